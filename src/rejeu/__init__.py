@@ -1,0 +1,36 @@
+"""rejeu: reinforcement learning with hindsight replay, compiled with JAX, for any Gymnasium environment.
+
+>>> import rejeu
+>>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", learning_starts=50, seed=0).learn(100)
+>>> agent.num_timesteps
+100
+"""
+
+from rejeu.agents import AGENTS, SAC, load
+from rejeu.envs.vector import make_vector
+from rejeu.errors import CheckpointError, MissingExtra
+from rejeu.evaluation import Evaluation, evaluate_policy
+from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from rejeu.replay.hindsight import GoalSelectionStrategy, HerReplayBuffer
+from rejeu.replay.uniform import ReplayBuffer
+from rejeu.schedules import Exponential, Linear
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AGENTS",
+    "SAC",
+    "CheckpointError",
+    "Evaluation",
+    "Exponential",
+    "GoalSelectionStrategy",
+    "HerReplayBuffer",
+    "Linear",
+    "MissingExtra",
+    "NormalActionNoise",
+    "OrnsteinUhlenbeckActionNoise",
+    "ReplayBuffer",
+    "evaluate_policy",
+    "load",
+    "make_vector",
+]

@@ -1,0 +1,619 @@
+"""The agents: what owns an environment, a learner and a replay buffer, under Stable-Baselines3's names.
+
+An agent holds what changes and calls what computes; it contains no mathematics. Its hyper-parameters are those of its
+algorithm's configuration.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar, Self
+
+import gymnasium as gym
+import jax
+import numpy as np
+
+from rejeu import checkpoint, compilation, config as configs, spaces
+from rejeu.algorithms import sac
+from rejeu.config import OffPolicyConfig
+from rejeu.envs.vector import VectorEnv, make_vector
+from rejeu.errors import CheckpointError
+from rejeu.evaluation import Evaluation, evaluate
+from rejeu.history import History
+from rejeu.interrupt import Interrupt
+from rejeu.logging import Console, Sink, TensorBoard, next_folder
+from rejeu.loops import host
+from rejeu.loops.compiled import Compiled
+from rejeu.loops.host import Episode, Progress, Run
+from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
+
+Callback = Callable[["Agent", Progress], bool | None]
+"""Called after every step of the environments; ``False``, and nothing else, stops training."""
+
+POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
+
+AGENT_ARGUMENTS = {
+    "policy": "``MlpPolicy``, ``MultiInputPolicy`` (Dict observations) or ``CnnPolicy`` (images). All three build what "
+    "the observation space needs; a name that does not fit the space is an error.",
+    "env": "An id, a Gymnasium environment, a function that makes one, or a vector environment.",
+    "seed": "Seeds everything: networks, exploration, batches and environments. None draws one.",
+    "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
+    "tensorboard_log": "Folder for TensorBoard logs, None for none.",
+    "stats_window_size": "Episodes over which reported means are taken.",
+    "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
+}
+
+
+class Agent:
+    """What all agents share. Abstract: use SAC and its kin."""
+
+    algorithm: ClassVar[ModuleType]
+    """The module with ``Config`` and ``make``."""
+
+    def __init__(
+        self,
+        policy: str,
+        env: Any,
+        *,
+        seed: int | None = None,
+        verbose: int = 0,
+        tensorboard_log: str | Path | None = None,
+        stats_window_size: int = 100,
+        device: str = "auto",
+        **hyperparameters: Any,
+    ) -> None:
+        known = [*configs.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
+        for key in hyperparameters:
+            if key not in known:
+                raise TypeError(configs.unknown_name(key, known, self.name))
+        self.config: OffPolicyConfig = self.algorithm.Config(**hyperparameters)
+        self.policy = policy
+        self.seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed)
+        self.verbose = verbose
+        self.tensorboard_log = tensorboard_log
+        self.stats_window_size = configs.whole("stats_window_size", stats_window_size, least=1)
+        self.history = History()
+        self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=self.stats_window_size)
+        """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
+        self.ep_success_buffer: deque[float] = deque(maxlen=self.stats_window_size)
+        self.interrupted = False
+        """Whether the last ``learn`` was ended by Ctrl-C."""
+        self.steps_per_second = math.nan
+        """Environment steps per second of the present or last ``learn``."""
+        self._steps_before = 0
+        self._n_predictions = 0
+        self._own_env = isinstance(env, str)
+        compilation.enable_cache()
+        vector = make_vector(env, 1, seed=self.seed)
+        self._check_policy(policy, vector.observation_space)
+        self._build(vector.observation_space, vector.action_space)
+        self._start(vector)
+
+    def _build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
+        """Compiles the algorithm for these spaces."""
+        self.observation_space, self.action_space = observation_space, action_space
+        self._obs_leaves = spaces.leaves(observation_space)
+        noise = self.config.action_noise
+        if noise is not None and len(noise.mean) != math.prod(action_space.shape or ()):
+            raise ValueError(f"action_noise has {len(noise.mean)} dimensions and the actions {action_space.shape}")
+        self._compiled = Compiled(self.algorithm.make(self.config, observation_space, action_space), noise)
+
+    def _start(self, env: VectorEnv) -> None:
+        """Begins a run on ``env`` with a fresh state and an empty buffer."""
+        noise = self.config.action_noise
+        carry = np.zeros((env.n_envs, 0), np.float32) if noise is None else noise.init(env.n_envs)
+        self._run: Run = host.initial_run(
+            env, self._make_replay(env), self._compiled, carry, self.config.learning_starts, self.seed
+        )
+
+    def _make_replay(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
+        config = self.config
+        if config.hindsight is not None:
+            spaces.check_goal_space(env.observation_space)
+        action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
+        ring = Ring(
+            config.buffer_size,
+            env.n_envs,
+            self._obs_leaves,
+            spaces.structure(env.observation_space),
+            action.shape[1:],
+            action.dtype,
+        )
+        if config.hindsight is None:
+            return ReplayBuffer(ring, config.gamma)
+        goals = env.goals()
+        if goals is None:
+            raise ValueError(
+                f"hindsight replay needs the environment's compute_reward(achieved_goal, desired_goal, info), and "
+                f"{env.env_id} has none; add it, or use replay_buffer_class=None"
+            )
+        return HerReplayBuffer(ring, config.gamma, config.hindsight, goals)
+
+    @staticmethod
+    def _check_policy(policy: str, space: gym.Space) -> None:
+        if policy not in POLICIES:
+            raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
+        is_dict = isinstance(space, gym.spaces.Dict)
+        if policy == "MlpPolicy" and is_dict:
+            raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
+        if policy == "MultiInputPolicy" and not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+            raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
+        if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in spaces.leaves(space)):
+            raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
+
+    @property
+    def name(self) -> str:
+        """The algorithm's name."""
+        return self.algorithm.Config.name
+
+    @property
+    def env(self) -> VectorEnv | None:
+        """The environments it trains on; None after ``load`` without one."""
+        return self._run.env
+
+    @property
+    def n_envs(self) -> int:
+        """How many environments it steps at once."""
+        return self._run.env.n_envs if self._run.env is not None else 1
+
+    @property
+    def state(self) -> Any:
+        """Everything learnt, as the algorithm's own class. Its arrays are given away at the next ``learn``."""
+        return self._compiled.state(self._run.leaves)
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps taken since the last ``learn`` with ``reset_num_timesteps=True`` began."""
+        return self._run.step - self._steps_before
+
+    @property
+    def n_updates(self) -> int:
+        """Gradient steps taken in all."""
+        return self._run.n_updates
+
+    @property
+    def replay_buffer(self) -> ReplayBuffer | HerReplayBuffer:
+        """The replay buffer."""
+        return self._run.replay
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall time spent training, in all and by what it went into: ``env``, ``replay``, ``update``, ``total``."""
+        return dict(self._run.seconds)
+
+    def learn(
+        self,
+        total_timesteps: int | None = None,
+        callback: Callback | Iterable[Callback] | None = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        *,
+        minutes: float | None = None,
+        sinks: Iterable[Sink] = (),
+    ) -> Self:
+        """Trains, and returns the agent.
+
+        Args:
+            total_timesteps: environment steps to take, over all environments; exactly so many are taken. None with
+                ``minutes``.
+            callback: called after every step as ``callback(agent, progress)``, or several; ``False`` stops training.
+            log_interval: episodes between two rows of statistics.
+            tb_log_name: name of the run in ``tensorboard_log``; None: the algorithm's.
+            reset_num_timesteps: start counting and log anew; learning itself goes on where it stood in either case.
+            progress_bar: show one.
+            minutes: stop after so much wall time.
+            sinks: further places for the rows of statistics, such as ``rejeu.logging.CsvFile(path)``.
+
+        Ctrl-C ends training after the step it is in, with everything consistent; ``interrupted`` is then True.
+
+        Raises:
+            ValueError: without an environment, or if neither ``total_timesteps`` nor ``minutes`` is given.
+        """
+        if self._run.env is None:
+            raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
+        if total_timesteps is None and minutes is None:
+            raise ValueError("learn needs total_timesteps or minutes")
+        n_steps = None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1)
+        seconds = math.inf if minutes is None else 60 * configs.number("minutes", minutes, above=0)
+        if reset_num_timesteps:
+            self._steps_before = self._run.step
+        callbacks = [callback] if callable(callback) else list(callback or ())
+        outputs = [*sinks, *([Console()] if self.verbose else [])]
+        own_outputs: list[Sink] = []
+        if self.tensorboard_log is not None:
+            own_outputs.append(TensorBoard(next_folder(self.tensorboard_log, tb_log_name or self.name)))
+        outputs += own_outputs
+        bar = None
+        if progress_bar:
+            from rejeu.callbacks import ProgressBar
+
+            bar = ProgressBar(n_steps, None if minutes is None else seconds)
+            callbacks.append(bar)
+        began, first, logged = time.perf_counter(), self._run.step, len(self.history)
+
+        def progress(taken: int) -> float:
+            by_steps = taken / n_steps if n_steps else 0.0
+            by_time = (time.perf_counter() - began) / seconds if n_steps is None else 0.0
+            return min(max(by_steps, by_time), 1.0)
+
+        self.interrupted = False
+        try:
+            with Interrupt() as interrupt:
+                for turn in host.off_policy(self._run, self._compiled, self.config, n_steps, progress):
+                    elapsed = time.perf_counter() - began
+                    self.steps_per_second = (turn.step - first) / elapsed
+                    for episode in turn.episodes:
+                        self._record(episode)
+                    if len(self.history) - logged >= log_interval and outputs:
+                        logged = len(self.history)
+                        row = self.statistics()
+                        for output in outputs:
+                            output.write(self.num_timesteps, row)
+                    if not all([c(self, turn) is not False for c in callbacks]) or elapsed >= seconds:
+                        break
+                    if interrupt.requested:
+                        self.interrupted = True
+                        break
+        finally:
+            if bar is not None:
+                bar.close()
+            for output in own_outputs:
+                output.close()
+        return self
+
+    def _record(self, episode: Episode) -> None:
+        self.history.append(episode)
+        self.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
+        if not math.isnan(episode.success):
+            self.ep_success_buffer.append(episode.success)
+
+    def statistics(self) -> dict[str, float]:
+        """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
+        row: dict[str, float] = {}
+        if self.ep_info_buffer:
+            row["rollout/ep_len_mean"] = float(np.mean([e["l"] for e in self.ep_info_buffer]))
+            row["rollout/ep_rew_mean"] = float(np.mean([e["r"] for e in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            row["rollout/success_rate"] = float(np.mean(self.ep_success_buffer))
+        seconds = self._run.seconds
+        row["time/episodes"] = self._run.episode
+        row["time/steps_per_second"] = float(self.steps_per_second)
+        row["time/seconds"] = seconds["total"]
+        for part in ("env", "replay", "update"):
+            row[f"time/{part}_share"] = seconds[part] / max(seconds["total"], 1e-9)
+        row["time/compile_seconds"] = compilation.seconds()
+        row["train/n_updates"] = self._run.n_updates
+        for key, value in (self._run.metrics or {}).items():
+            row[f"train/{key}"] = float(value)
+        return row
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:
+        """Returns actions in the environment's own range, and ``state`` unchanged.
+
+        Args:
+            observation: one observation of the environment's space, or a batch of them with a leading axis; the action
+                has a leading axis if and only if the observation has.
+            state: accepted for recurrent policies' sake.
+            episode_start: likewise.
+            deterministic: the policy's mode; False draws from the policy.
+
+        Raises:
+            ValueError: if the observation does not have the space's structure or shape.
+        """
+        batch, single = self._as_batch(observation)
+        action = self._act(batch, deterministic)
+        scaled = spaces.scale_action(self.action_space, action)
+        return (scaled[0] if single else scaled), state
+
+    def _as_batch(self, observation: Any) -> tuple[Any, bool]:
+        expected = spaces.structure(self.observation_space)
+        parts, tree = jax.tree.flatten(observation)
+        if tree != expected:
+            raise ValueError(f"the observation has the structure {tree}, expected {expected} of {self.observation_space}")
+        arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(parts, self._obs_leaves, strict=True)]
+        single = arrays[0].ndim == len(self._obs_leaves[0].shape)
+        for array, leaf in zip(arrays, self._obs_leaves, strict=True):
+            if (array.shape if single else array.shape[1:]) != leaf.shape:
+                where = f" of {leaf.path!r}" if leaf.path else ""
+                raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
+        return jax.tree.unflatten(tree, [array[None] if single else array for array in arrays]), single
+
+    def _act(self, obs: Any, deterministic: bool) -> np.ndarray:
+        """Returns actions in the algorithm's range for a batch of cast observations."""
+        leaves = self._compiled.actor_leaves(self._run.leaves)
+        if deterministic:
+            return np.asarray(self._compiled.exploit(leaves, obs))
+        n = len(jax.tree.leaves(obs)[0])
+        clock = host.clock_of(self._run, 1.0)._replace(step=np.uint32(2**32 - 1 - self._n_predictions % 2**31))
+        self._n_predictions += 1
+        noise = self.config.action_noise
+        carry = np.zeros((n, 0), np.float32) if noise is None else noise.init(n)
+        action, _ = self._compiled.act(leaves, carry, obs, np.zeros(n, bool), self._run.key, clock)
+        return np.asarray(action)
+
+    def evaluate(
+        self, episodes: int = 100, env: Any = None, deterministic: bool = True, seed: int | None = None
+    ) -> Evaluation:
+        """Plays whole episodes and returns their returns, lengths, successes and 95 % intervals.
+
+        Args:
+            episodes: how many.
+            env: where, as for the constructor; None: new environments like the agent's own if it was given an id,
+                else the agent's own, whose running episodes are then given up.
+            deterministic: the policy's mode; False draws from the policy.
+            seed: of the environments; None draws one.
+        """
+        if env is None and self._run.env is None:
+            raise ValueError("this agent has no environment; give one: evaluate(env=...)")
+        own = env is None and not self._own_env
+        if own:
+            vector = self._run.env
+        elif env is None:
+            vector = make_vector(self._run.env.env_id, min(episodes, 16), self._run.env.backend, seed)
+        else:
+            vector = make_vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
+        try:
+            return evaluate(lambda obs: self._act(obs, deterministic), vector, episodes)
+        finally:
+            if own:
+                self._run.obs = self._run.action = None
+            elif not isinstance(env, gym.Env | gym.vector.VectorEnv | VectorEnv):
+                vector.close()
+
+    def get_env(self) -> VectorEnv | None:
+        """Returns the environments it trains on."""
+        return self.env
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Gives the agent another environment of the same spaces; its episodes start anew.
+
+        With another number of environments the replay buffer starts empty; otherwise it is kept.
+
+        Raises:
+            ValueError: if the spaces differ.
+        """
+        vector = make_vector(env, 1, seed=self.seed)
+        self._check_spaces(vector, "the new environment")
+        self._own_env = isinstance(env, str)
+        run = self._run
+        if run.env is None or run.env.n_envs != vector.n_envs:
+            run.replay = self._make_replay(vector)
+            noise = self.config.action_noise
+            run.carry = np.zeros((vector.n_envs, 0), np.float32) if noise is None else noise.init(vector.n_envs)
+        run.env = vector
+        run.obs = run.action = None
+        run.ended = np.ones(vector.n_envs, bool)
+
+    def _check_spaces(self, vector: VectorEnv, what: str) -> None:
+        for kind in ("observation", "action"):
+            own, other = getattr(self, f"{kind}_space"), getattr(vector, f"{kind}_space")
+            if not spaces.same(own, other, bounds=kind == "action"):
+                raise ValueError(f"{what} has the {kind} space {other}, and this agent was made for {own}")
+
+    def get_parameters(self) -> dict[str, np.ndarray]:
+        """Returns everything learnt as arrays by name, copied: networks, targets, optimizers, temperature, counters."""
+        return {key: value.copy() for key, value in checkpoint.tree_to_arrays(self.state).items()}
+
+    def set_parameters(self, load_path_or_dict: Mapping[str, np.ndarray] | str | Path, exact_match: bool = True) -> None:
+        """Puts parameters in place, from :meth:`get_parameters` or from a model file.
+
+        Args:
+            load_path_or_dict: arrays by name, or a path.
+            exact_match: require all of them; False takes those that are given and keeps the rest.
+
+        Raises:
+            CheckpointError: if a name, shape or dtype does not match; nothing is then changed.
+        """
+        source = load_path_or_dict
+        if isinstance(source, str | Path):
+            _, source = checkpoint.read(source, "agent")
+        arrays = {key: np.asarray(value) for key, value in source.items()}
+        if not exact_match:
+            arrays = self.get_parameters() | arrays
+        leaves = checkpoint.arrays_to_leaves(self._compiled.shapes, arrays, "set_parameters: the source")
+        self._run.leaves = [jax.numpy.array(leaf) for leaf in leaves]
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the model to one safetensors file and returns its path; the replay buffer is not part of it.
+
+        ``.safetensors`` is added to a path without a suffix. The file holds everything learnt, the hyper-parameters, the
+        spaces and the counters. An older file at that path is replaced only once the new one is complete.
+        """
+        run = self._run
+        header = {
+            "algorithm": self.name,
+            "config": configs.to_json(self.config),
+            "policy": self.policy,
+            "observation_space": spaces.describe(self.observation_space),
+            "action_space": spaces.describe(self.action_space),
+            "env_id": run.env.env_id if run.env is not None else None,
+            "seed": self.seed,
+            "stats_window_size": self.stats_window_size,
+            "counters": {"step": run.step, "episode": run.episode, "n_updates": run.n_updates},
+            "rng": run.rng.bit_generator.state["state"],
+        }
+        return checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), header)
+
+    @classmethod
+    def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:
+        """Returns the agent of a model file. Runs nothing that the file holds; it supplies numbers only.
+
+        Args:
+            path: as given to :meth:`save`.
+            env: where it goes on learning; None for an agent that only predicts.
+            changes: constructor arguments or hyper-parameters to set otherwise than they were saved.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            CheckpointError: if the file is damaged, of another algorithm, environment, schema or shape; it says which.
+        """
+        header, arrays = checkpoint.read(path, "agent")
+        if header.get("algorithm") != cls.algorithm.Config.name:
+            raise CheckpointError(
+                f"{path} holds a {str(header.get('algorithm'))[:40]} agent, not {cls.algorithm.Config.name}; "
+                f"use rejeu.load(path) or rejeu.{str(header.get('algorithm'))[:40]}.load"
+            )
+        own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
+        try:
+            config = configs.build(cls.algorithm.Config, {**header["config"], **changes})
+            observation_space = spaces.rebuild(header["observation_space"])
+            action_space = spaces.rebuild(header["action_space"])
+            counters = {key: configs.whole(key, header["counters"][key], 0) for key in ("step", "episode", "n_updates")}
+            rng = {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")}
+            seed = whole_seed(own.pop("seed", header["seed"]))
+            window = configs.whole("stats_window_size", own.pop("stats_window_size", header["stats_window_size"]), 1)
+            policy = own.pop("policy", header["policy"])
+            cls._check_policy(policy, observation_space)
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            if changes and not isinstance(error, KeyError):
+                raise
+            raise CheckpointError(f"{path}: the header is damaged or of another version: {error}") from None
+
+        agent = cls.__new__(cls)
+        agent.config, agent.policy, agent.seed = config, policy, seed
+        agent.verbose = own.pop("verbose", 0)
+        agent.tensorboard_log = own.pop("tensorboard_log", None)
+        agent.stats_window_size = window
+        agent.history = History()
+        agent.ep_info_buffer, agent.ep_success_buffer = deque(maxlen=window), deque(maxlen=window)
+        agent.interrupted, agent.steps_per_second = False, math.nan
+        agent._n_predictions, agent._own_env = 0, isinstance(env, str)
+        compilation.enable_cache()
+        try:
+            agent._build(observation_space, action_space)
+        except (TypeError, ValueError, MemoryError, OverflowError) as error:
+            raise CheckpointError(f"{path}: {error}") from None
+        leaves = checkpoint.arrays_to_leaves(agent._compiled.shapes, arrays, path)
+        vector = None if env is None else make_vector(env, 1, seed=seed)
+        if vector is not None:
+            agent._check_spaces(vector, "the given environment")
+        return agent._resume(vector, leaves, counters, rng)
+
+    def _resume(
+        self, vector: VectorEnv | None, leaves: list[np.ndarray], counters: dict[str, int], rng: dict[str, int]
+    ) -> Self:
+        """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
+        if vector is not None:
+            self._start(vector)
+        else:
+            self._run = host.initial_run(None, None, self._compiled, np.zeros((1, 0)), 0, self.seed)  # type: ignore[arg-type]
+        run = self._run
+        run.leaves = [jax.numpy.array(leaf) for leaf in leaves]
+        run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
+        run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": rng}
+        run.learn_from = max(self.config.learning_starts, run.step + self.config.learning_starts)
+        self._steps_before = 0
+        return self
+
+    def save_replay_buffer(self, path: str | Path) -> Path:
+        """Writes the replay buffer to one safetensors file and returns its path."""
+        header = {
+            "observation_space": spaces.describe(self.observation_space),
+            "action_space": spaces.describe(self.action_space),
+        }
+        return checkpoint.write(path, "replay", self._run.replay.arrays(), header)
+
+    def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
+        """Replaces the replay buffer by a saved one; learning can then go on at once.
+
+        Args:
+            path: as given to :meth:`save_replay_buffer`.
+            truncate_last_traj: accepted; the episodes that ran when it was saved are closed without a terminal state
+                when the next begins, so hindsight uses them as far as they went.
+
+        Raises:
+            CheckpointError: if the file is damaged, or of another environment or buffer size.
+        """
+        if self._run.replay is None:
+            raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
+        _, arrays = checkpoint.read(path, "replay")
+        try:
+            self._run.replay.restore(arrays)
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {error}") from None
+        self._run.learn_from = self.config.learning_starts
+        self._run.obs = self._run.action = None
+
+    def __repr__(self) -> str:
+        where = self._run.env.env_id if self._run.env is not None else "no environment"
+        return f"<rejeu.{self.name} on {where}, {self._run.step} steps, {self._run.n_updates} updates>"
+
+    def __init_subclass__(cls) -> None:
+        """Writes signature and docstring from the configuration, where every hyper-parameter is declared once."""
+        config = cls.algorithm.Config
+        docs = configs.field_docs(config)
+        lines = [f"{(config.__doc__ or '').strip()}", "", "Args:"]
+        lines += [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
+        defaults = config()
+        parameters = list(inspect.signature(Agent.__init__).parameters.values())[:-1]
+        for key in configs.field_names(config):
+            default = getattr(defaults, key)
+            lines.append(f"    {key}: {docs[key]} Default: {default!r}.")
+            parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
+        cls.__doc__ = "\n".join([f"{(cls.__doc__ or '').strip()}", "", *lines])
+        cls.__signature__ = inspect.Signature(parameters[1:])  # type: ignore[attr-defined]
+
+
+class SAC(Agent):
+    """Soft actor-critic (Haarnoja et al. 2018), for continuous actions."""
+
+    algorithm = sac
+
+
+AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in (SAC,)}
+"""Every agent by the name of its algorithm."""
+
+
+def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
+    """Returns the agent of a model file, whichever algorithm it is of; see :meth:`Agent.load`."""
+    header, _ = checkpoint.read(path, "agent")
+    name = header.get("algorithm")
+    if name not in AGENTS:
+        raise CheckpointError(f"{path} holds an agent of {str(name)[:40]!r}; this rejeu has {', '.join(AGENTS)}")
+    return AGENTS[name].load(path, env, **changes)
+
+
+def whole_seed(seed: Any) -> int:
+    """Returns a seed as an int in [0, 2^32).
+
+    Raises:
+        ValueError: otherwise.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
+    return int(seed)
+
+
+class _ClassOnly:
+    """Makes ``load`` refuse to be called on an instance, where it would silently leave that instance as it was."""
+
+    def __init__(self, method: Any) -> None:
+        self.method = method
+        self.__doc__ = method.__func__.__doc__
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is not None:
+            raise TypeError(
+                f"load is called on the class and returns a new agent: agent = {owner.__name__}.load(path); "
+                "to change this one in place use agent.set_parameters(path)"
+            )
+        return self.method.__get__(None, owner)
+
+
+Agent.load = _ClassOnly(Agent.__dict__["load"])  # type: ignore[method-assign,assignment]

@@ -1,0 +1,230 @@
+"""How hyper-parameters are declared, checked, documented and saved.
+
+A configuration is a frozen dataclass whose every field carries an attribute docstring; the command line, ``help()`` and
+the documentation are made from it. It accepts what Stable-Baselines3 users write, keeps it in one hashable form, and
+turns into JSON and back.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import difflib
+import inspect
+import math
+import textwrap
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, Literal, TypeVar
+
+from rejeu import schedules
+from rejeu.exploration import noise as action_noises
+from rejeu.networks import PolicyConfig
+from rejeu.replay.hindsight import HindsightConfig
+from rejeu.schedules import Schedule
+
+C = TypeVar("C")
+
+REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
+"""Names for ``replay_buffer_class`` and what configures each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyConfig:
+    """What every algorithm that learns from replayed experience can be told."""
+
+    learning_rate: float | Schedule = 3e-4
+    """Step size of Adam for every network; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
+    ``"lin_3e-4"``. Raising it learns faster until it diverges."""
+    buffer_size: int = 1_000_000
+    """Most steps that the replay buffer keeps, over all environments; the oldest make room. Raising it remembers longer
+    and takes memory in proportion."""
+    learning_starts: int = 100
+    """Environment steps of uniformly random actions before learning begins."""
+    batch_size: int = 256
+    """Transitions per gradient step. Raising it gives a steadier, dearer step."""
+    tau: float = 0.005
+    """Share of the online network that flows into the target network at each gradient step, in (0, 1]."""
+    gamma: float = 0.99
+    """Discount factor, in [0, 1]. Raising it looks further ahead."""
+    train_freq: int | tuple[int, Literal["step", "episode"]] = 1
+    """Learn every so many environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
+    environments together, whatever their number."""
+    gradient_steps: int = 1
+    """Gradient steps each time; -1 means as many as environment steps were taken since the last time."""
+    action_noise: action_noises.Noise | None = None
+    """Noise added to the actions of the training policy, such as ``NormalActionNoise(mean, sigma)``. None for none."""
+    replay_buffer_class: str = "ReplayBuffer"
+    """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not."""
+    replay_buffer_kwargs: HindsightConfig | None = None
+    """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``."""
+    policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
+    """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``."""
+
+    name: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
+        put("learning_rate", schedules.parse("learning_rate", self.learning_rate))
+        for key in ("buffer_size", "batch_size"):
+            put(key, whole(key, getattr(self, key), least=1))
+        put("learning_starts", whole("learning_starts", self.learning_starts, least=0))
+        put("tau", number("tau", self.tau, above=0, most=1))
+        put("gamma", number("gamma", self.gamma, least=0, most=1))
+        put("train_freq", _train_freq(self.train_freq))
+        put("gradient_steps", whole("gradient_steps", self.gradient_steps, least=-1))
+        if self.gradient_steps == 0:
+            raise ValueError("gradient_steps=0 would never learn; use 1 or more, or -1 for as many as environment steps")
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "
+                f"try buffer_size={max(10 * self.batch_size, 10_000)} or batch_size={self.buffer_size}"
+            )
+        put("action_noise", action_noises.parse(self.action_noise))
+        put("policy_kwargs", nested("policy_kwargs", PolicyConfig, self.policy_kwargs))
+        self._parse_replay()
+
+    def _parse_replay(self) -> None:
+        kind = self.replay_buffer_class
+        key = "ReplayBuffer" if kind is None else kind if isinstance(kind, str) else getattr(kind, "__name__", repr(kind))
+        if key not in REPLAY_BUFFERS:
+            raise ValueError(f"replay_buffer_class={key!r} is unknown; choose one of {', '.join(REPLAY_BUFFERS)}")
+        settings = REPLAY_BUFFERS[key]
+        object.__setattr__(self, "replay_buffer_class", key)
+        if settings is None:
+            if self.replay_buffer_kwargs:
+                raise ValueError(
+                    f"replay_buffer_kwargs={self.replay_buffer_kwargs!r} has no meaning for {key}; "
+                    "did you forget replay_buffer_class=HerReplayBuffer?"
+                )
+            object.__setattr__(self, "replay_buffer_kwargs", None)
+        else:
+            object.__setattr__(
+                self, "replay_buffer_kwargs", nested("replay_buffer_kwargs", settings, self.replay_buffer_kwargs or {})
+            )
+
+    @property
+    def hindsight(self) -> HindsightConfig | None:
+        """How goals are relabelled, or None where they are not."""
+        return self.replay_buffer_kwargs
+
+
+def whole(key: str, value: Any, least: int) -> int:
+    """Returns ``value`` as an int; ``1e6`` is accepted.
+
+    Raises:
+        ValueError: if it is not a whole number or below ``least``.
+    """
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
+    if not good or value < least:
+        raise ValueError(f"{key}={value!r} must be a whole number of at least {least}")
+    return int(value)
+
+
+def whole_exact(value: Any) -> int:
+    """Returns ``value`` if it is an int of at least 0, of whatever size.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"{value!r} must be a whole number of at least 0")
+    return value
+
+
+def number(
+    key: str, value: Any, least: float = -math.inf, above: float = -math.inf, most: float = math.inf
+) -> float:
+    """Returns ``value`` as a finite float within ``[least, most]`` and greater than ``above``.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not (good and least <= value <= most and value > above):
+        bounds = [f"above {above}"] * (above > -math.inf) + [f"at least {least}"] * (least > -math.inf)
+        bounds += [f"at most {most}"] * (most < math.inf)
+        raise ValueError(f"{key}={value!r} must be a finite number" + (", " + " and ".join(bounds) if bounds else ""))
+    return float(value)
+
+
+def nested(key: str, kind: type[C], value: Any) -> C:
+    """Returns a sub-configuration of class ``kind`` from itself or from a mapping of its fields."""
+    if isinstance(value, kind):
+        return value
+    if value is None:
+        return kind()
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{key}={value!r} must be a dict with the keys {', '.join(field_names(kind))}")
+    return build(kind, value, f"{key} of ")
+
+
+def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
+    """Returns ``kind(**given)``.
+
+    Raises:
+        TypeError: for a name that is no field, suggesting the nearest that is.
+    """
+    names = field_names(kind)
+    for key in given:
+        if key not in names:
+            raise TypeError(unknown_name(key, names, f"{context}{getattr(kind, 'name', '') or kind.__name__}"))
+    return kind(**given)
+
+
+def unknown_name(key: str, names: Iterable[str], owner: str) -> str:
+    """Returns the sentence for a misspelt name, with the nearest known one."""
+    near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
+    return f"{owner} has no setting {key!r}; {hint}"
+
+
+def field_names(kind: type) -> list[str]:
+    """Returns the names of a dataclass's fields, in order."""
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+@cache
+def field_docs(kind: type) -> dict[str, str]:
+    """Returns the attribute docstring of each field of a dataclass, its bases' included, each on one line."""
+    docs: dict[str, str] = {}
+    for owner in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(owner):
+            continue
+        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for statement, following in zip(body.body, body.body[1:], strict=False):
+            if (
+                isinstance(statement, ast.AnnAssign)
+                and isinstance(statement.target, ast.Name)
+                and isinstance(following, ast.Expr)
+                and isinstance(following.value, ast.Constant)
+                and isinstance(following.value.value, str)
+            ):
+                docs[statement.target.id] = " ".join(following.value.value.split())
+    return {key: docs[key] for key in field_names(kind) if key in docs}
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """Returns a configuration as plain JSON values; ``build(kind, to_json(config)) == config``."""
+    return {field.name: _value_to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
+
+
+def _value_to_json(value: Any) -> Any:
+    if isinstance(value, schedules.Linear | schedules.Exponential):
+        return schedules.to_json(value)
+    if isinstance(value, action_noises.Noise):
+        return action_noises.to_json(value)
+    if dataclasses.is_dataclass(value):
+        return to_json(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _train_freq(value: Any) -> int | tuple[int, Literal["step", "episode"]]:
+    if isinstance(value, tuple | list) and len(value) == 2 and value[1] in ("step", "episode"):
+        count = whole("train_freq", value[0], least=1)
+        return count if value[1] == "step" else (count, "episode")
+    if isinstance(value, int | float):
+        return whole("train_freq", value, least=1)
+    raise ValueError(f"train_freq={value!r} must be a whole number of steps, or (n, 'step') or (n, 'episode')")

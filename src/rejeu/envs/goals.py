@@ -1,0 +1,79 @@
+"""Rewards of goal environments for goals that were not the agent's own: what hindsight replay calls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rejeu.replay.hindsight import GoalFunctions
+
+PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
+"""Weights of x, y, vx, vy, cos h, sin h in highway-env's ``parking-v0`` (1.12, default configuration)."""
+
+
+def parking_reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    """Returns ``-sqrt(weights . |achieved - desired|)``, the reward of ``parking-v0`` without its collision penalty.
+
+    Shapes ``(..., 6)`` to ``(...)``. Equal to highway-env's ``compute_reward`` with the default configuration; like it,
+    it leaves out the -5 that ``step`` adds on a collision.
+    """
+    return -np.sqrt(np.abs(achieved - desired) @ PARKING_WEIGHTS.astype(achieved.dtype))
+
+
+def goal_functions(env: Any) -> GoalFunctions | None:
+    """Returns the goal functions of a Gymnasium environment, or None where it has no ``compute_reward``.
+
+    ``compute_terminated`` is taken along where the environment has one. Whether its functions accept batches is found
+    out at the first call (see :func:`over_batches`).
+    """
+    reward = attribute(env, "compute_reward")
+    if reward is None:
+        return None
+    terminated = attribute(env, "compute_terminated")
+    return GoalFunctions(
+        over_batches(reward, np.float32), None if terminated is None else over_batches(terminated, np.bool_)
+    )
+
+
+def attribute(env: Any, name: str) -> Any:
+    """Returns an attribute of an environment beneath any wrappers, or None."""
+    try:
+        return env.get_wrapper_attr(name)
+    except AttributeError:
+        return None
+
+
+def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Returns ``function(achieved, desired, info)`` as a function of batches of goals.
+
+    At the first call with two rows or more, it is called once with the whole batch and once for each of the first rows;
+    if the two agree it is taken to be vectorised from then on, otherwise it is called row by row.
+    """
+    vectorised: bool | None = None
+
+    def by_row(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        return np.array([function(a, d, {}) for a, d in zip(achieved, desired, strict=True)], dtype)
+
+    def call(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        nonlocal vectorised
+        if vectorised:
+            return np.asarray(function(achieved, desired, {})).astype(dtype, copy=False)
+        if vectorised is None and len(achieved) > 1:
+            vectorised = _agrees(function, by_row, achieved, desired)
+            return call(achieved, desired)
+        return by_row(achieved, desired)
+
+    return call
+
+
+def _agrees(function: Callable[..., Any], by_row: Callable[..., Any], achieved: np.ndarray, desired: np.ndarray) -> bool:
+    n = min(len(achieved), 8)
+    try:
+        whole = np.asarray(function(achieved, desired, {}))
+    except Exception:  # whatever a function that expects one row says of many: it is then called row by row
+        return False
+    return whole.shape == (len(achieved),) and np.allclose(
+        whole[:n].astype(np.float64), by_row(achieved[:n], desired[:n]).astype(np.float64), rtol=1e-4, atol=1e-5
+    )

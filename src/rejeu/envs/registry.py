@@ -1,0 +1,98 @@
+"""Finding environments by name: which package registers it, which extra installs that, what was probably meant."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+
+from rejeu.errors import MissingExtra
+
+
+class Provider(NamedTuple):
+    """A package whose import registers environments, and rejeu's extra that installs it."""
+
+    module: str
+    package: str
+    extra: str
+
+
+PROVIDERS: dict[tuple[str, ...], Provider] = {
+    (
+        "parking-", "highway-", "merge-", "roundabout-", "intersection-", "racetrack-", "exit-", "two-way-", "u-turn-",
+        "lane-keeping-",
+    ): Provider("highway_env", "highway-env", "parking"),
+    ("Fetch", "Hand", "PointMaze", "AntMaze", "Adroit", "FrankaKitchen"): Provider(
+        "gymnasium_robotics", "gymnasium-robotics", "robotics"
+    ),
+}  # fmt: skip
+"""Environments that Gymnasium knows only once another package is imported, by the beginning of their names."""
+
+NEEDS = {
+    "Box2D": Provider("Box2D", "box2d", "box2d"),
+    "box2d": Provider("Box2D", "box2d", "box2d"),
+    "mujoco": Provider("mujoco", "mujoco", "mujoco"),
+    "pygame": Provider("pygame", "pygame", "parking"),
+}
+"""Packages that Gymnasium's own environments import when they are made."""
+
+
+def provider(env_id: str) -> Provider | None:
+    """Returns the package that registers ``env_id``, or None if Gymnasium itself does."""
+    return next((p for prefixes, p in PROVIDERS.items() if env_id.startswith(prefixes)), None)
+
+
+def register(env_id: str) -> bool:
+    """Imports the package that registers ``env_id``; returns whether Gymnasium knows the id now."""
+    source = provider(env_id)
+    if source is not None and importlib.util.find_spec(source.module) is not None:
+        module = importlib.import_module(source.module)
+        if source.module == "gymnasium_robotics":
+            gym.register_envs(module)
+    return env_id in gym.registry or ":" in env_id
+
+
+def make_env(env_id: str, **kwargs: Any) -> gym.Env:
+    """Returns ``gymnasium.make(env_id)`` without its passive checker, importing what registers the id.
+
+    Raises:
+        ValueError: if no such environment is known, with the nearest names.
+        MissingExtra: if a package that it needs is not installed.
+    """
+    if not register(env_id):
+        source = provider(env_id)
+        if source is not None and importlib.util.find_spec(source.module) is None:
+            raise MissingExtra(f"the environment {env_id}", source.package, source.extra)
+        raise ValueError(unknown_environment(env_id))
+    try:
+        return gym.make(env_id, disable_env_checker=True, **kwargs)
+    except gym.error.DependencyNotInstalled as error:
+        need = next((p for name, p in NEEDS.items() if name in str(error)), None)
+        if need is None:
+            raise
+        raise MissingExtra(f"the environment {env_id}", need.package, need.extra) from None
+
+
+def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
+    """Returns a function that makes the environment; it can be sent to a worker process."""
+    return _Maker(env_id, kwargs)
+
+
+class _Maker(NamedTuple):
+    env_id: str
+    kwargs: dict[str, Any]
+
+    def __call__(self) -> gym.Env:
+        return make_env(self.env_id, **self.kwargs)
+
+
+def unknown_environment(env_id: str) -> str:
+    """Returns the sentence for an id that nothing registers, with the nearest known ones."""
+    known = [*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"]
+    near = difflib.get_close_matches(env_id, known, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else "rejeu list shows the environments that have presets"
+    return f"no environment is called {env_id!r}; {hint}"

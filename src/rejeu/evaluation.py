@@ -1,0 +1,174 @@
+"""Measuring a policy: episodes played to their end, their mean, and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rejeu.envs.vector import VectorEnv, make_vector
+from rejeu.spaces import scale_action
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a number of whole episodes came to."""
+
+    returns: np.ndarray = field(repr=False)
+    """Sum of rewards of each episode, ``(n,)``."""
+    lengths: np.ndarray = field(repr=False)
+    """Steps of each episode, ``(n,)``."""
+    successes: np.ndarray = field(repr=False)
+    """1 or 0 for each episode, NaN where the environment does not say, ``(n,)``."""
+
+    @property
+    def mean_return(self) -> float:
+        """Mean return."""
+        return float(np.mean(self.returns))
+
+    @property
+    def std_return(self) -> float:
+        """Standard deviation of the returns over episodes (dividing by n)."""
+        return float(np.std(self.returns))
+
+    @property
+    def mean_length(self) -> float:
+        """Mean episode length in steps."""
+        return float(np.mean(self.lengths))
+
+    @property
+    def return_interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the mean return, by Student's t; NaN for a single episode."""
+        n = len(self.returns)
+        if n < 2:
+            return math.nan, math.nan
+        from scipy import stats
+
+        half = float(stats.t.ppf(0.975, n - 1)) * float(np.std(self.returns, ddof=1)) / math.sqrt(n)
+        return self.mean_return - half, self.mean_return + half
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that succeeded, NaN if the environment does not say."""
+        return float(np.mean(self.successes))
+
+    @property
+    def success_interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the success rate, by Wilson's score; NaN where it is unknown."""
+        if math.isnan(self.success_rate):
+            return math.nan, math.nan
+        from scipy import stats
+
+        bounds = stats.binomtest(int(self.successes.sum()), len(self.successes)).proportion_ci(method="wilson")
+        return float(bounds.low), float(bounds.high)
+
+    def __str__(self) -> str:
+        low, high = self.return_interval
+        text = (
+            f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % interval of the mean {low:.2f} to {high:.2f}), "
+            f"length {self.mean_length:.1f}, {len(self.returns)} episodes"
+        )
+        if not math.isnan(self.success_rate):
+            low, high = self.success_interval
+            text = f"success {self.success_rate:.1%} (95 % interval {low:.1%} to {high:.1%}), {text}"
+        return text
+
+
+def evaluate(policy: Callable[[Any], np.ndarray], env: VectorEnv, episodes: int) -> Evaluation:
+    """Plays ``episodes`` whole episodes and returns what they came to.
+
+    Every environment plays its own fixed share of the episodes, so that short ones are not counted more often.
+
+    Args:
+        policy: maps observations ``(n_envs, ...)`` to actions in the algorithm's range.
+        env: reset at the beginning; left wherever the last episode ended.
+        episodes: at least 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes={episodes} must be at least 1")
+    share = (episodes + np.arange(env.n_envs)) // env.n_envs
+    played = np.zeros(env.n_envs, int)
+    total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
+    rows: list[tuple[float, int, float]] = []
+    obs = env.reset()
+    while len(rows) < episodes:
+        step = env.step(scale_action(env.action_space, policy(obs)))
+        total += step.reward
+        length += 1
+        done = step.terminated | step.truncated
+        for i in np.flatnonzero(done):
+            if played[i] < share[i]:
+                rows.append((total[i], length[i], env.success(step, i)))
+                played[i] += 1
+            total[i] = length[i] = 0
+        obs = env.reset_done(done) if done.any() and len(rows) < episodes else step.obs
+    returns, lengths, successes = zip(*rows, strict=True)
+    return Evaluation(np.array(returns), np.array(lengths), np.array(successes))
+
+
+def evaluate_policy(
+    model: Any,
+    env: Any,
+    n_eval_episodes: int = 10,
+    deterministic: bool = True,
+    render: bool = False,
+    callback: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
+    reward_threshold: float | None = None,
+    return_episode_rewards: bool = False,
+    warn: bool = True,
+) -> tuple[float, float] | tuple[list[float], list[int]]:
+    """Plays whole episodes and returns mean and standard deviation of the return, as Stable-Baselines3 does.
+
+    Args:
+        model: anything with ``predict(obs, deterministic=...) -> (action, state)``.
+        env: a Gymnasium environment, a vector environment, an id, or a function that makes an environment.
+        n_eval_episodes: at least 1, spread evenly over the environments of a vector.
+        deterministic: the policy's mode, or a sample.
+        render: show the environment while it plays; it must have been made with ``render_mode="human"``.
+        callback: called after every step with ``locals()`` and ``globals()``.
+        reward_threshold: least mean return that is accepted.
+        return_episode_rewards: return the lists of returns and lengths instead.
+        warn: accepted and without effect: episodes are counted here, so a missing ``Monitor`` falsifies nothing.
+
+    Raises:
+        ValueError: if the mean return is below ``reward_threshold``.
+    """
+    vector = make_vector(env)
+
+    def policy(obs: Any) -> np.ndarray:
+        return model.predict(obs, deterministic=deterministic)[0]
+
+    if n_eval_episodes < 1:
+        raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1")
+    share = (n_eval_episodes + np.arange(vector.n_envs)) // vector.n_envs
+    current_rewards, current_lengths = np.zeros(vector.n_envs), np.zeros(vector.n_envs, int)
+    episode_counts = np.zeros(vector.n_envs, int)
+    episode_rewards: list[float] = []
+    episode_lengths: list[int] = []
+    observations = vector.reset()
+    while len(episode_rewards) < n_eval_episodes:
+        actions = policy(observations)
+        step = vector.step(actions)
+        rewards, dones, infos = step.reward, step.terminated | step.truncated, step.info
+        current_rewards += rewards
+        current_lengths += 1
+        for i in range(vector.n_envs):
+            if callback is not None and episode_counts[i] < share[i]:
+                reward, done, info = rewards[i], dones[i], infos[i] if isinstance(infos, list) else infos
+                callback(locals(), globals())
+            if dones[i]:
+                if episode_counts[i] < share[i]:
+                    episode_rewards.append(float(current_rewards[i]))
+                    episode_lengths.append(int(current_lengths[i]))
+                    episode_counts[i] += 1
+                current_rewards[i] = current_lengths[i] = 0
+        observations = vector.reset_done(dones) if dones.any() else step.obs
+        if render and hasattr(env, "render"):
+            env.render()
+    mean, std = float(np.mean(episode_rewards)), float(np.std(episode_rewards))
+    if reward_threshold is not None and not mean > reward_threshold:
+        raise ValueError(f"the mean return {mean:.2f} is not above reward_threshold={reward_threshold:.2f}")
+    return (episode_rewards, episode_lengths) if return_episode_rewards else (mean, std)

@@ -1,0 +1,72 @@
+"""The record of a training run: one row an episode, as data and as a picture."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rejeu.loops.host import Episode
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLUMNS = ("step", "env", "return", "length", "success", "seconds")
+
+
+class History:
+    """A growing table of episodes."""
+
+    def __init__(self, episodes: Iterable[Episode] = ()) -> None:
+        self.episodes = list(episodes)
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """Returns one column, ``(n_episodes,)``: step, env, return, length, success or seconds.
+
+        Raises:
+            KeyError: for another name.
+        """
+        if column not in COLUMNS:
+            raise KeyError(f"{column!r} is no column; there are {', '.join(COLUMNS)}")
+        return np.array([episode[COLUMNS.index(column)] for episode in self.episodes], np.float64)
+
+    def append(self, episode: Episode) -> None:
+        """Adds one episode at the end."""
+        self.episodes.append(episode)
+
+    def moving_average(self, column: str = "return", window: int = 50) -> np.ndarray:
+        """Returns the mean of each value and up to ``window - 1`` before it, NaN left out, ``(n_episodes,)``."""
+        values = self[column]
+        known = np.isfinite(values)
+        sums = np.cumsum(np.where(known, values, 0.0))
+        counts = np.cumsum(known)
+        sums[window:] = sums[window:] - sums[:-window]
+        counts[window:] = counts[window:] - counts[:-window]
+        return sums / np.where(counts, counts, np.nan)
+
+    def write_csv(self, path: str | Path) -> None:
+        """Writes the table with a header line."""
+        with Path(path).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(COLUMNS)
+            writer.writerows(self.episodes)
+
+    def plot(self, path: str | Path | None = None, against: str = "step", window: int = 50) -> Figure:
+        """Draws returns and, where known, success against ``"step"`` or ``"seconds"``; writes a PNG if ``path``.
+
+        Raises:
+            MissingExtra: if matplotlib is not installed.
+        """
+        from rejeu import plots
+
+        return plots.learning_curve(self, path, against, window)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the columns as arrays, ready for ``pandas.DataFrame``."""
+        return {column: self[column] for column in COLUMNS}

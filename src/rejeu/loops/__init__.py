@@ -1,0 +1,1 @@
+"""Loops: what joins an algorithm to environments."""

@@ -1,0 +1,1 @@
+"""Replay buffers: where experience is kept on the host, and how batches are drawn from it."""

@@ -1,0 +1,166 @@
+"""Hindsight experience replay: past steps, relabelled with goals that the agent did reach.
+
+Source: Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). Relabelling happens when a batch is
+drawn: of every batch the share ``k / (k + 1)`` gets, in place of its own goal, an achieved goal from (section 4.5)
+
+- ``future``: a later moment of the same episode,
+- ``final``: the episode's last moment,
+- ``episode``: any moment of the same episode,
+- ``random``: any moment in the buffer,
+
+and the reward that the environment gives for it. Episodes that still run, or whose beginning the ring has forgotten, are
+used as far as they are kept. ``terminated`` is computed again where the environment offers ``compute_terminated`` and
+kept as it was elsewhere: a crash remains a crash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from rejeu.core import Transition
+from rejeu.replay.ring import TERMINATED, Ring, Rows
+from rejeu.replay.uniform import bootstrap_discount, discounted_sum, look_ahead
+
+
+class GoalSelectionStrategy(str, Enum):
+    """Where the goals of hindsight come from; the strings do as well."""
+
+    FUTURE = "future"
+    FINAL = "final"
+    EPISODE = "episode"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class HindsightConfig:
+    """Settings of hindsight replay (Stable-Baselines3's ``replay_buffer_kwargs``)."""
+
+    n_sampled_goal: int = 4
+    """Relabelled transitions per original one. Raising it learns more from failures and less from the real goals."""
+    goal_selection_strategy: str = "future"
+    """``future``, ``final``, ``episode`` or ``random``, or a ``GoalSelectionStrategy``."""
+    copy_info_dict: bool = False
+    """Accepted for Stable-Baselines3's sake; rejeu computes rewards without info, so only False is possible."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
+            raise ValueError(f"n_sampled_goal={self.n_sampled_goal!r} must be a whole number of at least 0")
+        try:
+            strategy = GoalSelectionStrategy(self.goal_selection_strategy)
+        except ValueError:
+            known = ", ".join(s.value for s in GoalSelectionStrategy)
+            raise ValueError(f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}") from None
+        object.__setattr__(self, "goal_selection_strategy", strategy.value)
+        if self.copy_info_dict:
+            raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
+
+
+class GoalFunctions(NamedTuple):
+    """The environment's own view of its goals, vectorised: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
+
+    reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """None where the environment does not say; steps then keep their own."""
+
+
+class HerReplayBuffer:
+    """Draws transitions uniformly from a :class:`Ring` and gives most of them a goal that was reached."""
+
+    def __init__(self, ring: Ring, gamma: float, config: HindsightConfig, goals: GoalFunctions, n_steps: int = 1) -> None:
+        self.ring = ring
+        self.gamma = gamma
+        self.config = config
+        self.goals = goals
+        self.n_steps = n_steps
+        paths = [leaf.path for leaf in ring.obs_leaves]
+        self.achieved = paths.index("achieved_goal")
+        self.desired = paths.index("desired_goal")
+
+    def size(self) -> int:
+        """Returns the number of transitions kept."""
+        return len(self.ring)
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Transition:
+        """Returns transitions, every leaf ``(*shape, ...)``, the last axis of ``shape`` being one batch.
+
+        Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances.
+        """
+        ring, n, k = self.ring, int(np.prod(shape)), self.config.n_sampled_goal
+        rows = ring.draw(rng, n)
+        index = ring.index(*rows)
+        relabelled = np.zeros(shape, bool)
+        relabelled[..., : int(shape[-1] * k / (k + 1))] = True
+        relabelled = np.flatnonzero(relabelled)
+
+        chosen = Rows(rows.env[relabelled], rows.time[relabelled])
+        goal = ring.obs[self.achieved].take(self._goal_index(rng, chosen, index[relabelled]), axis=0)
+        if self.n_steps == 1:
+            reward, terminated = ring.reward[index], ring.kind[index] == TERMINATED
+            steps = np.ones(1, np.int64)
+            following = ring.index(rows.env, rows.time + steps)
+            reached = ring.obs[self.achieved].take(following[relabelled], axis=0)
+            reward[relabelled] = self.goals.reward(reached, goal)
+            if self.goals.terminated is not None:
+                terminated[relabelled] = self.goals.terminated(reached, goal)
+        else:
+            reward, steps, terminated = self._n_step(rows, relabelled, goal)
+            following = ring.index(rows.env, rows.time + steps)
+
+        obs, next_obs = ring.observation(index), ring.observation(following)
+        obs[self.desired][relabelled] = goal
+        next_obs[self.desired][relabelled] = goal
+        return Transition(
+            ring.tree([leaf.reshape(*shape, *leaf.shape[1:]) for leaf in obs]),
+            ring.action[index].reshape(*shape, *ring.action.shape[1:]),
+            reward.reshape(shape),
+            ring.tree([leaf.reshape(*shape, *leaf.shape[1:]) for leaf in next_obs]),
+            bootstrap_discount(self.gamma, steps, terminated).reshape(shape),
+        )
+
+    def _goal_index(self, rng: np.random.Generator, rows: Rows, index: np.ndarray) -> np.ndarray:
+        """Returns where in the ring the new goals of ``rows`` stand: observations after a step, by the strategy."""
+        ring, strategy = self.ring, self.config.goal_selection_strategy
+        if strategy == "random":
+            other = ring.draw(rng, len(index))
+            return ring.index(other.env, other.time + 1)
+        until_end = ring.until_end[index]
+        end = np.where(until_end >= 0, rows.time + until_end, ring.head[rows.env])
+        if strategy == "final":
+            return ring.index(rows.env, end)
+        if strategy == "future":
+            first = rows.time + 1
+        else:
+            first = np.maximum(rows.time - ring.since_start[index], ring.oldest()[rows.env]) + 1
+        return ring.index(rows.env, rng.integers(first, end + 1))
+
+    def _n_step(
+        self, rows: Rows, relabelled: np.ndarray, goal: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns n-step reward, number of steps and ``terminated``, for the new goals where there are any."""
+        ring = self.ring
+        window = look_ahead(ring, rows, self.n_steps)
+        rewards, valid = ring.reward[window.index], window.valid.copy()
+        terminal = (ring.kind[window.index] == TERMINATED) & valid
+        following = ring.index(rows.env[relabelled, None], rows.time[relabelled, None] + 1 + np.arange(self.n_steps))
+        reached = ring.obs[self.achieved][following].reshape(-1, *goal.shape[1:])
+        goals = np.repeat(goal, self.n_steps, axis=0)
+        rewards[relabelled] = self.goals.reward(reached, goals).reshape(-1, self.n_steps)
+        if self.goals.terminated is not None:
+            ends = self.goals.terminated(reached, goals).reshape(-1, self.n_steps) & valid[relabelled]
+            terminal[relabelled] = ends
+            valid[relabelled, 1:] &= ~np.logical_or.accumulate(ends, axis=1)[:, :-1]
+            terminal &= valid
+        return discounted_sum(rewards, valid, self.gamma), valid.sum(axis=1), terminal.any(axis=1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns everything kept, as named arrays; goals are drawn anew each time, so nothing else is needed."""
+        return self.ring.arrays()
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`."""
+        self.ring.restore(arrays)

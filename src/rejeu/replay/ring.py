@@ -1,0 +1,227 @@
+"""A ring of steps per environment, addressed by absolute time.
+
+Each environment writes one endless row of time steps 0, 1, 2, ...; the ring keeps the newest ``rows`` of them. The row at
+time t holds the observation at t and, once the step was taken, its action and reward. The successor of t is the
+observation at t + 1, so every observation is stored once. Where an episode ends, one further row holds the final
+observation, marked ``LAST``; the next episode begins in the row after it. No row is ever moved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from rejeu.spaces import Leaf
+
+STEP, TERMINATED, LAST = 0, 1, 2
+"""Kinds of row: an ordinary step, a step into a terminal state of the MDP, a final observation without a step."""
+
+
+class Rows(NamedTuple):
+    """Addresses of steps: which environment, at which absolute time; both ``int64[n]``."""
+
+    env: np.ndarray
+    time: np.ndarray
+
+
+class Ring:
+    """The storage beneath every replay buffer. Mutable; ``add`` and ``begin`` write in place."""
+
+    def __init__(
+        self,
+        capacity: int,
+        n_envs: int,
+        obs_leaves: tuple[Leaf, ...],
+        obs_structure: Any,
+        action_shape: tuple[int, ...],
+        action_dtype: Any,
+    ) -> None:
+        """Reserves ``capacity // n_envs`` rows for each environment (at least 2).
+
+        Raises:
+            MemoryError: if the machine cannot hold them, with the numbers.
+        """
+        self.n_envs = n_envs
+        self.rows = max(capacity // n_envs, 2)
+        self.obs_leaves = obs_leaves
+        self.obs_structure = obs_structure
+        per_row = sum(leaf.nbytes for leaf in obs_leaves) + 4 + 1 + 8
+        per_row += math.prod(action_shape) * np.dtype(action_dtype).itemsize
+        check_memory(per_row * self.rows * n_envs, capacity)
+        n = self.rows * n_envs
+        self.obs = [np.zeros((n, *leaf.shape), leaf.dtype) for leaf in obs_leaves]
+        self.action = np.zeros((n, *action_shape), action_dtype)
+        self.reward = np.zeros(n, np.float32)
+        self.kind = np.zeros(n, np.uint8)
+        self.since_start = np.zeros(n, np.int32)
+        """Steps since the row's episode began."""
+        self.until_end = np.full(n, -1, np.int32)
+        """Steps until the ``LAST`` row of the row's episode; -1 while it runs."""
+        self.head = np.full(n_envs, -1, np.int64)
+        """Absolute time of each environment's newest row; -1 before the first."""
+        self.n_steps = np.zeros(n_envs, np.int64)
+        """Steps kept, by environment: the rows that are not ``LAST`` and not the newest."""
+        self.base = np.arange(n_envs, dtype=np.int64) * self.rows
+        self.all_envs = np.arange(n_envs)
+
+    def __len__(self) -> int:
+        """Number of steps that can be sampled."""
+        return int(self.n_steps.sum())
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes reserved."""
+        arrays = [*self.obs, self.action, self.reward, self.kind, self.since_start, self.until_end]
+        return sum(array.nbytes for array in arrays)
+
+    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
+        """Starts an episode with ``obs`` ``(n_envs, ...)`` in the environments ``envs`` (indices; None: all).
+
+        An episode that was still running there is closed where it stands, without a terminal state.
+        """
+        envs = self.all_envs if envs is None else envs
+        for env in envs[self.head[envs] >= 0]:
+            self._close(env)
+        self._advance(envs)
+        index = self.index(envs, self.head[envs])
+        self._write_obs(index, obs, envs)
+        self.since_start[index] = 0
+
+    def add(
+        self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any, envs: np.ndarray | None = None
+    ) -> None:
+        """Records one step of each environment in ``envs``; the arrays cover all environments, ``(n_envs, ...)``."""
+        envs = self.all_envs if envs is None else envs
+        index = self.index(envs, self.head[envs])
+        self.action[index] = action[envs]
+        self.reward[index] = reward[envs]
+        self.kind[index] = terminated[envs]
+        self._advance(envs)
+        self.n_steps[envs] += 1
+        following = self.index(envs, self.head[envs])
+        self._write_obs(following, next_obs, envs)
+        self.since_start[following] = self.since_start[index] + 1
+
+    def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Returns the position in the arrays of rows given by environment and absolute time."""
+        return self.base[env] + time % self.rows
+
+    def oldest(self) -> np.ndarray:
+        """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
+        return np.maximum(self.head - self.rows + 1, 0)
+
+    def draw(self, rng: np.random.Generator, n: int) -> Rows:
+        """Returns ``n`` steps drawn uniformly, with replacement, from all that are kept.
+
+        Rows are drawn until they are steps, which takes a second round for the share of ``LAST`` rows only.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        if not len(self):
+            raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
+        rows = self._draw_rows(rng, n)
+        last = self.kind[self.index(*rows)] == LAST
+        while last.any():
+            again = np.flatnonzero(last)
+            redrawn = self._draw_rows(rng, len(again))
+            rows.env[again], rows.time[again] = redrawn
+            last[again] = self.kind[self.index(*redrawn)] == LAST
+        return rows
+
+    def _draw_rows(self, rng: np.random.Generator, n: int) -> Rows:
+        oldest = self.oldest()
+        if self.n_envs == 1:
+            return Rows(np.zeros(n, np.int64), rng.integers(oldest[0], self.head[0], n))
+        ends = np.cumsum(np.maximum(self.head - oldest, 0))
+        ticket = rng.integers(ends[-1], size=n)
+        env = np.searchsorted(ends, ticket, side="right")
+        return Rows(env, self.head[env] - 1 - (ends[env] - 1 - ticket))
+
+    def observation(self, index: np.ndarray) -> list[np.ndarray]:
+        """Returns the observation leaves at positions ``index``, each ``(*index.shape, ...)``."""
+        return [leaf.take(index, axis=0) for leaf in self.obs]
+
+    def tree(self, obs_leaves: list[np.ndarray]) -> Any:
+        """Returns observation leaves in the nesting of the environment's space."""
+        return jax.tree.unflatten(self.obs_structure, obs_leaves)
+
+    def _advance(self, envs: np.ndarray) -> None:
+        """Moves the heads on by one row, forgetting what stood there."""
+        full = self.head[envs] >= self.rows - 1
+        self.head[envs] += 1
+        index = self.index(envs, self.head[envs])
+        self.n_steps[envs] -= full & (self.kind[index] != LAST)
+        self.kind[index] = STEP
+        self.until_end[index] = -1
+
+    def _close(self, env: int) -> None:
+        """Marks the newest row of ``env`` as its episode's final observation."""
+        head = int(self.head[env])
+        newest = int(self.base[env]) + head % self.rows
+        self.kind[newest] = LAST
+        length = min(int(self.since_start[newest]), self.rows - 1)
+        times = np.arange(head - length, head + 1)
+        self.until_end[self.base[env] + times % self.rows] = head - times
+
+    def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray) -> None:
+        for store, leaf in zip(self.obs, jax.tree.leaves(obs), strict=True):
+            store[index] = leaf[envs]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns everything kept as named arrays, the untouched rows left out: ``(n_envs, rows used, ...)``."""
+        used = int(min(self.head.max() + 1, self.rows))
+        split = lambda a: a.reshape(self.n_envs, self.rows, *a.shape[1:])[:, :used]  # noqa: E731
+        stored = {f"obs.{leaf.path or 'array'}": split(a) for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
+        for name in ("action", "reward", "kind", "since_start", "until_end"):
+            stored[name] = split(getattr(self, name))
+        return stored | {"head": self.head, "n_steps": self.n_steps}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Puts back what :meth:`arrays` returned; everything is checked before anything is changed.
+
+        Raises:
+            ValueError: if names, shapes or dtypes are not those of this ring.
+        """
+        own = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
+        own |= {name: getattr(self, name) for name in ("action", "reward", "kind", "since_start", "until_end")}
+        if missing := ({*own, "head", "n_steps"} ^ set(arrays)):
+            raise ValueError(f"the replay file and this buffer differ in the arrays {', '.join(sorted(missing))}")
+        head, n_steps = arrays["head"], arrays["n_steps"]
+        if head.shape != (self.n_envs,) or n_steps.shape != (self.n_envs,):
+            raise ValueError(
+                f"the replay file is of {head.size} environments and this agent has {self.n_envs}; make them equal"
+            )
+        if head.dtype != np.int64 or n_steps.dtype != np.int64 or head.min() < -1:
+            raise ValueError("the replay file's counters are damaged")
+        used = int(min(head.max() + 1, self.rows))
+        for name, array in own.items():
+            expected = (self.n_envs, used, *array.shape[1:])
+            if arrays[name].shape != expected or arrays[name].dtype != array.dtype:
+                raise ValueError(
+                    f"{name} in the replay file is {arrays[name].dtype}{list(arrays[name].shape)} and this buffer "
+                    f"expects {array.dtype}{list(expected)}; it was saved with another environment or buffer_size"
+                )
+        for name, array in own.items():
+            array.reshape(self.n_envs, self.rows, *array.shape[1:])[:, :used] = arrays[name]
+        self.head, self.n_steps = head.copy(), n_steps.copy()
+
+
+def check_memory(nbytes: int, capacity: int) -> None:
+    """Raises ``MemoryError``, with the numbers, if ``nbytes`` exceed the machine's physical memory."""
+    try:
+        import os
+
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # not on Windows: there the allocation itself says no
+        return
+    if nbytes > memory:
+        fits = int(capacity * 0.5 * memory / nbytes)
+        raise MemoryError(
+            f"buffer_size={capacity} takes {nbytes / 2**30:.1f} GiB for this environment and the machine has "
+            f"{memory / 2**30:.1f} GiB; try buffer_size={fits}"
+        )

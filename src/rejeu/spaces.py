@@ -1,0 +1,233 @@
+"""What an algorithm needs to know of an environment's spaces: their leaves, their checks, the scaling of actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from gymnasium import spaces
+
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array of an observation: static and hashable, so that a network can hold it."""
+
+    path: str
+    """Where it sits in the observation, such as ``"camera.left"``; empty for a plain array."""
+    kind: Literal["continuous", "image", "categorical", "binary"]
+    """How it is to be read; ``image`` is a uint8 array with three axes."""
+    shape: tuple[int, ...]
+    """Of one observation, without the batch axis."""
+    dtype: str
+    """As stored and handed to the network: 64-bit numbers are halved."""
+    sizes: tuple[int, ...] = ()
+    """For ``categorical``: how many values each component may take."""
+    starts: tuple[int, ...] = ()
+    """For ``categorical``: the smallest value of each component."""
+
+    @property
+    def n_features(self) -> int:
+        """Length of the vector that this leaf becomes when it is flattened and one-hot encoded."""
+        return sum(self.sizes) if self.kind == "categorical" else int(np.prod(self.shape, dtype=int))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of one observation of this leaf."""
+        return int(np.prod(self.shape, dtype=int)) * np.dtype(self.dtype).itemsize
+
+
+def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
+    """Returns the leaves of a space in the order in which JAX flattens its observations (Dict keys sorted).
+
+    Raises:
+        TypeError: for spaces that are not fixed-size arrays (Text, Graph, Sequence, OneOf).
+    """
+    if isinstance(space, spaces.Dict):
+        return tuple(
+            leaf for key in sorted(space.spaces) for leaf in leaves(space.spaces[key], f"{path}.{key}".lstrip("."))
+        )
+    if isinstance(space, spaces.Tuple):
+        return tuple(
+            leaf for i, part in enumerate(space.spaces) for leaf in leaves(part, f"{path}.{i}".lstrip("."))
+        )
+    if isinstance(space, spaces.Box):
+        is_image = space.dtype == np.uint8 and len(space.shape) == 3
+        return (Leaf(path, "image" if is_image else "continuous", space.shape, narrow(space.dtype)),)
+    if isinstance(space, spaces.Discrete):
+        return (Leaf(path, "categorical", (), "int32", (int(space.n),), (int(space.start),)),)
+    if isinstance(space, spaces.MultiDiscrete):
+        sizes = tuple(int(n) for n in space.nvec.ravel())
+        starts = tuple(int(s) for s in np.broadcast_to(space.start, space.nvec.shape).ravel())
+        return (Leaf(path, "categorical", space.nvec.shape, "int32", sizes, starts),)
+    if isinstance(space, spaces.MultiBinary):
+        return (Leaf(path, "binary", space.shape, "int8"),)
+    where = f" at {path!r}" if path else ""
+    raise TypeError(
+        f"the observation space{where} is {space}; expected Box, Discrete, MultiDiscrete or MultiBinary, in any nesting "
+        "of Dict and Tuple: wrap the environment with gymnasium.wrappers.TransformObservation"
+    )
+
+
+def structure(space: spaces.Space) -> Any:
+    """Returns the tree structure of one observation of ``space``."""
+    return jax.tree.structure(_skeleton(space))
+
+
+def narrow(dtype: Any) -> str:
+    """Returns the name of the dtype in which values are kept: 64-bit floats and integers become 32-bit ones."""
+    return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(
+        np.dtype(dtype).name, np.dtype(dtype).name
+    )
+
+
+def cast(space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
+    """Returns a batch of observations as arrays of the kept dtypes, with the same nesting; copies only what differs."""
+    arrays, tree = jax.tree.flatten(observation)
+    return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
+
+
+def check_goal_space(space: spaces.Space) -> None:
+    """Raises ``ValueError`` unless ``space`` is a goal environment's: hindsight needs the two goals."""
+    keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
+    missing = [key for key in GOAL_KEYS if keys is None or key not in keys]
+    if missing:
+        has = f"a Dict with the keys {sorted(keys)}" if keys is not None else str(space)
+        raise ValueError(
+            f"hindsight replay needs a Dict observation with {', '.join(GOAL_KEYS)}, but {', '.join(missing)} "
+            f"is missing from {has}; use a goal environment or replay_buffer_class=None"
+        )
+    assert isinstance(space, spaces.Dict)
+    if space["achieved_goal"] != space["desired_goal"]:
+        raise ValueError(
+            f"achieved_goal {space['achieved_goal']} and desired_goal {space['desired_goal']} must be the same space, "
+            "because hindsight puts the one in the other's place"
+        )
+
+
+def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
+    """Returns ``space`` if it is a finite Box with one axis or more.
+
+    Raises:
+        ValueError: otherwise, naming what to use instead.
+    """
+    if not isinstance(space, spaces.Box):
+        instead = "DQN or PPO" if isinstance(space, spaces.Discrete) else "PPO"
+        raise ValueError(f"{algorithm} needs a Box action space, got {space}; for this environment use {instead}")
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise ValueError(
+            f"{algorithm} needs finite action bounds, got low={space.low}, high={space.high}; "
+            "wrap the environment with gymnasium.wrappers.RescaleAction or declare the bounds it really has"
+        )
+    if not (space.high > space.low).all():
+        raise ValueError(f"every action bound must satisfy low < high, got low={space.low}, high={space.high}")
+    return space
+
+
+def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
+    """Returns actions in the environment's own range from what an algorithm gives.
+
+    Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``. Discrete: from 0 to n - 1 to the
+    space's own numbers.
+    """
+    if isinstance(space, spaces.Box):
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        scaled = low + 0.5 * (action.reshape(-1, *space.shape) + 1.0) * (high - low)
+        return np.clip(scaled, low, high).astype(space.dtype)
+    if isinstance(space, spaces.Discrete):
+        return action.astype(np.int64) + int(space.start)
+    raise TypeError(f"cannot scale actions of {space}")
+
+
+def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`)."""
+    if isinstance(space, spaces.Box):
+        return rng.uniform(-1.0, 1.0, (n, int(np.prod(space.shape)))).astype(np.float32)
+    if isinstance(space, spaces.Discrete):
+        return rng.integers(int(space.n), size=n, dtype=np.int32)
+    raise TypeError(f"cannot draw random actions of {space}")
+
+
+def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
+    """Returns whether two spaces hold arrays of the same structure, shapes and dtypes, and the same bounds if asked.
+
+    Observation bounds are declared differently by different backends of one environment, and nothing depends on them.
+    """
+    if bounds:
+        return describe(space) == describe(other)
+    return leaves(space) == leaves(other)
+
+
+def describe(space: spaces.Space) -> Any:
+    """Returns a JSON-able description of a space, enough to tell two of them apart; infinite bounds as strings."""
+    if isinstance(space, spaces.Dict):
+        return {"Dict": {key: describe(part) for key, part in sorted(space.spaces.items())}}
+    if isinstance(space, spaces.Tuple):
+        return {"Tuple": [describe(part) for part in space.spaces]}
+    if isinstance(space, spaces.Box):
+        return {
+            "Box": {
+                "low": _bounds(space.low),
+                "high": _bounds(space.high),
+                "shape": list(space.shape),
+                "dtype": narrow(space.dtype),
+            }
+        }
+    if isinstance(space, spaces.Discrete):
+        return {"Discrete": {"n": int(space.n), "start": int(space.start)}}
+    if isinstance(space, spaces.MultiDiscrete):
+        start = np.broadcast_to(space.start, space.nvec.shape)
+        return {"MultiDiscrete": {"nvec": space.nvec.tolist(), "start": start.tolist()}}
+    if isinstance(space, spaces.MultiBinary):
+        return {"MultiBinary": {"shape": list(space.shape)}}
+    raise TypeError(f"cannot describe the space {space}")
+
+
+def rebuild(description: Any) -> spaces.Space:
+    """Returns the space that :func:`describe` described: the inverse, over a fixed set of names.
+
+    Raises:
+        ValueError: if the description is not one that :func:`describe` writes.
+    """
+    try:
+        (kind, body), *others = description.items()
+        if others:
+            raise ValueError("more than one space")
+        if kind == "Dict":
+            return spaces.Dict({str(key): rebuild(part) for key, part in body.items()})
+        if kind == "Tuple":
+            return spaces.Tuple([rebuild(part) for part in body])
+        if kind == "Box":
+            dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
+            if dtype.kind not in "fiu":
+                raise ValueError(f"dtype {dtype}")
+            low, high = (np.asarray(body[end], np.float64).astype(dtype) for end in ("low", "high"))
+            return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
+        if kind == "Discrete":
+            return spaces.Discrete(body["n"], start=body["start"])
+        if kind == "MultiDiscrete":
+            return spaces.MultiDiscrete(body["nvec"], start=body["start"])
+        if kind == "MultiBinary":
+            return spaces.MultiBinary(body["shape"])
+    except (AttributeError, KeyError, TypeError, ValueError, AssertionError, OverflowError) as error:
+        raise ValueError(f"not the description of a space: {error}") from None
+    raise ValueError(f"not the description of a space: {kind!r}")
+
+
+def _bounds(bounds: np.ndarray) -> Any:
+    """A single number where all are equal, a nested list otherwise; infinities as the strings ``inf`` and ``-inf``."""
+    values = bounds.astype(np.float64)
+    if values.size and (values == values.flat[0]).all():
+        values = values.flat[0]
+    return jax.tree.map(lambda v: v if np.isfinite(v) else str(v), np.asarray(values).tolist())
+
+
+def _skeleton(space: spaces.Space) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: _skeleton(part) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_skeleton(part) for part in space.spaces)
+    return 0
