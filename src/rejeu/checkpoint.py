@@ -48,7 +48,7 @@ def write(path: str | Path, kind: str, arrays: Mapping[str, np.ndarray], header:
     os.close(handle)
     temporary = Path(name)
     try:
-        save_file({key: np.ascontiguousarray(value) for key, value in arrays.items()}, temporary, {HEADER_KEY: text})
+        save_file({key: np.asarray(value, order="C") for key, value in arrays.items()}, temporary, {HEADER_KEY: text})
         with temporary.open("r+b") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
