@@ -1,5 +1,10 @@
 """Environments: how rejeu steps many of them at once, and how goal environments compute rewards."""
 
+import gymnasium as gym
+
 from rejeu.envs.vector import VectorEnv, make_vector
+
+if "rejeu/Ball-v0" not in gym.registry:
+    gym.register("rejeu/Ball-v0", "rejeu.envs.ball:Ball", max_episode_steps=500)
 
 __all__ = ["VectorEnv", "make_vector"]

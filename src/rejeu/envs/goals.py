@@ -48,8 +48,8 @@ def attribute(env: Any, name: str) -> Any:
 def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Returns ``function(achieved, desired, info)`` as a function of batches of goals.
 
-    At the first call with two rows or more, it is called once with the whole batch and once for each of the first rows;
-    if the two agree it is taken to be vectorised from then on, otherwise it is called row by row.
+    At the first call with two rows or more, it is called once with the whole batch and once for each of the first eight
+    rows; if the two agree it is taken to be vectorised from then on, otherwise it is called row by row.
     """
     vectorised: bool | None = None
 
@@ -61,19 +61,26 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
         if vectorised:
             return np.asarray(function(achieved, desired, {})).astype(dtype, copy=False)
         if vectorised is None and len(achieved) > 1:
-            vectorised = _agrees(function, by_row, achieved, desired)
-            return call(achieved, desired)
+            whole = _whole(function, by_row, achieved, desired)
+            vectorised = whole is not None
+            if whole is not None:
+                return whole.astype(dtype, copy=False)
         return by_row(achieved, desired)
 
     return call
 
 
-def _agrees(function: Callable[..., Any], by_row: Callable[..., Any], achieved: np.ndarray, desired: np.ndarray) -> bool:
+def _whole(
+    function: Callable[..., Any], by_row: Callable[..., np.ndarray], achieved: np.ndarray, desired: np.ndarray
+) -> np.ndarray | None:
+    """Returns what ``function`` says of the whole batch, or None where it does not say the same of the single rows."""
     n = min(len(achieved), 8)
     try:
         whole = np.asarray(function(achieved, desired, {}))
     except Exception:  # whatever a function that expects one row says of many: it is then called row by row
-        return False
-    return whole.shape == (len(achieved),) and np.allclose(
-        whole[:n].astype(np.float64), by_row(achieved[:n], desired[:n]).astype(np.float64), rtol=1e-4, atol=1e-5
-    )
+        return None
+    if whole.shape != (len(achieved),):
+        return None
+    rows = by_row(achieved[:n], desired[:n])
+    agrees = np.allclose(whole[:n].astype(np.float64), rows.astype(np.float64), rtol=1e-4, atol=1e-5)
+    return whole if agrees else None

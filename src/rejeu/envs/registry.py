@@ -6,6 +6,7 @@ import difflib
 import importlib
 import importlib.util
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -82,7 +83,8 @@ def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
     return _Maker(env_id, kwargs)
 
 
-class _Maker(NamedTuple):
+@dataclass(frozen=True)
+class _Maker:
     env_id: str
     kwargs: dict[str, Any]
 

@@ -17,9 +17,9 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from rejeu.envs import goals as goals_module
-from rejeu.envs.registry import make_env, maker, provider, register
+from rejeu.envs.registry import make_env, maker, provider, register, unknown_environment
 from rejeu.replay.hindsight import GoalFunctions
-from rejeu.spaces import cast, leaves
+from rejeu.spaces import cast, leaves, plain, structure
 
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
@@ -119,7 +119,9 @@ def make_vector(
         return GymnasiumVector(env, seed)
     if isinstance(env, gym.Env):
         if n_envs != 1:
-            raise ValueError(f"n_envs={n_envs} needs an id or a function that makes an environment, not one environment")
+            raise ValueError(
+                f"n_envs={n_envs} needs an id or a function that makes an environment, not one environment"
+            )
         return InProcess([env], seed)
     if hasattr(env, "envs") and isinstance(env.envs, list):
         return InProcess(env.envs, seed)
@@ -137,6 +139,7 @@ def make_vector(
     if backend == "envpool":
         if env_kwargs:
             raise ValueError(f"the envpool backend takes no environment arguments, got {env_kwargs}; use 'gymnasium'")
+        check_envpool_knows(env)
         return EnvPool(env, n_envs, seed)
     return make_vector(maker(env, **env_kwargs), n_envs, backend, seed)
 
@@ -148,7 +151,9 @@ class InProcess(VectorEnv):
 
     def __init__(self, envs: Sequence[gym.Env], seed: int | None = None) -> None:
         if len({id(env) for env in envs}) < len(envs):
-            raise ValueError("the same environment was given more than once; the function must make a new one each time")
+            raise ValueError(
+                "the same environment was given more than once; the function must make a new one each time"
+            )
         self.envs = list(envs)
         self.n_envs = len(envs)
         self.observation_space = envs[0].observation_space
@@ -159,7 +164,7 @@ class InProcess(VectorEnv):
         stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
         self._stores = stores
         self._plain = isinstance(self.observation_space, gym.spaces.Box)
-        self._obs = stores[0] if self._plain else None
+        self._obs = jax.tree.unflatten(structure(self.observation_space), stores)
 
     def reset(self, seed: int | None = None) -> Any:
         seed = self._seed if seed is None else seed
@@ -181,7 +186,7 @@ class InProcess(VectorEnv):
         return Step(self._obs, reward, terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             self._store(i, self.envs[i].reset()[0])
         return self._obs
 
@@ -199,11 +204,8 @@ class InProcess(VectorEnv):
         if self._plain:
             self._stores[0][i] = obs
             return
-        parts, tree = jax.tree.flatten(obs)
-        for store, part in zip(self._stores, parts, strict=True):
+        for store, part in zip(self._stores, jax.tree.leaves(plain(self.observation_space, obs)), strict=True):
             store[i] = part
-        if self._obs is None:
-            self._obs = jax.tree.unflatten(tree, self._stores)
 
 
 class GymnasiumVector(VectorEnv):
@@ -214,12 +216,11 @@ class GymnasiumVector(VectorEnv):
     ) -> None:
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         unwrapped = env.unwrapped
-        if mode == AutoresetMode.NEXT_STEP:
-            if not isinstance(unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
-                raise ValueError(
-                    f"{type(unwrapped).__name__} resets by itself at the next step, which cannot be undone; make it with "
-                    "autoreset_mode=AutoresetMode.DISABLED or SAME_STEP"
-                )
+        if mode == AutoresetMode.NEXT_STEP and not isinstance(unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
+            raise ValueError(
+                f"{type(unwrapped).__name__} resets by itself at the next step, which cannot be undone; make it with "
+                "autoreset_mode=AutoresetMode.DISABLED or SAME_STEP"
+            )
         self.env = env
         self._same_step = mode == AutoresetMode.SAME_STEP
         self._make_one = make_one
@@ -238,24 +239,26 @@ class GymnasiumVector(VectorEnv):
     def reset(self, seed: int | None = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        return cast(self._leaves, self.env.reset(seed=seed)[0])
+        return cast(self.observation_space, self._leaves, self.env.reset(seed=seed)[0])
 
     def step(self, action: np.ndarray) -> Step:
         obs, reward, terminated, truncated, info = self.env.step(action)
-        obs = cast(self._leaves, obs)
+        obs = cast(self.observation_space, self._leaves, obs)
         if self._same_step:
             self._after_reset = obs
             done = np.flatnonzero(terminated | truncated)
             if len(done):
                 obs = jax.tree.map(np.copy, obs)
-                for i in done:
-                    _put(obs, i, info["final_obs"][i])
+                for i in done.tolist():
+                    _put(obs, i, plain(self.observation_space, info["final_obs"][i]))
         return Step(obs, np.asarray(reward, np.float32), terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
         if self._same_step:
             return self._after_reset
-        return cast(self._leaves, self.env.reset(options={"reset_mask": np.asarray(done, bool)})[0])
+        return cast(
+            self.observation_space, self._leaves, self.env.reset(options={"reset_mask": np.asarray(done, bool)})[0]
+        )
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
@@ -295,25 +298,28 @@ class EnvPool(VectorEnv):
     def _make(self, seed: int | None) -> Any:
         import envpool
 
-        seed = int(np.random.SeedSequence().generate_state(1)[0] >> 2) if seed is None else seed
+        seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        seed %= 2**31 - self.n_envs  # environment i gets seed + i, and EnvPool takes int32
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
-            return envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seed)
+            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seed)
+            pool.observation_space, pool.action_space  # noqa: B018 - made when first asked for, and kept
+        return pool
 
     def reset(self, seed: int | None = None) -> Any:
         if seed is not None:
             self._pool = self._make(seed)
-        self._obs = cast(self._leaves, self._pool.reset()[0])
+        self._obs = cast(self.observation_space, self._leaves, self._pool.reset()[0])
         return self._obs
 
     def step(self, action: np.ndarray) -> Step:
         obs, reward, terminated, truncated, info = self._pool.step(action)
-        self._obs = cast(self._leaves, obs)
+        self._obs = cast(self.observation_space, self._leaves, obs)
         return Step(self._obs, np.asarray(reward, np.float32), terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
         ended = np.flatnonzero(done).astype(np.int32)
-        fresh = cast(self._leaves, self._pool.reset(ended)[0])
+        fresh = cast(self.observation_space, self._leaves, self._pool.reset(ended)[0])
         obs = jax.tree.map(np.copy, self._obs)
         jax.tree.map(lambda whole, part: whole.__setitem__(ended, part), obs, fresh)
         self._obs = obs
@@ -324,7 +330,10 @@ class EnvPool(VectorEnv):
         return float("nan") if value is None else float(value[env])
 
     def goals(self) -> GoalFunctions | None:
-        if not isinstance(self.observation_space, gym.spaces.Dict) or "desired_goal" not in self.observation_space.keys():
+        if (
+            not isinstance(self.observation_space, gym.spaces.Dict)
+            or "desired_goal" not in self.observation_space
+        ):
             return None
         if self.env_id == "parking-v0":
             return GoalFunctions(goals_module.parking_reward)
@@ -332,6 +341,15 @@ class EnvPool(VectorEnv):
 
     def close(self) -> None:
         self._pool.close()
+
+
+def check_envpool_knows(env_id: str) -> None:
+    """Raises ``ValueError`` unless EnvPool has the environment, with the backend or the name to use instead."""
+    import envpool
+
+    if env_id not in envpool.list_all_envs():
+        known = register(env_id)
+        raise ValueError(f"EnvPool has no {env_id}; use backend='gymnasium'" if known else unknown_environment(env_id))
 
 
 def envpool_knows(env_id: str) -> bool:

@@ -1,0 +1,305 @@
+"""Vector environments that reset themselves, with Stable-Baselines3's interface, for scripts that step them by hand.
+
+Agents take a ``DummyVecEnv`` and step the environments in it themselves, without the automatic reset: what an episode
+ended in is never hidden from learning.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import concatenate, create_empty_array
+
+from rejeu.video import VideoFile, check_renders, rgb_frame
+
+Indices = int | Iterable[int] | None
+"""Which environments: one, several, or None for all."""
+
+
+class DummyVecEnv:
+    """Environments stepped one after the other in this process; an ended one is reset within the step that ended it.
+
+    Observations are arrays with a leading axis ``num_envs``, nested as the observation space is; they, rewards
+    ``float32 (num_envs,)``, dones ``bool (num_envs,)`` and the list of infos are new at every step.
+
+    Args:
+        env_fns: functions that each make a new environment.
+
+    Raises:
+        TypeError: if something else than functions is given.
+        ValueError: if two functions return the same environment.
+
+    >>> env = DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2)
+    >>> env.reset().shape
+    (2, 3)
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
+        for function in env_fns:
+            if isinstance(function, gym.Env) or not callable(function):
+                raise TypeError(
+                    f"env_fns must hold functions that make environments, got {type(function).__name__}; "
+                    "try DummyVecEnv([lambda: gymnasium.make(id)])"
+                )
+        if not env_fns:
+            raise ValueError("env_fns is empty; give one function for each environment")
+        self.envs = [function() for function in env_fns]
+        if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
+            raise ValueError("two functions of env_fns returned the same environment; each must make a new one")
+        self.num_envs = len(self.envs)
+        self.observation_space = self.envs[0].observation_space
+        self.action_space = self.envs[0].action_space
+        self.metadata = self.envs[0].metadata
+        self.render_mode = self.envs[0].render_mode
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in self.envs]
+        """What the last ``reset`` of each environment said."""
+        self._actions: Any = None
+        self._seeds: list[int | None] = [None] * self.num_envs
+        self._options: list[dict[str, Any] | None] = [None] * self.num_envs
+
+    def reset(self) -> Any:
+        """Resets every environment, with the seeds and options set before, and returns the observations."""
+        parts = []
+        for i, env in enumerate(self.envs):
+            obs, self.reset_infos[i] = env.reset(seed=self._seeds[i], options=self._options[i])
+            parts.append(copy.deepcopy(obs))
+        self._seeds, self._options = [None] * self.num_envs, [None] * self.num_envs
+        return self._stack(parts)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Steps every environment and returns observations, rewards, dones and infos.
+
+        Where an episode ended, the observation is the next episode's first, and the info has the ended one's last under
+        ``terminal_observation``. Every info says under ``TimeLimit.truncated`` whether a time limit alone ended it.
+
+        Args:
+            actions: one for each environment, in the environment's own range.
+        """
+        self.step_async(actions)
+        return self.step_wait()
+
+    def step_async(self, actions: Any) -> None:
+        """Notes the actions of the next :meth:`step_wait`."""
+        if len(actions) != self.num_envs:
+            raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Takes the step of :meth:`step_async` and returns what :meth:`step` does."""
+        parts, infos = [], []
+        rewards, dones = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
+        for i, env in enumerate(self.envs):
+            obs, rewards[i], terminated, truncated, info = env.step(self._actions[i])
+            obs = copy.deepcopy(obs)  # an environment may write its next observation into the same array
+            info = {**info, "TimeLimit.truncated": bool(truncated and not terminated)}
+            dones[i] = terminated or truncated
+            if dones[i]:
+                info["terminal_observation"] = obs
+                obs, self.reset_infos[i] = env.reset()
+                obs = copy.deepcopy(obs)
+            parts.append(obs)
+            infos.append(info)
+        return self._stack(parts), rewards, dones, infos
+
+    def _stack(self, parts: list[Any]) -> Any:
+        space = self.observation_space
+        empty: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, parts, empty)
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Seeds the next :meth:`reset`, each environment by one more than the one before; returns the seeds."""
+        first = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
+        self._seeds = [first + i for i in range(self.num_envs)]
+        return self._seeds
+
+    def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
+        """Sets the options of the next :meth:`reset`: one dict for all environments, or one for each."""
+        one_for_all = options is None or isinstance(options, dict)
+        each: list[Any] = [options] * self.num_envs if one_for_all else list(options or ())
+        self._options = copy.deepcopy(each)
+
+    def close(self) -> None:
+        """Closes every environment."""
+        for env in self.envs:
+            env.close()
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """Returns all environments' pictures as one, ``uint8 (height, width, 3)``, or None if they show themselves.
+
+        Args:
+            mode: accepted if it is the mode that the environments were made with; None is that mode.
+        """
+        if mode is not None and mode != self.render_mode:
+            raise ValueError(f"render(mode={mode!r}): the environments were made with render_mode={self.render_mode!r}")
+        if self.render_mode == "human":
+            self.env_method("render")
+            return None
+        return tile(self.get_images())
+
+    def get_images(self) -> list[np.ndarray]:
+        """Returns the picture of each environment, ``uint8 (height, width, 3)``."""
+        check_renders(self)
+        return [rgb_frame(env) for env in self.envs]
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Returns whether every environment, or a wrapper around it, has the attribute."""
+        return all(env.has_wrapper_attr(attr_name) for env in self.envs)
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Returns an attribute of each environment, found through its wrappers."""
+        return [env.get_wrapper_attr(attr_name) for env in self._chosen(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Sets an attribute of each environment.
+
+        It is set where it exists, be that beneath wrappers. (Stable-Baselines3 sets it on the outermost wrapper, where
+        the environment itself does not see it.)
+        """
+        for env in self._chosen(indices):
+            env.set_wrapper_attr(attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of each environment, found through its wrappers, and returns what each returned."""
+        return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in self._chosen(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Returns for each environment whether a wrapper of that class is around it."""
+        return [_is_wrapped(env, wrapper_class) for env in self._chosen(indices)]
+
+    def _chosen(self, indices: Indices) -> list[gym.Env]:
+        chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
+        return [self.envs[i] for i in chosen]
+
+    @property
+    def unwrapped(self) -> DummyVecEnv:
+        """Itself."""
+        return self
+
+
+class VecVideoRecorder:
+    """Records what a vector environment looks like while it is stepped.
+
+    A recording begins at a reset or step where the trigger says so, has the frame of that moment and one for each of
+    the next ``video_length`` steps, and becomes ``{name_prefix}-step-{begin}-to-step-{begin + video_length}.mp4``, also
+    if ``close`` or a further triggered ``reset`` ends it early. Several environments are shown side by side. Frames go
+    to the file as they come.
+
+    Whatever else is asked of it, it hands on to ``venv``, except ``envs``: stepping those directly, as agents do, would
+    record nothing.
+
+    Args:
+        venv: a :class:`DummyVecEnv` whose environments were made with ``render_mode="rgb_array"``, or another recorder.
+        video_folder: where the files go; made if missing.
+        record_video_trigger: told the number of steps so far, says whether to begin a recording.
+        video_length: steps in a recording.
+        name_prefix: of the files' names.
+
+    Raises:
+        MissingExtra: if imageio-ffmpeg is not installed.
+        ValueError: if the environments do not render to arrays.
+    """
+
+    def __init__(
+        self,
+        venv: DummyVecEnv | VecVideoRecorder,
+        video_folder: str | Path,
+        record_video_trigger: Callable[[int], bool],
+        video_length: int = 200,
+        name_prefix: str = "rl-video",
+    ) -> None:
+        check_renders(venv)
+        self.venv = venv
+        self.video_folder = Path(video_folder).absolute()
+        self.video_folder.mkdir(parents=True, exist_ok=True)
+        self.record_video_trigger = record_video_trigger
+        self.video_length = video_length
+        self.name_prefix = name_prefix
+        self.frames_per_sec = float(venv.metadata.get("render_fps") or 30)
+        self.step_id = 0
+        """Steps so far."""
+        self.video_path: Path | None = None
+        """Of the present or last recording."""
+        self._video: VideoFile | None = None
+
+    @property
+    def recording(self) -> bool:
+        """Whether a recording is under way."""
+        return self._video is not None
+
+    def reset(self) -> Any:
+        """Resets the environments and returns the observations."""
+        obs = self.venv.reset()
+        if self.record_video_trigger(self.step_id):
+            self._begin()
+        return obs
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Steps the environments and returns observations, rewards, dones and infos."""
+        self.venv.step_async(actions)
+        return self.step_wait()
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Takes the step noted by ``step_async`` and returns what :meth:`step` does."""
+        result = self.venv.step_wait()
+        self.step_id += 1
+        if self._video is not None:
+            self._capture(self._video)
+        elif self.record_video_trigger(self.step_id):
+            self._begin()
+        return result
+
+    def close(self) -> None:
+        """Completes the recording that is under way and closes the environments."""
+        self._end()
+        self.venv.close()
+
+    def _begin(self) -> None:
+        self._end()
+        name = f"{self.name_prefix}-step-{self.step_id}-to-step-{self.step_id + self.video_length}.mp4"
+        self.video_path = self.video_folder / name
+        self._video = VideoFile(self.video_path, self.frames_per_sec)
+        self._capture(self._video)
+
+    def _capture(self, video: VideoFile) -> None:
+        try:
+            video.write(tile(self.venv.get_images()))
+        except BaseException:
+            video.discard()
+            self._video = None
+            raise
+        if video.n_frames > self.video_length:
+            self._end()
+
+    def _end(self) -> None:
+        if self._video is not None:
+            video, self._video = self._video, None
+            video.close()
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("venv", "envs"):
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.venv, name)
+
+
+def tile(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Returns pictures of one shape as one picture, in rows of a near-square grid; places left over are black."""
+    rows = math.ceil(math.sqrt(len(images)))
+    columns = math.ceil(len(images) / rows)
+    filled = [*images, *[np.zeros_like(images[0])] * (rows * columns - len(images))]
+    return np.concatenate([np.concatenate(filled[r * columns : (r + 1) * columns], axis=1) for r in range(rows)])
+
+
+def _is_wrapped(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> bool:
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, wrapper_class):
+            return True
+        env = env.env
+    return False

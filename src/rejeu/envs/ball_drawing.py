@@ -1,0 +1,214 @@
+"""How the ball is drawn: position against time in one dimension, the plane in two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rejeu.errors import MissingExtra
+
+Colour = tuple[int, int, int]
+Point = tuple[float, float]
+
+PAPER, INSIDE, OUTSIDE = (246, 246, 243), (255, 255, 255), (244, 235, 232)
+INK, FAINT, GRID = (52, 58, 70), (140, 146, 156), (232, 234, 238)
+OLD_TRAIL, NEW_TRAIL = (214, 225, 240), (40, 104, 190)
+BALL, HELD, LOST, PUSH = (40, 104, 190), (38, 150, 96), (205, 62, 52), (236, 140, 38)
+FINE = 2
+"""Everything is drawn this many times larger and then reduced, which smooths the edges."""
+FADING = 80
+"""Steps over which the trail fades."""
+MARGIN = 2.2
+"""What is seen beyond the walls, in units of position."""
+SIZES = {1: (900, 460), 2: (620, 666)}
+"""Width and height of the picture in pixels, by dimension; even, as videos want them."""
+
+
+class BallDrawing:
+    """One picture or window, drawn anew at every step. Mutable."""
+
+    def __init__(self, dimension: int, render_mode: str, fps: float, wall: float, n_steps: int) -> None:
+        """Opens the window if there is to be one.
+
+        Raises:
+            MissingExtra: if pygame is not installed.
+        """
+        try:
+            import pygame
+        except ImportError:
+            raise MissingExtra("drawing the ball", "pygame", "parking") from None
+        self.pygame: Any = pygame
+        self.dimension = dimension
+        self.fps = fps
+        self.wall = wall
+        self.n_steps = n_steps
+        self.size = width, height = SIZES[dimension]
+        pygame.font.init()
+        self.canvas = pygame.Surface((width * FINE, height * FINE))
+        self.font = pygame.font.Font(None, 22 * FINE)
+        self.large_font = pygame.font.Font(None, 30 * FINE)
+        self.window: Any = None
+        self.clock = pygame.time.Clock()
+        if render_mode == "human":
+            pygame.display.init()
+            pygame.display.set_caption("rejeu/Ball-v0")
+            self.window = pygame.display.set_mode(self.size)
+        self.left, self.top = (64, 72) if dimension == 1 else (46, 76)
+        self.right, self.bottom = width - 26, height - (48 if dimension == 1 else 42)
+        self._draw_field()
+        self.field = self.canvas.copy()
+
+    def draw(self, trail: Sequence[Sequence[float]], push: Sequence[float], step: int, over: bool) -> np.ndarray | None:
+        """Draws the positions of ``trail``, oldest first, the last ``push`` and the ball after ``step`` steps.
+
+        Returns ``uint8 (height, width, 3)``, or None where there is a window.
+        """
+        lost = over and bool(trail) and max(map(abs, trail[-1])) > self.wall
+        colour = BALL if not over else LOST if lost else HELD
+        self.canvas.blit(self.field, (0, 0))
+        points = self._points(trail, step)
+        self._draw_trail(points)
+        if points:
+            if len(push) and len(points) > 1:
+                self._draw_push(points[-2], push)
+            self._draw_ball(points[-1], colour)
+        self._draw_caption(step, colour, over, lost)
+        picture = self.pygame.transform.smoothscale(self.canvas, self.size)
+        if self.window is None:
+            return np.ascontiguousarray(self.pygame.surfarray.array3d(picture).swapaxes(0, 1))
+        self.pygame.event.pump()
+        self.window.blit(picture, (0, 0))
+        self.pygame.display.flip()
+        self.clock.tick(self.fps)
+        return None
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        if self.window is not None:
+            self.pygame.display.quit()
+            self.window = None
+
+    def _x(self, value: float) -> float:
+        low, high = (0.0, float(self.n_steps)) if self.dimension == 1 else (-self.wall - MARGIN, self.wall + MARGIN)
+        return self.left + (self.right - self.left) * (value - low) / (high - low)
+
+    def _y(self, value: float) -> float:
+        reach = self.wall + MARGIN
+        return self.bottom - (self.bottom - self.top) * (value + reach) / (2 * reach)
+
+    def _points(self, trail: Sequence[Sequence[float]], step: int) -> list[Point]:
+        """Returns where the trail's positions are in the picture; what is further out than its edge is on the edge."""
+        reach = self.wall + MARGIN
+        clipped = [[min(max(x, -reach), reach) for x in position] for position in trail]
+        if self.dimension == 1:
+            first = step - len(clipped) + 1
+            return [(self._x(first + i), self._y(position[0])) for i, position in enumerate(clipped)]
+        return [(self._x(position[0]), self._y(position[1])) for position in clipped]
+
+    def _draw_field(self) -> None:
+        """Draws what stays as it is: the box, its walls and the scales."""
+        self.canvas.fill(PAPER)
+        wall = self.wall
+        west, east = (0, self.n_steps) if self.dimension == 1 else (-wall, wall)
+        self._rectangle((self.left, self.top), (self.right, self.bottom), OUTSIDE)
+        self._rectangle((self._x(west), self._y(wall)), (self._x(east), self._y(-wall)), INSIDE)
+        ticks = [-wall, -wall / 2, 0.0, wall / 2, wall]
+        for tick in ticks:
+            self._line((self._x(west), self._y(tick)), (self._x(east), self._y(tick)), GRID, 1.2)
+            self._text(_number(tick), (self.left - 9, self._y(tick)), FAINT, "right")
+        for tick in range(0, self.n_steps + 1, self.n_steps // 5) if self.dimension == 1 else ticks:
+            if self.dimension == 2 or tick > 0:
+                self._line((self._x(tick), self._y(-wall)), (self._x(tick), self._y(wall)), GRID, 1.2)
+            self._text(_number(tick), (self._x(tick), self.bottom + 15), FAINT, "centre")
+        corners = [(self._x(x), self._y(y)) for x, y in ((west, wall), (east, wall), (east, -wall), (west, -wall))]
+        sides = ((0, 1), (2, 3)) if self.dimension == 1 else ((0, 1), (1, 2), (2, 3), (3, 0))
+        for start, end in sides:
+            self._line(corners[start], corners[end], INK, 2.5)
+
+    def _draw_trail(self, points: list[Point]) -> None:
+        """Draws the way so far; in the plane its older part in one faint colour, beneath the rest."""
+        n_old = len(points) if self.dimension == 1 else max(len(points) - FADING, 0)
+        if n_old > 1:
+            fine = [(x * FINE, y * FINE) for x, y in points[: n_old + 1]]
+            colour, width = (NEW_TRAIL, 1.6) if self.dimension == 1 else (OLD_TRAIL, 1.0)
+            self.pygame.draw.lines(self.canvas, colour, False, fine, round(width * FINE))
+        for i in range(max(n_old, 1), len(points)):
+            freshness = 1.0 - (len(points) - 1 - i) / FADING
+            colour = _mix(OLD_TRAIL, NEW_TRAIL, freshness**2)
+            self._line(points[i - 1], points[i], colour, 1.6)
+            self._disc(points[i], 1.2 + 1.2 * freshness, colour)
+        if points:
+            self._disc(points[0], 4.5, FAINT)
+            self._disc(points[0], 2.8, INSIDE)
+
+    def _draw_push(self, origin: Point, push: Sequence[float]) -> None:
+        """Draws the push as an arrow from where the ball was."""
+        scale = (self.bottom - self.top) / (2 * (self.wall + MARGIN))
+        along = np.array([0.0, -push[0]] if self.dimension == 1 else [push[0], -push[1]]) * scale
+        length = float(np.hypot(*along))
+        if length < 3.0:
+            return
+        unit, base = along / length, np.array(origin)
+        across, head = np.array([-unit[1], unit[0]]), min(9.0, length)
+        neck = base + unit * (length - head)
+        self._line(tuple(base), tuple(neck), PUSH, 3.0)
+        self._polygon([base + along, neck + across * head * 0.5, neck - across * head * 0.5], PUSH)
+
+    def _draw_ball(self, centre: Point, colour: Colour) -> None:
+        radius = 9.0
+        self._disc((centre[0], centre[1] + 1.5), radius + 1.5, _mix(INSIDE, INK, 0.25))
+        for i in range(8):
+            share = i / 7
+            shift, tint = 0.33 * radius * share, 0.75 * share**2
+            self._disc((centre[0] - shift, centre[1] - shift), radius * (1 - 0.85 * share), _mix(colour, INSIDE, tint))
+
+    def _draw_caption(self, step: int, colour: Colour, over: bool, lost: bool) -> None:
+        said = f"lost in step {step}" if lost else f"held for {step} steps" if over and step else f"step {step}"
+        self._text(said, (self.left, 30), colour if over else INK, "left", self.large_font)
+        self._text(f"of {self.n_steps}", (self.right, 30), FAINT, "right")
+        self._rectangle((self.left, 50), (self.right, 55), GRID)
+        filled = self.left + (self.right - self.left) * min(step / self.n_steps, 1.0)
+        self._rectangle((self.left, 50), (filled, 55), colour)
+
+    def _rectangle(self, corner: Point, opposite: Point, colour: Colour) -> None:
+        left, top = round(corner[0] * FINE), round(corner[1] * FINE)
+        width, height = round(opposite[0] * FINE) - left, round(opposite[1] * FINE) - top
+        self.pygame.draw.rect(self.canvas, colour, (left, top, width, height))
+
+    def _line(self, start: Sequence[float], end: Sequence[float], colour: Colour, width: float) -> None:
+        """Draws a line with round ends; pygame's own wide lines are cut off slanting."""
+        along = np.subtract(end, start)
+        length = float(np.hypot(*along))
+        if length > 0.0:
+            across = np.array([-along[1], along[0]]) * (0.5 * width / length)
+            self._polygon([start + across, end + across, end - across, start - across], colour)
+        if width < 2.0:
+            self._disc(start, 0.5 * width, colour)
+            self._disc(end, 0.5 * width, colour)
+
+    def _polygon(self, points: Sequence[Any], colour: Colour) -> None:
+        self.pygame.draw.polygon(self.canvas, colour, [(float(x) * FINE, float(y) * FINE) for x, y in points])
+
+    def _disc(self, centre: Sequence[float], radius: float, colour: Colour) -> None:
+        self.pygame.draw.circle(
+            self.canvas, colour, (float(centre[0]) * FINE, float(centre[1]) * FINE), max(radius * FINE, 1.0)
+        )
+
+    def _text(self, text: str, place: Point, colour: Colour, side: str, font: Any = None) -> None:
+        """Writes ``text`` with its middle line at ``place``, which is its ``side``: left, right or centre."""
+        drawn = (font or self.font).render(text, True, colour)
+        x = place[0] * FINE - {"left": 0.0, "centre": 0.5, "right": 1.0}[side] * drawn.get_width()
+        self.canvas.blit(drawn, (round(x), round(place[1] * FINE - 0.5 * drawn.get_height())))
+
+
+def _mix(first: Colour, second: Colour, share: float) -> Colour:
+    """Returns the colour ``share`` of the way from ``first`` to ``second``."""
+    red, green, blue = (round(a + (b - a) * share) for a, b in zip(first, second, strict=True))
+    return red, green, blue
+
+
+def _number(value: float) -> str:
+    """Returns a number with a true minus sign."""
+    return f"{value:g}".replace("-", "\N{MINUS SIGN}")

@@ -1,0 +1,1 @@
+"""What Stable-Baselines3 has in ``common``."""

@@ -1,0 +1,5 @@
+"""Replay buffers."""
+
+from rejeu.replay.uniform import ReplayBuffer
+
+__all__ = ["ReplayBuffer"]

@@ -1,0 +1,5 @@
+"""Watching episodes."""
+
+from rejeu.envs.monitor import Monitor
+
+__all__ = ["Monitor"]

@@ -1,0 +1,5 @@
+"""Noise on actions."""
+
+from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+
+__all__ = ["NormalActionNoise", "OrnsteinUhlenbeckActionNoise"]
