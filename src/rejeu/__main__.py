@@ -1,0 +1,8 @@
+"""``python -m rejeu`` is the command ``rejeu``."""
+
+import sys
+
+from rejeu.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

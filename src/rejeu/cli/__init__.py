@@ -1,0 +1,76 @@
+"""The command ``rejeu``: one file a command.
+
+What a command needs is imported when it runs, so that asking for help is quick.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import tyro
+
+from rejeu.cli import evaluate, list as listing, record, train
+
+COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
+    "train": (train.Train, train.run),
+    "evaluate": (evaluate.Evaluate, evaluate.run),
+    "record": (record.Record, record.run),
+    "list": (listing.List, listing.run),
+}
+"""Each command's arguments, and the function that takes them and returns the exit status."""
+
+DESCRIPTION = """Trains agents on Gymnasium environments.
+
+The shortest use: rejeu train parking-v0. Version: rejeu --version."""
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit status: 0, 2 after an error, 130 after Ctrl-C.
+
+    Args:
+        argv: without the program's name; None takes the process's own.
+
+    Raises:
+        SystemExit: after ``--help``, or if the arguments cannot be read.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    if [*argv] == ["--version"]:
+        from rejeu import __version__
+
+        print(f"rejeu {__version__}")
+        return 0
+    arguments = tyro.extras.subcommand_cli_from_dict(
+        {name: kind for name, (kind, _) in COMMANDS.items()}, prog="rejeu", description=DESCRIPTION, args=argv
+    )
+    run = next(function for kind, function in COMMANDS.values() if isinstance(arguments, kind))
+    try:
+        return run(arguments)
+    except KeyboardInterrupt:
+        print("rejeu: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except expected_errors() as error:
+        print(f"rejeu: error: {one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def expected_errors() -> tuple[type[Exception], ...]:
+    """Returns the errors whose message is meant for the user; the others are defects and keep their traceback."""
+    import gymnasium
+
+    from rejeu import errors
+
+    own = (errors.BadEnvironmentError, gymnasium.error.Error)
+    return ValueError, TypeError, ImportError, OSError, MemoryError, *own
+
+
+def one_line(error: Exception) -> str:
+    r"""Returns an error's message on one line, or its kind if it has none.
+
+    >>> one_line(ValueError("two\n  lines")), one_line(MemoryError())
+    ('two lines', 'MemoryError')
+    """
+    return " ".join(str(error).split()) or type(error).__name__

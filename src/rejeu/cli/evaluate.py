@@ -1,0 +1,47 @@
+"""``rejeu evaluate``: how good a trained agent is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from rejeu.cli import run_folder
+from rejeu.cli.run_folder import Which
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Plays whole episodes with a trained agent's deterministic policy and prints what they came to."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of a run, or a .safetensors file."""
+    episodes: Annotated[int, arg(metavar="N")] = 100
+    """How many."""
+    backend: Annotated[str, arg(metavar="NAME")] = "auto"
+    """auto, envpool, gymnasium or gymnasium-async; gymnasium is the environment's own package."""
+    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Of the environments; one is drawn if none is given."""
+    which: Which = "best"
+    """Of a folder: the model that evaluated best in training, or the last."""
+
+
+def run(arguments: Evaluate) -> int:
+    """Evaluates, prints one line, and returns the exit status."""
+    from rejeu import load
+    from rejeu.config import whole
+    from rejeu.envs.vector import make_vector
+
+    episodes = whole("--episodes", arguments.episodes, least=1)
+    model = run_folder.find_model(arguments.run, arguments.which)
+    env_id = run_folder.environment_of(model)
+    agent = load(model)
+    env = make_vector(env_id, min(episodes, 16), arguments.backend, arguments.seed)  # type: ignore[arg-type]
+    try:
+        print(f"{env_id} on {env.backend}, {model}", flush=True)
+        print(agent.evaluate(episodes, env=env), flush=True)
+    finally:
+        env.close()
+    return 0

@@ -1,0 +1,317 @@
+"""``rejeu train``: from the name of an environment to a run folder with a trained agent, a curve and a video."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from rejeu.cli import run_folder, settings
+from rejeu.cli.run_folder import RunConfig, RunFolder
+
+if TYPE_CHECKING:
+    from rejeu.agents import Agent
+    from rejeu.callbacks import Evaluate, Evaluated
+    from rejeu.envs.vector import VectorEnv
+    from rejeu.logging import Sink
+    from rejeu.presets import Preset
+
+VIDEO_EPISODES = 3
+VIDEO_STEPS = 600
+"""Most steps filmed, for a poor policy's episodes are long and highway-env draws some 70 a second."""
+
+say = partial(print, flush=True)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Trains an agent and leaves a run folder: models, tables, learning curve, video.
+
+    Ctrl-C stops cleanly and saves everything. Example: rejeu train Pendulum-v1 --steps 20000 --set learning_rate=1e-3
+    """
+
+    env: Annotated[Positional[str], arg(metavar="ENV")]
+    """Id of an environment, such as parking-v0."""
+    algo: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Algorithm; by default the preset's, else the one that fits the environment's actions."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Environment steps to take, over all environments; by default the preset's, else 100000."""
+    minutes: Annotated[float | None, arg(metavar="M", help_behavior_hint="")] = None
+    """Train for so many minutes instead."""
+    envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Environments stepped at once; by default the preset's, else 1."""
+    backend: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto: EnvPool where it knows ENV."""
+    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Seeds everything; one is drawn if none is given."""
+    assignments: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
+    """Hyper-parameters, dotted where nested: policy_kwargs.net_arch=[64,64] train_freq=[1,"episode"]."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Run folder, new or empty; by default one under runs, named after the run and the time."""
+    evaluate_every: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Environment steps between two evaluations; by default the preset's, else 5000."""
+    evaluate_episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Episodes of each evaluation; by default the preset's, else 20."""
+
+
+def run(arguments: Train) -> int:
+    """Trains and returns the exit status: 0, or 130 after Ctrl-C."""
+    began = time.perf_counter()
+    from rejeu import compilation, presets
+
+    compiled_before = compilation.seconds()
+    check(arguments)
+    algorithm = None if arguments.algo is None else algorithm_name(arguments.algo)
+    preset = presets.find(arguments.env, algorithm)
+    seed = draw_seed() if arguments.seed is None else arguments.seed
+    with closing(make_env(arguments, preset, seed)) as env:
+        config = plan(arguments, preset, algorithm or choose_algorithm(preset, env), env, seed)
+        agent = make_agent(config, env)
+        with closing(make_evaluation_env(config)) as evaluation_env:
+            folder = run_folder.create(arguments.out, config.env, config.algorithm, seed)
+            run_folder.write_config(folder, config)
+            say(header(config, folder))
+            evaluate = train(agent, config, evaluation_env, folder)
+        picture(agent, evaluate, config, folder)
+        seconds, compile_seconds = time.perf_counter() - began, compilation.seconds() - compiled_before
+        say(summary(agent, evaluate, folder, seconds, compile_seconds))
+    return 130 if agent.interrupted else 0
+
+
+def check(arguments: Train) -> None:
+    """Raises ValueError or OSError for what is wrong before anything is made."""
+    from rejeu.agents import whole_seed
+    from rejeu.config import number, whole
+
+    if arguments.steps is not None and arguments.minutes is not None:
+        raise ValueError("--steps and --minutes exclude each other; give one of them")
+    for name in ("steps", "envs", "evaluate_every", "evaluate_episodes"):
+        if getattr(arguments, name) is not None:
+            whole(f"--{name.replace('_', '-')}", getattr(arguments, name), least=1)
+    if arguments.minutes is not None:
+        number("--minutes", arguments.minutes, above=0)
+    if arguments.seed is not None:
+        whole_seed(arguments.seed)
+    run_folder.check_free(arguments.out)
+
+
+def algorithm_name(given: str) -> str:
+    """Returns the name of an algorithm in its own spelling.
+
+    Raises:
+        ValueError: if there is none of that name.
+
+    >>> algorithm_name("sac")
+    'SAC'
+    """
+    import difflib
+
+    from rejeu import AGENTS
+
+    known = {name.lower(): name for name in AGENTS}
+    if given.lower() in known:
+        return known[given.lower()]
+    near = difflib.get_close_matches(given.lower(), known, n=1, cutoff=0.5)
+    hint = f"did you mean {known[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
+    raise ValueError(f"no algorithm is called {given!r}; {hint}")
+
+
+def draw_seed() -> int:
+    """Returns a seed of at most four digits, which a person can copy."""
+    import numpy as np
+
+    return int(np.random.default_rng().integers(10_000))
+
+
+def make_env(arguments: Train, preset: Preset | None, seed: int) -> VectorEnv:
+    """Returns the environments to train on."""
+    from rejeu.envs.vector import make_vector
+
+    n_envs = arguments.envs or (preset.n_envs if preset else 1)
+    backend = arguments.backend or (preset.backend if preset else "auto")
+    return make_vector(arguments.env, n_envs, backend, seed)  # type: ignore[arg-type]
+
+
+def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
+    """Returns the preset's algorithm, or one that takes the environment's actions.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    from rejeu import presets
+
+    if preset is not None:
+        return preset.algorithm
+    kind = type(env.action_space).__name__
+    if kind not in presets.ALGORITHM_FOR:
+        known = ", ".join(f"{name} takes {space}" for space, name in presets.ALGORITHM_FOR.items())
+        raise ValueError(f"{env.env_id} has the actions {env.action_space}, which no algorithm here takes; {known}")
+    return presets.ALGORITHM_FOR[kind]
+
+
+def plan(arguments: Train, preset: Preset | None, algorithm: str, env: VectorEnv, seed: int) -> RunConfig:
+    """Returns what will be done: what the arguments say, and where they are silent the preset or the defaults.
+
+    Raises:
+        TypeError: for an unknown hyper-parameter, with the nearest known one.
+        ValueError: for a bad value.
+    """
+    from gymnasium import spaces
+
+    from rejeu import AGENTS, config as configs, presets
+
+    base = presets.default(env.env_id, algorithm) if preset is None else preset
+    given = settings.apply(chain.from_iterable(arguments.assignments), base.hyperparameters)
+    nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
+    return RunConfig(
+        env=env.env_id,
+        algorithm=algorithm,
+        preset=preset is not None,
+        hyperparameters=configs.to_json(configs.build(AGENTS[algorithm].algorithm.Config, given)),
+        policy="MultiInputPolicy" if nested else "MlpPolicy",
+        seed=seed,
+        n_envs=env.n_envs,
+        backend=env.backend,
+        steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
+        minutes=arguments.minutes,
+        evaluate_every=arguments.evaluate_every or base.evaluate_every,
+        evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
+    )
+
+
+def make_agent(config: RunConfig, env: VectorEnv) -> Agent:
+    """Returns the agent that a configuration describes."""
+    from rejeu import AGENTS
+
+    return AGENTS[config.algorithm](config.policy, env, seed=config.seed, **config.hyperparameters)
+
+
+def make_evaluation_env(config: RunConfig) -> VectorEnv:
+    """Returns up to 16 environments like those of training, seeded apart from them."""
+    import numpy as np
+
+    from rejeu.envs.vector import make_vector
+
+    seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
+    backend = "envpool" if config.backend == "envpool" else "gymnasium"
+    return make_vector(config.env, min(config.evaluate_episodes, 16), backend, seed)  # type: ignore[arg-type]
+
+
+def train(agent: Agent, config: RunConfig, evaluation_env: VectorEnv, folder: RunFolder) -> Evaluate:
+    """Trains, evaluates and saves; whatever ends it, the tables hold all that happened. Returns the evaluations."""
+    from rejeu import errors
+    from rejeu.callbacks import Evaluate
+    from rejeu.logging import CsvFile
+
+    metrics, table = CsvFile(folder.metrics), CsvFile(folder.evaluations)
+    evaluate = Evaluate(
+        evaluation_env, config.evaluate_every, config.evaluate_episodes, folder.best, report=reporter(agent, table)
+    )
+    try:
+        agent.learn(
+            config.steps,
+            evaluate,
+            log_interval=4 * config.n_envs,
+            progress_bar=True,
+            minutes=config.minutes,
+            sinks=[metrics],
+        )
+        agent.save(folder.agent)
+        evaluated_last = bool(evaluate.results) and evaluate.results[-1].step == agent.num_timesteps
+        if not agent.interrupted and not evaluated_last:
+            evaluate.run(agent, agent.num_timesteps)
+        if not evaluate.results:
+            agent.save(folder.best)
+    except errors.BadEnvironmentError:
+        agent.save(folder.agent)
+        raise
+    finally:
+        agent.history.write_csv(folder.episodes)
+        metrics.close()
+        table.close()
+    return evaluate
+
+
+def reporter(agent: Agent, table: Sink) -> Callable[[Evaluated, bool], None]:
+    """Returns what prints an evaluation and adds it to a table."""
+
+    def report(result: Evaluated, is_best: bool) -> None:
+        evaluation = result.evaluation
+        table.write(
+            result.step,
+            {
+                "seconds": agent.seconds["total"],
+                "success_rate": evaluation.success_rate,
+                "mean_return": evaluation.mean_return,
+                "std_return": evaluation.std_return,
+                "mean_length": evaluation.mean_length,
+                "episodes": len(evaluation.returns),
+                "best": int(is_best),
+            },
+        )
+        success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
+        say(f"step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}")
+
+    return report
+
+
+def picture(agent: Agent, evaluate: Evaluate, config: RunConfig, folder: RunFolder) -> None:
+    """Draws the curve and, unless Ctrl-C ended training, films the best model; says so where either is impossible."""
+    import gymnasium
+
+    from rejeu import load, plots
+    from rejeu.video import record_video
+
+    try:
+        plots.learning_curve(
+            agent.history, folder.curve, evaluations=evaluate.results, title=f"{config.env}, {config.algorithm}"
+        )
+    except ImportError as error:
+        say(f"no curve: {error}")
+    if agent.interrupted:
+        say(f"no video after Ctrl-C; rejeu record {folder.path} makes one")
+        return
+    try:
+        record_video(load(folder.best), folder.video, config.env, VIDEO_EPISODES, VIDEO_STEPS, config.seed)
+    except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
+        say(f"no video: {' '.join(str(error).split())}")
+
+
+def header(config: RunConfig, folder: RunFolder) -> str:
+    """Returns what a run says of itself before it begins."""
+    what = "preset" if config.preset else "default hyper-parameters"
+    span = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
+    every = f"evaluated on {config.evaluate_episodes} episodes every {config.evaluate_every:,} steps"
+    return "\n".join(
+        [
+            f"environment   {config.env}, {config.n_envs} at once on {config.backend}",
+            f"algorithm     {config.algorithm}, {what}, seed {config.seed}",
+            f"training      {span}, {every}",
+            f"run folder    {folder.path}",
+        ]
+    )
+
+
+def summary(agent: Agent, evaluate: Evaluate, folder: RunFolder, seconds: float, compile_seconds: float) -> str:
+    """Returns what a run says at its end."""
+    lines = ["", "stopped by Ctrl-C; everything is saved"] if agent.interrupted else [""]
+    if evaluate.best is not None:
+        lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
+    files = ", ".join(sorted(path.name for path in folder.path.iterdir()))
+    return "\n".join(
+        [
+            *lines,
+            f"files         {folder.path}: {files}",
+            f"time          {seconds:.1f} s in all, {compile_seconds:.1f} s of them compiling; "
+            f"{agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s",
+            f"try it        rejeu evaluate {folder.path} --backend gymnasium",
+        ]
+    )

@@ -1,0 +1,82 @@
+import sys
+
+import numpy as np
+import pytest
+
+from rejeu.errors import MissingExtra
+from rejeu.evaluation import Evaluation
+from rejeu.history import History
+from rejeu.loops.host import Episode
+from rejeu.plots import learning_curve
+
+
+def history(n=200, success=float("nan")):
+    return History([Episode(1_000 * (i + 1), 0, -1000.0 + i, 50, success, i / 10) for i in range(n)])
+
+
+def evaluated(step, success=float("nan")):
+    return step, Evaluation(np.array([-500.0, -400.0]), np.array([50, 50]), np.array([success, success]))
+
+
+def test_a_curve_is_written_where_asked(tmp_path):
+    learning_curve(history(), tmp_path / "made" / "curve.png")
+    assert (tmp_path / "made" / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_success_has_a_panel_of_its_own_where_it_is_known():
+    assert len(learning_curve(history()).axes) == 1
+    assert len(learning_curve(history(success=1.0)).axes) == 2
+
+
+def test_large_numbers_have_thousands_separators(tmp_path):
+    figure = learning_curve(history(), tmp_path / "curve.png")
+    labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
+    assert "100,000" in labels
+
+
+def test_the_line_is_the_moving_average():
+    record = history(20)
+    figure = learning_curve(record, window=5)
+    line = next(line for line in figure.axes[0].lines if line.get_label() == "mean of 5 episodes")
+    expected = [np.mean(record["return"][max(0, i - 4) : i + 1]) for i in range(20)]
+    np.testing.assert_allclose(line.get_ydata(), expected)
+
+
+def test_evaluations_are_drawn_at_their_steps():
+    figure = learning_curve(history(), evaluations=[evaluated(50_000), evaluated(100_000)])
+    points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))
+    np.testing.assert_array_equal(points.get_xdata(), [50_000, 100_000])
+    np.testing.assert_array_equal(points.get_ydata(), [-450, -450])
+
+
+def test_evaluations_stand_at_their_time_when_drawn_against_seconds():
+    figure = learning_curve(history(), against="seconds", evaluations=[evaluated(50_000)])
+    points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))
+    np.testing.assert_allclose(points.get_xdata(), [4.9])  # episode 49 ended at step 50,000 after 4.9 s
+    assert figure.axes[0].get_xlabel() == "seconds of training"
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_a_run_of_hardly_any_episodes_can_be_drawn(tmp_path, n):
+    learning_curve(history(n, success=1.0), tmp_path / "curve.png", evaluations=[evaluated(1_000, 1.0)])
+
+
+def test_nothing_of_matplotlibs_global_state_is_touched():
+    import matplotlib
+
+    backend = matplotlib.rcParams._get("backend")
+    learning_curve(history(), title="a title")
+    assert matplotlib.rcParams._get("backend") is backend
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or not pyplot.get_fignums()
+
+
+def test_an_unknown_axis_is_an_error():
+    with pytest.raises(ValueError, match="step, seconds"):
+        learning_curve(history(), against="epochs")
+
+
+def test_without_matplotlib_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtra, match=r"rejeu\[plot\]"):
+        learning_curve(history())
