@@ -18,13 +18,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rejeu.core import Transition
+from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import TERMINATED, Ring, Rows
-from rejeu.replay.uniform import bootstrap_discount, discounted_sum, look_ahead
+from rejeu.replay.uniform import batch, begin, bootstrap_discount, discounted_sum, draw, look_ahead
 
 
 class GoalSelectionStrategy(str, Enum):
@@ -54,7 +55,9 @@ class HindsightConfig:
             strategy = GoalSelectionStrategy(self.goal_selection_strategy)
         except ValueError:
             known = ", ".join(s.value for s in GoalSelectionStrategy)
-            raise ValueError(f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}") from None
+            raise ValueError(
+                f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}"
+            ) from None
         object.__setattr__(self, "goal_selection_strategy", strategy.value)
         if self.copy_info_dict:
             raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
@@ -69,14 +72,23 @@ class GoalFunctions(NamedTuple):
 
 
 class HerReplayBuffer:
-    """Draws transitions uniformly from a :class:`Ring` and gives most of them a goal that was reached."""
+    """Draws transitions from a :class:`Ring`, uniformly or by priority, and gives most of them a goal that was reached."""
 
-    def __init__(self, ring: Ring, gamma: float, config: HindsightConfig, goals: GoalFunctions, n_steps: int = 1) -> None:
+    def __init__(
+        self,
+        ring: Ring,
+        gamma: float,
+        config: HindsightConfig,
+        goals: GoalFunctions,
+        n_steps: int = 1,
+        priorities: Priorities | None = None,
+    ) -> None:
         self.ring = ring
         self.gamma = gamma
         self.config = config
         self.goals = goals
         self.n_steps = n_steps
+        self.priorities = priorities
         paths = [leaf.path for leaf in ring.obs_leaves]
         self.achieved = paths.index("achieved_goal")
         self.desired = paths.index("desired_goal")
@@ -85,28 +97,46 @@ class HerReplayBuffer:
         """Returns the number of transitions kept."""
         return len(self.ring)
 
-    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Transition:
+    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
+        """Starts episodes; see :meth:`Ring.begin`."""
+        begin(self.ring, self.priorities, obs, envs)
+
+    def add(
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        next_obs: Any,
+        envs: np.ndarray | None = None,
+    ) -> None:
+        """Records one step of each environment; see :meth:`Ring.add`."""
+        index, following = self.ring.add(action, reward, terminated, next_obs, envs)
+        if self.priorities is not None:
+            self.priorities.add(index, following)
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
         """Returns transitions, every leaf ``(*shape, ...)``, the last axis of ``shape`` being one batch.
 
-        Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances.
+        Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances, ``progress`` anneals the weights.
         """
-        ring, n, k = self.ring, int(np.prod(shape)), self.config.n_sampled_goal
-        rows = ring.draw(rng, n)
+        ring, k = self.ring, self.config.n_sampled_goal
+        rows, weight = draw(ring, self.priorities, rng, int(np.prod(shape)), progress)
         index = ring.index(*rows)
-        relabelled = np.zeros(shape, bool)
-        relabelled[..., : int(shape[-1] * k / (k + 1))] = True
-        relabelled = np.flatnonzero(relabelled)
+        chosen = np.zeros(shape, bool)
+        chosen[..., : int(shape[-1] * k / (k + 1))] = True
+        relabelled = np.flatnonzero(chosen)
 
-        chosen = Rows(rows.env[relabelled], rows.time[relabelled])
-        goal = ring.obs[self.achieved].take(self._goal_index(rng, chosen, index[relabelled]), axis=0)
+        relabelled_rows = Rows(rows.env[relabelled], rows.time[relabelled])
+        goal = ring.obs[self.achieved].take(self._goal_index(rng, relabelled_rows, index[relabelled]), axis=0)
         if self.n_steps == 1:
             reward, terminated = ring.reward[index], ring.kind[index] == TERMINATED
             steps = np.ones(1, np.int64)
             following = ring.index(rows.env, rows.time + steps)
             reached = ring.obs[self.achieved].take(following[relabelled], axis=0)
-            reward[relabelled] = self.goals.reward(reached, goal)
-            if self.goals.terminated is not None:
-                terminated[relabelled] = self.goals.terminated(reached, goal)
+            if len(relabelled):
+                reward[relabelled] = self.goals.reward(reached, goal)
+                if self.goals.terminated is not None:
+                    terminated[relabelled] = self.goals.terminated(reached, goal)
         else:
             reward, steps, terminated = self._n_step(rows, relabelled, goal)
             following = ring.index(rows.env, rows.time + steps)
@@ -114,13 +144,13 @@ class HerReplayBuffer:
         obs, next_obs = ring.observation(index), ring.observation(following)
         obs[self.desired][relabelled] = goal
         next_obs[self.desired][relabelled] = goal
-        return Transition(
-            ring.tree([leaf.reshape(*shape, *leaf.shape[1:]) for leaf in obs]),
-            ring.action[index].reshape(*shape, *ring.action.shape[1:]),
-            reward.reshape(shape),
-            ring.tree([leaf.reshape(*shape, *leaf.shape[1:]) for leaf in next_obs]),
-            bootstrap_discount(self.gamma, steps, terminated).reshape(shape),
-        )
+        discount = bootstrap_discount(self.gamma, steps, terminated)
+        return batch(ring, shape, obs, ring.action[index], reward, next_obs, discount, weight)
+
+    def reprioritise(self, td_errors: list[Any]) -> None:
+        """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
+        if self.priorities is not None:
+            self.priorities.update(td_errors)
 
     def _goal_index(self, rng: np.random.Generator, rows: Rows, index: np.ndarray) -> np.ndarray:
         """Returns where in the ring the new goals of ``rows`` stand: observations after a step, by the strategy."""
@@ -144,8 +174,8 @@ class HerReplayBuffer:
         """Returns n-step reward, number of steps and ``terminated``, for the new goals where there are any."""
         ring = self.ring
         window = look_ahead(ring, rows, self.n_steps)
-        rewards, valid = ring.reward[window.index], window.valid.copy()
-        terminal = (ring.kind[window.index] == TERMINATED) & valid
+        rewards, valid = ring.reward[window.position], window.valid.copy()
+        terminal = (ring.kind[window.position] == TERMINATED) & valid
         following = ring.index(rows.env[relabelled, None], rows.time[relabelled, None] + 1 + np.arange(self.n_steps))
         reached = ring.obs[self.achieved][following].reshape(-1, *goal.shape[1:])
         goals = np.repeat(goal, self.n_steps, axis=0)
@@ -164,3 +194,5 @@ class HerReplayBuffer:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`."""
         self.ring.restore(arrays)
+        if self.priorities is not None:
+            self.priorities.restore()

@@ -4,6 +4,8 @@ Each environment writes one endless row of time steps 0, 1, 2, ...; the ring kee
 time t holds the observation at t and, once the step was taken, its action and reward. The successor of t is the
 observation at t + 1, so every observation is stored once. Where an episode ends, one further row holds the final
 observation, marked ``LAST``; the next episode begins in the row after it. No row is ever moved.
+
+Of stacked frames (``frame_stack``) a row holds the newest only, and the others are found in the rows before it.
 """
 
 from __future__ import annotations
@@ -39,21 +41,37 @@ class Ring:
         obs_structure: Any,
         action_shape: tuple[int, ...],
         action_dtype: Any,
+        frame_stack: int | None = None,
     ) -> None:
-        """Reserves ``capacity // n_envs`` rows for each environment (at least 2).
+        """Reserves ``capacity // n_envs`` rows for each environment (at least 2, and more than ``frame_stack``).
+
+        Images whose first axis has length ``frame_stack`` are taken for as many frames, oldest first.
 
         Raises:
             MemoryError: if the machine cannot hold them, with the numbers.
+            ValueError: if ``frame_stack`` is given and no observation leaf is such a stack.
         """
         self.n_envs = n_envs
-        self.rows = max(capacity // n_envs, 2)
+        self.rows = max(capacity // n_envs, 2, 0 if frame_stack is None else frame_stack + 1)
         self.obs_leaves = obs_leaves
         self.obs_structure = obs_structure
-        per_row = sum(leaf.nbytes for leaf in obs_leaves) + 4 + 1 + 8
+        self.frame_stack = frame_stack
+        self.stacked = tuple(is_stack(leaf, frame_stack) for leaf in obs_leaves)
+        if frame_stack is not None and not any(self.stacked):
+            given = ", ".join(f"{leaf.path or 'observation'} {leaf.dtype}{list(leaf.shape)}" for leaf in obs_leaves)
+            raise ValueError(
+                f"frame_stack={frame_stack} needs uint8 observations ({frame_stack}, height, width[, channels]), got "
+                f"{given}; wrap the environment with gymnasium.wrappers.FrameStackObservation(env, {frame_stack})"
+            )
+        per_row = 4 + 1 + 8
+        shapes = []
+        for leaf, stacked in zip(obs_leaves, self.stacked, strict=True):
+            shapes.append(leaf.shape[1:] if stacked else leaf.shape)
+            per_row += leaf.nbytes // (leaf.shape[0] if stacked else 1)
         per_row += math.prod(action_shape) * np.dtype(action_dtype).itemsize
         check_memory(per_row * self.rows * n_envs, capacity)
         n = self.rows * n_envs
-        self.obs = [np.zeros((n, *leaf.shape), leaf.dtype) for leaf in obs_leaves]
+        self.obs = [np.zeros((n, *shape), leaf.dtype) for leaf, shape in zip(obs_leaves, shapes, strict=True)]
         self.action = np.zeros((n, *action_shape), action_dtype)
         self.reward = np.zeros(n, np.float32)
         self.kind = np.zeros(n, np.uint8)
@@ -88,13 +106,16 @@ class Ring:
             self._close(env)
         self._advance(envs)
         index = self.index(envs, self.head[envs])
-        self._write_obs(index, obs, envs)
         self.since_start[index] = 0
+        self._write_obs(index, obs, envs)
 
     def add(
         self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any, envs: np.ndarray | None = None
-    ) -> None:
-        """Records one step of each environment in ``envs``; the arrays cover all environments, ``(n_envs, ...)``."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Records one step of each environment in ``envs``; the arrays cover all environments, ``(n_envs, ...)``.
+
+        Returns the positions of the steps and of the rows after them.
+        """
         envs = self.all_envs if envs is None else envs
         index = self.index(envs, self.head[envs])
         self.action[index] = action[envs]
@@ -103,8 +124,9 @@ class Ring:
         self._advance(envs)
         self.n_steps[envs] += 1
         following = self.index(envs, self.head[envs])
-        self._write_obs(following, next_obs, envs)
         self.since_start[following] = self.since_start[index] + 1
+        self._write_obs(following, next_obs, envs)
+        return index, following
 
     def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Returns the position in the arrays of rows given by environment and absolute time."""
@@ -143,8 +165,24 @@ class Ring:
         return Rows(env, self.head[env] - 1 - (ends[env] - 1 - ticket))
 
     def observation(self, index: np.ndarray) -> list[np.ndarray]:
-        """Returns the observation leaves at positions ``index``, each ``(*index.shape, ...)``."""
-        return [leaf.take(index, axis=0) for leaf in self.obs]
+        """Returns the observation leaves at positions ``index``, each ``(*index.shape, ...)``, stacks rebuilt.
+
+        Before an episode's first frame a stack repeats it, as ``FrameStackObservation(padding_type="reset")`` does. At
+        the far end of the ring an episode counts as begun with the oldest frame that is kept.
+        """
+        frames = self._frames(index) if any(self.stacked) else index
+        kinds = zip(self.obs, self.stacked, strict=True)
+        return [leaf.take(frames if stacked else index, axis=0) for leaf, stacked in kinds]
+
+    def _frames(self, index: np.ndarray) -> np.ndarray:
+        """Returns where the frames of the stacks at ``index`` are, oldest first, ``(*index.shape, frame_stack)``."""
+        assert self.frame_stack is not None
+        env, slot = np.divmod(index, self.rows)
+        head = self.head[env]
+        since_oldest = np.minimum(head, self.rows - 1) - (head - slot) % self.rows
+        available = np.minimum(since_oldest, self.since_start[index])
+        back = np.minimum(np.arange(self.frame_stack)[::-1], available[..., None])
+        return self.base[env][..., None] + (slot[..., None] - back) % self.rows
 
     def tree(self, obs_leaves: list[np.ndarray]) -> Any:
         """Returns observation leaves in the nesting of the environment's space."""
@@ -169,8 +207,28 @@ class Ring:
         self.until_end[self.base[env] + times % self.rows] = head - times
 
     def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray) -> None:
-        for store, leaf in zip(self.obs, jax.tree.leaves(obs), strict=True):
-            store[index] = leaf[envs]
+        """Writes observations ``(n_envs, ...)`` at ``index``, of stacks the newest frame.
+
+        Raises:
+            ValueError: if the older frames of a stack are not those of the rows before, so that it cannot be rebuilt.
+        """
+        leaves = jax.tree.leaves(obs)
+        for store, leaf, stacked in zip(self.obs, leaves, self.stacked, strict=True):
+            store[index] = leaf[envs, -1] if stacked else leaf[envs]
+        if self.frame_stack is None:
+            return
+        # A run may begin an episode in the ring midway, whose older frames are then padded like those of any other; the
+        # first that an environment ever begins does follow a reset, and shows how its stacks are padded.
+        length = np.where(self.head[envs] == 0, self.frame_stack, self.since_start[index] + 1)
+        for rebuilt, leaf, stacked in zip(self.observation(index), leaves, self.stacked, strict=True):
+            if stacked:
+                differs = (rebuilt != leaf[envs]).any(axis=tuple(range(2, leaf.ndim)))
+                if (differs[:, ::-1] & (np.arange(leaf.shape[1]) < length[:, None])).any():
+                    raise ValueError(
+                        f"frame_stack={self.frame_stack}: an observation is not made of the frames of the steps before "
+                        "it, oldest first, the episode's first one repeated (gymnasium.wrappers.FrameStackObservation "
+                        "with padding_type='reset'); leave frame_stack out to store observations as they are"
+                    )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns everything kept as named arrays, the untouched rows left out: ``(n_envs, rows used, ...)``."""
@@ -196,7 +254,7 @@ class Ring:
             raise ValueError(
                 f"the replay file is of {head.size} environments and this agent has {self.n_envs}; make them equal"
             )
-        if head.dtype != np.int64 or n_steps.dtype != np.int64 or head.min() < -1:
+        if head.dtype != np.int64 or n_steps.dtype != np.int64 or head.min() < -1 or head.max() >= 2**62:
             raise ValueError("the replay file's counters are damaged")
         used = int(min(head.max() + 1, self.rows))
         for name, array in own.items():
@@ -206,9 +264,36 @@ class Ring:
                     f"{name} in the replay file is {arrays[name].dtype}{list(arrays[name].shape)} and this buffer "
                     f"expects {array.dtype}{list(expected)}; it was saved with another environment or buffer_size"
                 )
+        if not self._consistent(head, n_steps, arrays["kind"], arrays["since_start"], arrays["until_end"]):
+            raise ValueError("the replay file's counters are damaged")
         for name, array in own.items():
             array.reshape(self.n_envs, self.rows, *array.shape[1:])[:, :used] = arrays[name]
         self.head, self.n_steps = head.copy(), n_steps.copy()
+
+    def _consistent(
+        self, head: np.ndarray, n_steps: np.ndarray, kind: np.ndarray, since_start: np.ndarray, until_end: np.ndarray
+    ) -> bool:
+        """Whether the counters of a file agree with each other, so that nothing drawn by them lies outside the ring."""
+        for env in range(self.n_envs):
+            times = np.arange(max(head[env] - self.rows + 1, 0), head[env] + 1)
+            rows = times % self.rows
+            if (
+                kind[env, rows].max(initial=0) > LAST
+                or n_steps[env] != (kind[env, rows[:-1]] != LAST).sum()
+                or not ((since_start[env, rows] >= 0) & (since_start[env, rows] <= times)).all()
+                or not ((until_end[env, rows] >= -1) & (times + until_end[env, rows] <= head[env])).all()
+            ):
+                return False
+        return True
+
+
+def is_stack(leaf: Leaf, frame_stack: int | None) -> bool:
+    """Returns whether a leaf holds ``frame_stack`` frames along its first axis: uint8, of 3 axes or more, and no goal.
+
+    Hindsight exchanges goals one by one, so they are stored whole.
+    """
+    is_goal = leaf.path in ("achieved_goal", "desired_goal")
+    return leaf.dtype == "uint8" and len(leaf.shape) >= 3 and leaf.shape[0] == frame_stack and not is_goal
 
 
 def check_memory(nbytes: int, capacity: int) -> None:

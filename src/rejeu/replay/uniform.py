@@ -1,63 +1,126 @@
-"""The plain replay buffer: every step is as likely as any other; n-step returns by option."""
+"""The plain replay buffer: steps are drawn uniformly, or by priority; n-step returns by option."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rejeu.core import Transition
+from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import LAST, TERMINATED, Ring, Rows
 
 
 class ReplayBuffer:
-    """Draws transitions uniformly from a :class:`Ring`."""
+    """Draws transitions from a :class:`Ring`, uniformly or by priority."""
 
-    def __init__(self, ring: Ring, gamma: float, n_steps: int = 1) -> None:
+    def __init__(self, ring: Ring, gamma: float, n_steps: int = 1, priorities: Priorities | None = None) -> None:
         self.ring = ring
         self.gamma = gamma
         self.n_steps = n_steps
+        self.priorities = priorities
 
     def size(self) -> int:
         """Returns the number of transitions kept."""
         return len(self.ring)
 
-    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Transition:
-        """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances."""
-        ring = self.ring
-        rows = ring.draw(rng, int(np.prod(shape)))
-        index = ring.index(*rows)
+    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
+        """Starts episodes; see :meth:`Ring.begin`."""
+        begin(self.ring, self.priorities, obs, envs)
+
+    def add(
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        next_obs: Any,
+        envs: np.ndarray | None = None,
+    ) -> None:
+        """Records one step of each environment; see :meth:`Ring.add`."""
+        index, following = self.ring.add(action, reward, terminated, next_obs, envs)
+        if self.priorities is not None:
+            self.priorities.add(index, following)
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
+        """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances, ``progress`` anneals the weights."""
+        rows, weight = draw(self.ring, self.priorities, rng, int(np.prod(shape)), progress)
+        index = self.ring.index(*rows)
         if self.n_steps == 1:
-            reward, terminated = ring.reward[index], ring.kind[index] == TERMINATED
+            reward, terminated = self.ring.reward[index], self.ring.kind[index] == TERMINATED
             steps = np.ones(1, np.int64)
         else:
-            window = look_ahead(ring, rows, self.n_steps)
-            rewards = ring.reward[window.index]
-            reward = discounted_sum(rewards, window.valid, self.gamma)
+            window = look_ahead(self.ring, rows, self.n_steps)
+            reward = discounted_sum(self.ring.reward[window.position], window.valid, self.gamma)
             steps, terminated = window.steps, window.terminated
-        following = ring.index(rows.env, rows.time + steps)
-        return Transition(
-            ring.tree([leaf.reshape(*shape, *leaf.shape[1:]) for leaf in ring.observation(index)]),
-            ring.action[index].reshape(*shape, *ring.action.shape[1:]),
-            reward.reshape(shape),
-            ring.tree([leaf.reshape(*shape, *leaf.shape[1:]) for leaf in ring.observation(following)]),
-            bootstrap_discount(self.gamma, steps, terminated).reshape(shape),
-        )
+        following = self.ring.index(rows.env, rows.time + steps)
+        obs, next_obs = self.ring.observation(index), self.ring.observation(following)
+        discount = bootstrap_discount(self.gamma, steps, terminated)
+        return batch(self.ring, shape, obs, self.ring.action[index], reward, next_obs, discount, weight)
+
+    def reprioritise(self, td_errors: list[Any]) -> None:
+        """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
+        if self.priorities is not None:
+            self.priorities.update(td_errors)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns everything kept, as named arrays."""
         return self.ring.arrays()
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`."""
+        """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`. Priorities start equal."""
         self.ring.restore(arrays)
+        if self.priorities is not None:
+            self.priorities.restore()
+
+
+def begin(ring: Ring, priorities: Priorities | None, obs: Any, envs: np.ndarray | None) -> None:
+    """Starts episodes in the ring and takes their first rows out of what can be drawn."""
+    ring.begin(obs, envs)
+    if priorities is not None:
+        envs = ring.all_envs if envs is None else envs
+        priorities.tree.set(ring.index(envs, ring.head[envs]), 0.0)
+
+
+def draw(
+    ring: Ring, priorities: Priorities | None, rng: np.random.Generator, n: int, progress: float
+) -> tuple[Rows, np.ndarray | None]:
+    """Returns ``n`` steps, and their importance weights where there are priorities."""
+    return (ring.draw(rng, n), None) if priorities is None else priorities.draw(rng, n, progress)
+
+
+def batch(
+    ring: Ring,
+    shape: tuple[int, ...],
+    obs: list[np.ndarray],
+    action: np.ndarray,
+    reward: np.ndarray,
+    next_obs: list[np.ndarray],
+    discount: np.ndarray,
+    weight: np.ndarray | None,
+) -> Transition:
+    """Returns transitions in ``shape`` from flat arrays; weights are divided by the largest of each batch."""
+
+    def shaped(array: np.ndarray) -> np.ndarray:
+        return array.reshape(*shape, *array.shape[1:])
+
+    if weight is not None:
+        weight = shaped(weight)
+        weight /= weight.max(axis=-1, keepdims=True)
+    return Transition(
+        ring.tree([shaped(leaf) for leaf in obs]),
+        shaped(action),
+        shaped(reward),
+        ring.tree([shaped(leaf) for leaf in next_obs]),
+        shaped(discount),
+        weight,
+    )
 
 
 class Window(NamedTuple):
     """The steps that an n-step return sums, by sampled row."""
 
-    index: np.ndarray
+    position: np.ndarray
     """Positions in the ring of the n rows from the sampled one on, ``(batch, n)``."""
     valid: np.ndarray
     """Which of them belong to the return, ``bool (batch, n)``; the first always does."""
@@ -82,7 +145,7 @@ def look_ahead(ring: Ring, rows: Rows, n: int) -> Window:
 def discounted_sum(rewards: np.ndarray, valid: np.ndarray, gamma: float) -> np.ndarray:
     """Returns ``sum_i gamma^i r_i`` over the valid steps, ``float32 (batch,)``."""
     weights = gamma ** np.arange(rewards.shape[1])
-    return ((rewards * valid) @ weights).astype(np.float32)
+    return (np.where(valid, rewards, 0.0) @ weights).astype(np.float32)
 
 
 def bootstrap_discount(gamma: float, steps: np.ndarray, terminated: np.ndarray) -> np.ndarray:

@@ -1,0 +1,139 @@
+"""Prioritised replay: steps are drawn in proportion to how wrong the critic was about them.
+
+Source: Schaul et al. 2015, "Prioritized Experience Replay" (arXiv 1511.05952), the proportional variant. A step with TD
+error ``delta`` has priority ``p = (|delta| + epsilon)^alpha`` and is drawn with probability ``P = p / sum p``; its loss is
+weighted by ``(N P)^-beta``, divided by the largest weight of its batch, with ``beta`` rising to 1 over the run. New steps get
+the largest priority so far.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rejeu import schedules
+from rejeu.replay.ring import LAST, Ring, Rows
+from rejeu.schedules import Schedule
+
+
+@dataclass(frozen=True)
+class PriorityConfig:
+    """Settings of prioritised replay; the defaults are the paper's (table 3, proportional)."""
+
+    alpha: float = 0.6
+    """How strongly priorities differ: 0 is uniform, 1 is in proportion to the TD error."""
+    beta: float | Schedule = schedules.Linear(0.4, 1.0)
+    """How far importance weights undo the bias; 1 wholly."""
+    epsilon: float = 1e-6
+    """Added to every TD error, so that no step is forgotten; positive."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "beta", schedules.parse("beta", self.beta))
+        if not 0 <= self.alpha <= 1:
+            raise ValueError(f"alpha={self.alpha!r} must be from 0 to 1")
+        if not self.epsilon > 0:
+            raise ValueError(f"epsilon={self.epsilon!r} must be positive")
+
+
+class SumTree:
+    """Non-negative numbers by position; setting and drawing take time in the logarithm of their count."""
+
+    def __init__(self, n: int) -> None:
+        self.n_leaves = 1 << max(n - 1, 1).bit_length()
+        self.nodes = np.zeros(2 * self.n_leaves, np.float64)
+        """Node 1 is the root and holds the sum; the children of node i are 2 i and 2 i + 1."""
+
+    @property
+    def total(self) -> float:
+        """The sum of all numbers."""
+        return float(self.nodes[1])
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.nodes[self.n_leaves + index]
+
+    def set(self, index: np.ndarray, value: Any) -> None:
+        """Puts ``value`` at the positions ``index``, ``(n,)``; where one is repeated, its last value counts."""
+        node = index + self.n_leaves
+        self.nodes[node] = value
+        for _ in range(self.n_leaves.bit_length() - 1):
+            node = node >> 1
+            self.nodes[node] = self.nodes[2 * node] + self.nodes[2 * node + 1]
+
+    def find(self, mass: np.ndarray) -> np.ndarray:
+        """Returns for each ``mass`` in [0, total) the position where the running sum first exceeds it, ``int64 (n,)``."""
+        node = np.ones(len(mass), np.int64)
+        mass = mass.copy()
+        while node[0] < self.n_leaves:
+            left = 2 * node
+            weight = self.nodes[left]
+            goes_right = (mass >= weight) & (self.nodes[left + 1] > 0)
+            mass -= np.where(goes_right, weight, 0.0)
+            node = left + goes_right
+        return node - self.n_leaves
+
+
+class Priorities:
+    """The priorities of the steps of a :class:`Ring`. Mutable."""
+
+    def __init__(self, ring: Ring, config: PriorityConfig) -> None:
+        self.ring = ring
+        self.config = config
+        self.tree = SumTree(ring.rows * ring.n_envs)
+        self.largest = 1.0
+        """The largest priority so far, which new steps get."""
+        self._drawn: deque[tuple[np.ndarray, np.ndarray]] = deque()
+        """Positions and times of the steps whose TD errors are still to come, one entry a draw."""
+
+    def add(self, index: np.ndarray, following: np.ndarray) -> None:
+        """Notes new steps at ``index``, and that the rows ``following`` are heads, which cannot be drawn."""
+        self.tree.set(following, 0.0)
+        self.tree.set(index, self.largest)
+
+    def draw(self, rng: np.random.Generator, n: int, progress: float) -> tuple[Rows, np.ndarray]:
+        """Returns ``n`` steps, one from each of ``n`` equal parts of the total priority, and weights ``float32 (n,)``.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        tree, ring = self.tree, self.ring
+        if not len(ring):
+            raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
+        index = tree.find((np.arange(n) + rng.random(n)) * (tree.total / n))
+        rng.shuffle(index)
+        env = index // ring.rows
+        head = ring.head[env]
+        time = head - (head - index % ring.rows) % ring.rows
+        probability = tree[index] / tree.total
+        weight = (len(ring) * probability) ** -float(schedules.at(self.config.beta, progress))
+        self._drawn.append((index, time))
+        return Rows(env, time), weight.astype(np.float32)
+
+    def update(self, td_errors: Iterable[np.ndarray]) -> None:
+        """Takes the absolute TD errors of the oldest draws; of steps overwritten since then they are passed over."""
+        for td_error in td_errors:
+            index, time = self._drawn.popleft()
+            if not len(index):  # drawn from what the ring held before it was restored
+                continue
+            priority = (np.asarray(td_error, np.float64).ravel() + self.config.epsilon) ** self.config.alpha
+            head = self.ring.head[index // self.ring.rows]
+            kept = (time > head - self.ring.rows) & (self.tree[index] > 0)
+            if kept.any():
+                self.tree.set(index[kept], priority[kept])
+            self.largest = max(self.largest, float(priority.max()))
+
+    def restore(self) -> None:
+        """Gives every step of the ring the largest priority: they are learnt anew within one pass over the buffer."""
+        ring = self.ring
+        nowhere = np.zeros(0, np.int64)
+        self._drawn = deque((nowhere, nowhere) for _ in self._drawn)
+        self.tree = SumTree(ring.rows * ring.n_envs)
+        for env in range(ring.n_envs):
+            times = np.arange(ring.oldest()[env], ring.head[env])
+            index = ring.index(np.full(len(times), env), times)
+            steps = index[ring.kind[index] != LAST]
+            if len(steps):
+                self.tree.set(steps, self.largest)

@@ -1,0 +1,151 @@
+"""A brute-force model of replay: every observation ever seen, as a plain list per environment.
+
+Each observation names its environment and its place in that list, so that a sampled transition can be looked up and
+checked. The model knows nothing of rings: what is kept is simply the end of the list.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from hypothesis import strategies as st
+
+from rejeu import spaces
+from rejeu.replay.ring import Ring
+
+
+@dataclass
+class Frame:
+    """One observation, and the step that was taken from it (None: the last of its episode, or the newest)."""
+
+    episode: int
+    step: tuple[float, float, bool] | None = None
+    """Action, reward, terminated."""
+    closed: bool = False
+    """Whether this is the final observation of an episode after which another has begun."""
+
+
+class Model:
+    """What a ring with room for ``rows`` observations of each environment ought to hold."""
+
+    def __init__(self, n_envs: int, rows: int) -> None:
+        self.n_envs, self.rows = n_envs, rows
+        self.frames: list[list[Frame]] = [[] for _ in range(n_envs)]
+        self.must_begin = [True] * n_envs
+
+    def kept(self, env: int) -> range:
+        return range(max(len(self.frames[env]) - self.rows, 0), len(self.frames[env]))
+
+    def steps(self) -> list[tuple[int, int]]:
+        """All (environment, place) whose step and successor are kept."""
+        return [(env, i) for env in range(self.n_envs) for i in self.kept(env) if self.frames[env][i].step is not None]
+
+    def episode(self, env: int, place: int) -> list[int]:
+        """The kept places of the episode that (env, place) belongs to, final observation included, in order."""
+        mine = self.frames[env][place].episode
+        return [i for i in self.kept(env) if self.frames[env][i].episode == mine]
+
+    def n_step(self, env: int, place: int, n: int, gamma: float) -> tuple[float, int, float]:
+        """Return, place bootstrapped from, and discount, by walking along the episode."""
+        total, weight = 0.0, 1.0
+        for _ in range(n):
+            frame = self.frames[env][place]
+            if frame.step is None:
+                break
+            total += weight * frame.step[1]
+            weight *= gamma
+            place += 1
+            if frame.step[2]:
+                return total, place, 0.0
+        return total, place, weight
+
+    def begin(self, envs: list[int]) -> None:
+        for env in envs:
+            frames = self.frames[env]
+            if frames:
+                frames[-1].closed = True
+            frames.append(Frame(frames[-1].episode + 1 if frames else 0))
+            self.must_begin[env] = False
+
+    def add(self, envs: list[int], action: np.ndarray, reward: np.ndarray, ends: list[str]) -> None:
+        for env in envs:
+            frames = self.frames[env]
+            frames[-1].step = (float(action[env]), float(reward[env]), ends[env] == "terminated")
+            frames.append(Frame(frames[-1].episode))
+            self.must_begin[env] = ends[env] != "no"
+
+
+@dataclass
+class Turn:
+    """One thing that happens to the environments."""
+
+    stepping: list[bool]
+    ends: list[str]
+    restarting: list[bool]
+    """Environments whose running episode is given up after the step."""
+
+
+def turns(n_envs: int, most: int = 40) -> st.SearchStrategy[list[Turn]]:
+    """Random histories: partial steps, both kinds of ends, abandoned episodes."""
+    each = lambda values: st.lists(values, min_size=n_envs, max_size=n_envs)  # noqa: E731
+    end = st.sampled_from(["no"] * 6 + ["terminated", "truncated"])
+    restart = st.sampled_from([False] * 9 + [True])
+    turn = st.builds(Turn, each(st.sampled_from([True, True, True, False])), each(end), each(restart))
+    return st.lists(turn, min_size=1, max_size=most)
+
+
+OBSERVATION = gym.spaces.Dict(
+    {
+        "where": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32),
+        "more": gym.spaces.Tuple([gym.spaces.Discrete(1000), gym.spaces.Box(0, 255, (1,), np.uint8)]),
+    }
+)
+GOAL_OBSERVATION = gym.spaces.Dict(
+    {key: gym.spaces.Box(-np.inf, np.inf, (2,), np.float32) for key in ("observation", "achieved_goal", "desired_goal")}
+)
+
+
+def observe(n_envs: int, places: list[int]) -> Any:
+    """Observations that name environment and place, in every leaf."""
+    where = np.array([[env, place] for env, place in enumerate(places)], np.float32)
+    coded = np.array([10 * place + env for env, place in enumerate(places)])
+    return {"where": where, "more": (coded.astype(np.int32), (coded % 256).astype(np.uint8)[:, None])}
+
+
+def observe_goal(n_envs: int, places: list[int]) -> Any:
+    """The achieved goal names environment and place; the desired one is (-1, -1), which nothing achieves."""
+    where = np.array([[env, place] for env, place in enumerate(places)], np.float32)
+    return {"observation": where, "achieved_goal": where, "desired_goal": np.full((n_envs, 2), -1.0, np.float32)}
+
+
+def make_ring(capacity: int, n_envs: int, space: gym.Space = OBSERVATION) -> Ring:
+    return Ring(capacity, n_envs, spaces.leaves(space), spaces.structure(space), (1,), np.float32)
+
+
+def play(replay: Any, model: Model, history: list[Turn], observe_function: Any = observe, seed: int = 0) -> None:
+    """Does to ``replay`` and ``model`` the same things, as the training loop would."""
+    rng = np.random.default_rng(seed)
+    n_envs = model.n_envs
+
+    def observed() -> Any:
+        return observe_function(n_envs, [len(frames) for frames in model.frames])
+
+    def begin(envs: list[int]) -> None:
+        if envs:
+            replay.begin(observed(), np.array(envs))
+            model.begin(envs)
+
+    begin(list(range(n_envs)))
+    for turn in history:
+        stepping = [env for env in range(n_envs) if turn.stepping[env]]
+        if stepping:
+            action = rng.uniform(-1, 1, (n_envs, 1)).astype(np.float32)
+            reward = rng.normal(size=n_envs).astype(np.float32)
+            terminated = np.array([end == "terminated" for end in turn.ends])
+            everyone = len(stepping) == n_envs
+            replay.add(action, reward, terminated, observed(), None if everyone else np.array(stepping))
+            model.add(stepping, action[:, 0], reward, turn.ends)
+        begin([env for env in range(n_envs) if model.must_begin[env] or turn.restarting[env]])
