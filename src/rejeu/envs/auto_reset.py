@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jax
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
+from rejeu.envs.vector import VectorEnv
 from rejeu.video import VideoFile, check_renders, rgb_frame
 
 Indices = int | Iterable[int] | None
@@ -182,6 +184,43 @@ class DummyVecEnv:
     def unwrapped(self) -> DummyVecEnv:
         """Itself."""
         return self
+
+
+class AutoResetView:
+    """An agent's own environments, stepped by hand as Stable-Baselines3's ``model.get_env()`` is.
+
+    Stepping it ends the episodes that the agent was training in; its next ``learn`` begins new ones.
+    """
+
+    def __init__(self, vector: VectorEnv) -> None:
+        self.vector = vector
+        self.num_envs = vector.n_envs
+        self.observation_space, self.action_space = vector.observation_space, vector.action_space
+
+    def reset(self) -> Any:
+        """Starts an episode in every environment and returns the observations ``(num_envs, ...)``."""
+        return jax.tree.map(np.copy, self.vector.reset())
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Steps every environment and returns observations, rewards, dones and infos, as :class:`DummyVecEnv` does."""
+        step = self.vector.step(np.asarray(actions))
+        dones = step.terminated | step.truncated
+        infos: list[dict[str, Any]] = []
+        for i in range(self.num_envs):
+            info = dict(step.info[i]) if isinstance(step.info, list) else {}
+            info["TimeLimit.truncated"] = bool(step.truncated[i] and not step.terminated[i])
+            success = self.vector.success(step, i)
+            if not math.isnan(success):
+                info["is_success"] = bool(success)
+            if dones[i]:
+                info["terminal_observation"] = jax.tree.map(lambda leaf, i=i: np.copy(leaf[i]), step.obs)
+            infos.append(info)
+        obs = self.vector.reset_done(dones) if dones.any() else step.obs
+        return jax.tree.map(np.copy, obs), step.reward, dones, infos
+
+    def close(self) -> None:
+        """Releases the environments."""
+        self.vector.close()
 
 
 class VecVideoRecorder:

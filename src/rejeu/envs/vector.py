@@ -115,6 +115,8 @@ def make_vector(
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
     if isinstance(env, VectorEnv):
         return env
+    if isinstance(getattr(env, "vector", None), VectorEnv):
+        return env.vector
     if isinstance(env, gym.vector.VectorEnv):
         return GymnasiumVector(env, seed)
     if isinstance(env, gym.Env):
@@ -330,10 +332,7 @@ class EnvPool(VectorEnv):
         return float("nan") if value is None else float(value[env])
 
     def goals(self) -> GoalFunctions | None:
-        if (
-            not isinstance(self.observation_space, gym.spaces.Dict)
-            or "desired_goal" not in self.observation_space
-        ):
+        if "desired_goal" not in getattr(self.observation_space, "spaces", ()):
             return None
         if self.env_id == "parking-v0":
             return GoalFunctions(goals_module.parking_reward)

@@ -1,15 +1,25 @@
-"""Noise added to actions in [-1, 1]: frozen settings, and pure functions over a small state per environment."""
+"""Noise added to actions in [-1, 1]: frozen settings, and pure functions over a small state per environment.
+
+Everything here is in the scale in which algorithms act, where every action dimension runs from -1 to 1. What is meant
+in the environment's own units, over ``[low, high]``, converts by the half width ``h = (high - low) / 2``: means,
+``sigma`` and ``drift`` are divided by ``h``, the strength of the repulsive boundary by ``h^2``; ``theta`` and ``dt``
+stay.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, InitVar, asdict, dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gymnasium import spaces
 from jax import Array
+
+from rejeu.exploration.parameter_space import ParameterNoise
 
 
 @dataclass(frozen=True)
@@ -23,56 +33,105 @@ class NormalActionNoise:
     mean: tuple[float, ...]
     """Mean per action dimension, in the scale of actions in [-1, 1]."""
     sigma: tuple[float, ...]
-    """Standard deviation per action dimension, at least 0."""
+    """Standard deviation per action dimension, at least 0; a single number serves all of them."""
+    dtype: InitVar[Any] = np.float32
+    """Accepted for Stable-Baselines3's sake; the noise is always float32."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, dtype: Any) -> None:
+        _check_dtype(self, dtype)
         _as_tuples(self, "mean", "sigma")
 
     def init(self, n_envs: int) -> Array:
         """Returns the state of the noise of ``n_envs`` environments: nothing."""
         return jnp.zeros((n_envs, 0), jnp.float32)
 
-    def sample(self, state: Array, key: Array) -> tuple[Array, Array]:
-        """Returns the state and noise ``(n_envs, action_dim)``."""
-        shape = (state.shape[0], len(self.mean))
-        return state, jnp.array(self.mean) + jnp.array(self.sigma) * jax.random.normal(key, shape)
+    def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
+        """Returns the state and ``action`` with noise, ``(n_envs, action_dim)``, not yet clipped to [-1, 1]."""
+        noise = _row(self.mean) + _row(self.sigma) * jax.random.normal(key, action.shape)
+        return state, action + noise
 
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeckActionNoise:
     """Noise that drifts back to its mean: an Ornstein-Uhlenbeck process, one per environment.
 
-    ``x <- x + theta (mean - x) dt + sigma sqrt(dt) N(0, 1)``, from 0 at the start of every episode (Uhlenbeck and
-    Ornstein 1930; for DDPG, Lillicrap et al. 2015, arXiv 1509.02971).
+    From ``initial_noise`` at the start of every episode, each step takes (Uhlenbeck and Ornstein 1930; for DDPG,
+    Lillicrap et al. 2015, arXiv 1509.02971)::
+
+        x <- x + theta (mean - x) dt + sigma sqrt(dt) N(0, 1)
+        u  = action + x
+        g  = repulsive B'(u),    B(u) = (pi u / 2)^6
+        x <- x + drift dt - g
+        action taken = clip(u - g, -1, 1)
+
+    Without the repulsive boundary ``B``, a long excursion of the process holds the action at its bound; with it the
+    action is pushed back from there and the process with it. The push goes no further than to the middle, ``u = 0``,
+    without which a large ``u`` would be thrown out on the other side and diverge.
+
+    >>> OrnsteinUhlenbeckActionNoise(mean=[0.0], sigma=[0.2], repulsive=1e-4).repulsive
+    (0.0001,)
     """
 
     mean: tuple[float, ...]
     """What the process returns to, per action dimension."""
     sigma: tuple[float, ...]
-    """Size of the random kicks per square root of time, at least 0."""
+    """Size of the random kicks per square root of time, at least 0; a single number serves all dimensions."""
     theta: float = 0.15
     """Rate of return to the mean, per unit of time."""
     dt: float = 1e-2
     """Time between two steps."""
+    initial_noise: tuple[float, ...] = (0.0,)
+    """Where the process starts each episode; None starts at 0."""
+    dtype: InitVar[Any] = np.float32
+    """Accepted for Stable-Baselines3's sake; the noise is always float32."""
+    _: KW_ONLY
+    drift: tuple[float, ...] = (0.0,)
+    """Steady push on the process per unit of time, after its value is used: it then hovers about
+    ``mean + drift / theta``."""
+    repulsive: tuple[float, ...] = (0.0,)
+    """Strength of the repulsive boundary, at least 0; 0 or None for none. Raising it keeps actions further inside. A
+    strength ``s`` for actions in ``[low, high]`` is ``4 s / (high - low)^2`` here: 1e-4 over [-2, 2] is 2.5e-5."""
 
-    def __post_init__(self) -> None:
-        _as_tuples(self, "mean", "sigma")
+    def __post_init__(self, dtype: Any) -> None:
+        _check_dtype(self, dtype)
+        for key in ("initial_noise", "repulsive"):
+            if getattr(self, key) is None:
+                object.__setattr__(self, key, (0.0,))
+        _as_tuples(self, "mean", "sigma", "initial_noise", "drift", "repulsive")
+        if not 0 <= self.theta < math.inf:
+            raise ValueError(f"{type(self).__name__}: theta={self.theta!r} must be a number of at least 0")
+        if not 0 < self.dt < math.inf:
+            raise ValueError(f"{type(self).__name__}: dt={self.dt!r} must be a positive number")
+        if min(self.repulsive) < 0:
+            raise ValueError(f"{type(self).__name__}: repulsive={self.repulsive} must not be negative")
 
     def init(self, n_envs: int) -> Array:
-        """Returns the processes of ``n_envs`` environments at rest, ``(n_envs, action_dim)``."""
-        return jnp.zeros((n_envs, len(self.mean)), jnp.float32)
+        """Returns the processes of ``n_envs`` environments at the start of an episode, ``(n_envs, action_dim)``."""
+        return jnp.tile(_row(self.initial_noise), (n_envs, 1))
 
-    def sample(self, state: Array, key: Array) -> tuple[Array, Array]:
-        """Returns the state after one step of the processes, which is the noise too, ``(n_envs, action_dim)``."""
-        kick = jnp.array(self.sigma) * np.sqrt(self.dt) * jax.random.normal(key, state.shape)
-        state = state + self.theta * (jnp.array(self.mean) - state) * self.dt + kick
-        return state, state
+    def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
+        """Returns the processes after one step, and ``action`` plus their values, not yet clipped to [-1, 1]."""
+        kick = _row(self.sigma) * math.sqrt(self.dt) * jax.random.normal(key, state.shape)
+        state = state + self.theta * (_row(self.mean) - state) * self.dt + kick
+        action = action + state
+        state = state + _row(self.drift) * self.dt
+        if max(self.repulsive) > 0:
+            push = jnp.clip(_row(self.repulsive) * barrier_slope(action), -jnp.abs(action), jnp.abs(action))
+            state, action = state - push, action - push
+        return state, action
 
 
-Noise = NormalActionNoise | OrnsteinUhlenbeckActionNoise
-NOISES: dict[str, type[NormalActionNoise] | type[OrnsteinUhlenbeckActionNoise]] = {
+def barrier_slope(action: Array) -> Array:
+    """Returns the derivative of the barrier ``(pi u / 2)^6``, which is flat within [-1, 1] and steep beyond."""
+    return 3.0 * math.pi * (0.5 * math.pi * action) ** 5
+
+
+ActionNoise = NormalActionNoise | OrnsteinUhlenbeckActionNoise
+Noise = ActionNoise | ParameterNoise
+NOISES: dict[str, type[NormalActionNoise] | type[OrnsteinUhlenbeckActionNoise] | type[ParameterNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
+    "parameter": ParameterNoise,
 }
 
 
@@ -99,13 +158,44 @@ def to_json(noise: Noise) -> dict[str, Any]:
     return {"noise": name, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()}}
 
 
+def check_fits(noise: Noise | None, action_space: spaces.Space) -> None:
+    """Raises ``ValueError`` unless the noise can be used with these actions.
+
+    Noise on actions needs a Box with as many dimensions as it has; noise on parameters goes with all.
+    """
+    if noise is None or isinstance(noise, ParameterNoise):
+        return
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(
+            f"{type(noise).__name__} adds to continuous actions and the action space is {action_space}; use "
+            "action_noise=ParameterNoise(), or None"
+        )
+    if len(noise.mean) != math.prod(action_space.shape):
+        raise ValueError(
+            f"action_noise has {len(noise.mean)} dimensions and the actions have {math.prod(action_space.shape)}; "
+            f"try {type(noise).__name__}(mean=[0.0] * {math.prod(action_space.shape)}, sigma={noise.sigma[0]})"
+        )
+
+
+def _row(values: tuple[float, ...]) -> Array:
+    return jnp.array([values], jnp.float32)
+
+
+def _check_dtype(noise: Any, dtype: Any) -> None:
+    if not np.issubdtype(np.dtype(dtype), np.floating):
+        raise ValueError(f"{type(noise).__name__}: dtype={dtype!r} must be a floating dtype")
+
+
 def _as_tuples(noise: Any, *keys: str) -> None:
-    """Turns array-like fields into tuples of floats of one length, so that the settings are hashable."""
-    for key in keys:
-        values = tuple(float(v) for v in np.atleast_1d(np.asarray(getattr(noise, key), np.float64)))
-        object.__setattr__(noise, key, values)
-    lengths = {key: len(getattr(noise, key)) for key in keys}
-    if len(set(lengths.values())) != 1:
-        raise ValueError(f"{type(noise).__name__}: {', '.join(f'{k} has {n}' for k, n in lengths.items())} entries")
+    """Turns array-like fields into tuples of finite floats of one length, so that the settings are hashable."""
+    name = type(noise).__name__
+    arrays = {key: np.atleast_1d(np.asarray(getattr(noise, key), np.float64)) for key in keys}
+    n = max(len(array) for array in arrays.values())
+    if any(array.ndim != 1 or len(array) not in (1, n) for array in arrays.values()):
+        raise ValueError(f"{name}: {', '.join(f'{key} has {array.size}' for key, array in arrays.items())} entries")
+    for key, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: {key}={getattr(noise, key)!r} must be finite")
+        object.__setattr__(noise, key, tuple(np.broadcast_to(array, n).tolist()))
     if min(noise.sigma) < 0:
-        raise ValueError(f"{type(noise).__name__}: sigma={noise.sigma} must not be negative")
+        raise ValueError(f"{name}: sigma={noise.sigma} must not be negative")

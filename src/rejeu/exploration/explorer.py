@@ -1,0 +1,73 @@
+"""What a loop calls to choose training actions: an algorithm's own exploration, with noise around it by option.
+
+Noise with memory is a small pytree per environment, the *carry*: it travels beside the algorithm's state, is renewed
+where an episode begins, and is saved with the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rejeu.core import Algorithm, Clock, PyTree
+from rejeu.exploration import parameter_space
+from rejeu.exploration.noise import ActionNoise, Noise
+from rejeu.exploration.parameter_space import ParameterNoise
+
+
+class Explorer(NamedTuple):
+    """Pure functions over a carry, whose leaves are arrays with a leading axis of environments, or shared by all."""
+
+    init: Callable[[PyTree, int], PyTree]
+    """``init(actor, n_envs) -> carry``; of ``actor`` only the shapes are used."""
+    act: Callable[[PyTree, PyTree, PyTree, Array, Array, Clock], tuple[Array, PyTree]]
+    """``act(carry, actor, obs, ended, key, clock) -> (action, carry)``; ``ended``, ``bool (n_envs,)``, is where an
+    episode has just begun."""
+
+
+def make(algorithm: Algorithm, noise: Noise | None) -> Explorer:
+    """Returns how ``algorithm`` explores with ``noise`` (None: as it does by itself)."""
+    if noise is None:
+        return plain(algorithm)
+    if isinstance(noise, ParameterNoise):
+        return with_parameter_noise(algorithm, noise)
+    return with_action_noise(algorithm, noise)
+
+
+def plain(algorithm: Algorithm) -> Explorer:
+    """Returns the algorithm's own exploration; the carry is empty."""
+
+    def act(carry: PyTree, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, PyTree]:
+        return algorithm.explore(actor, obs, key, clock), carry
+
+    return Explorer(lambda actor, n_envs: (), act)
+
+
+def with_action_noise(algorithm: Algorithm, noise: ActionNoise) -> Explorer:
+    """Returns exploration by ``noise`` on actions in [-1, 1]; the carry is the noise's state."""
+
+    def act(carry: PyTree, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, PyTree]:
+        action_key, noise_key = jax.random.split(key)
+        carry = renew(ended, noise.init(ended.shape[0]), carry)
+        carry, action = noise.perturb(carry, algorithm.explore(actor, obs, action_key, clock), noise_key)
+        return jnp.clip(action, -1.0, 1.0), carry
+
+    return Explorer(lambda actor, n_envs: noise.init(n_envs), act)
+
+
+def with_parameter_noise(algorithm: Algorithm, noise: ParameterNoise) -> Explorer:
+    """Returns the algorithm's own exploration by actors with perturbed parameters, one per environment."""
+
+    def act(carry: PyTree, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, PyTree]:
+        return parameter_space.act(noise, algorithm, carry, actor, obs, ended, key, clock)
+
+    return Explorer(lambda actor, n_envs: parameter_space.initial(noise, actor, n_envs), act)
+
+
+def renew(ended: Array, fresh: PyTree, carry: PyTree) -> PyTree:
+    """Returns ``carry`` with the environments where ``ended`` taken from ``fresh``."""
+    return jax.tree.map(lambda f, c: jnp.where(ended.reshape(-1, *[1] * (c.ndim - 1)), f, c), fresh, carry)
