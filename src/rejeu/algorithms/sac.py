@@ -17,8 +17,9 @@ critics' losses are summed over the critics, which gives each the gradient of it
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -28,11 +29,23 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.config import OffPolicyConfig, number, whole
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, ensemble, polyak
+from rejeu.core import (
+    TD_ERROR,
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    copy,
+    descend,
+    ensemble,
+    polyak,
+    weighted_mean,
+)
 from rejeu.distributions import TanhNormal
-from rejeu.networks import Actor, Critic
+from rejeu.networks import Actor, Critic, action_values
 from rejeu.schedules import at
-from rejeu.spaces import check_box_action, leaves
+from rejeu.spaces import action_dimension, check_box_action, leaves
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
@@ -86,12 +99,16 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """Returns SAC for these spaces.
 
     Raises:
-        ValueError: if the action space is not a finite Box.
+        ValueError: if the action space is neither a finite Box nor Discrete.
         TypeError: if the observation space holds something that is no array.
     """
+    if isinstance(action_space, spaces.Discrete):
+        from rejeu.algorithms import sac_discrete  # which imports this module
+
+        return sac_discrete.make(config, observation_space, action_space)
     box = check_box_action(action_space, "SAC")
     obs_leaves = leaves(observation_space)
-    action_dim = int(jnp.prod(jnp.array(box.shape)))
+    action_dim = action_dimension(box)
     shape = config.policy_kwargs
     target_entropy = -float(action_dim) if config.target_entropy == "auto" else float(config.target_entropy)
     optimizer = optax.scale_by_adam()
@@ -129,9 +146,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         alpha = jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch, target_key)
         (critic_loss, values), gradients = jax.value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
-        critics, critics_optimizer = descend(
-            state.critics, gradients, state.critics_optimizer, optimizer, rate
-        )
+        critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
         (policy_loss, log_prob), gradients = jax.value_and_grad(actor_loss, has_aux=True)(
             state.actor, critics, alpha, batch.obs, actor_key
         )
@@ -143,7 +158,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             log_alpha, alpha_optimizer = descend(log_alpha, gradient, alpha_optimizer, optimizer, rate)
 
         n_updates = state.n_updates + 1
-        tau = config.tau
+        tau: Any = config.tau
         if config.target_update_interval > 1:
             tau = jnp.where(n_updates % config.target_update_interval == 0, tau, 0.0)
         state = State(
@@ -163,6 +178,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             "ent_coef": alpha,
             "entropy": -jnp.mean(log_prob),
             "q_value": jnp.mean(values),
+            TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
         }
         return state, metrics
 
@@ -181,9 +197,9 @@ def initial_temperature(ent_coef: float | str) -> float:
             value = float(rest) if rest else 1.0
         except ValueError:
             value = -1.0
-        if ent_coef.startswith("auto") and value > 0:
+        if ent_coef.startswith("auto") and 0 < value < math.inf:
             return value
-    elif not isinstance(ent_coef, bool) and isinstance(ent_coef, int | float) and ent_coef > 0:
+    elif not isinstance(ent_coef, bool) and isinstance(ent_coef, int | float) and 0 < ent_coef < math.inf:
         return float(ent_coef)
     raise ValueError(f"ent_coef={ent_coef!r} must be 'auto', 'auto_0.1' or a positive number")
 
@@ -192,11 +208,6 @@ def policy(actor: Actor, obs: PyTree) -> TanhNormal:
     """Returns the distribution of actions in [-1, 1] at ``obs``."""
     mean, log_std = jnp.split(actor(obs), 2, axis=-1)
     return TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
-
-
-def action_values(critics: Critic, obs: PyTree, action: Array) -> Array:
-    """Returns the value of each critic, ``(n_critics, batch)``."""
-    return jax.vmap(lambda critic: critic(obs, action)[:, 0])(critics)
 
 
 def td_target(actor: Actor, target_critics: Critic, alpha: Array, batch: Transition, key: Array) -> Array:
@@ -209,7 +220,7 @@ def td_target(actor: Actor, target_critics: Critic, alpha: Array, batch: Transit
 def critics_loss(critics: Critic, batch: Transition, target: Array) -> tuple[Array, Array]:
     """Returns half the squared TD error, averaged over the batch and summed over critics, and the values."""
     values = action_values(critics, batch.obs, batch.action)
-    return 0.5 * jnp.sum(jnp.mean(jnp.square(values - target), axis=-1)), values
+    return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
 
 
 def actor_loss(actor: Actor, critics: Critic, alpha: Array, obs: PyTree, key: Array) -> tuple[Array, Array]:

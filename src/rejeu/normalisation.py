@@ -1,0 +1,189 @@
+"""Batch renormalisation: batch normalisation that does in training what it will do in use.
+
+Source: Ioffe 2017, "Batch Renormalization" (arXiv 1702.03275, algorithm 1). With mean and standard deviation ``m_B``,
+``s_B`` of the batch, the running ones ``m``, ``s``, and clip bounds ``r_max``, ``d_max``::
+
+    r = clip(s_B / s, 1 / r_max, r_max)         d = clip((m_B - m) / s, -d_max, d_max)         neither differentiated
+    y = scale ((x - m_B) / s_B r + d) + offset                                                  in training
+    y = scale (x - m) / s + offset                                                              in use
+
+Where nothing is clipped the two give the same, but in training the gradient flows through the batch's statistics.
+During the warm-up ``r = 1`` and ``d = 0``: plain batch normalisation. Running statistics move a hundredth of the way to
+the batch's at every training step; the paper keeps ``s``, we keep its square, as CrossQ's authors do.
+
+The running statistics are arrays of the network like its weights, but they learn from what passes, not by gradient:
+``train`` returns the output and the network that has seen it. Because an optimizer's step starts from the network
+before, :func:`with_statistics` joins the two::
+
+    (loss, trained), gradients = jax.value_and_grad(loss_that_returns_trained, has_aux=True)(network)
+    network = with_statistics(descend(network, gradients, ...), trained)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from rejeu.core import PyTree
+from rejeu.networks import ACTIVATIONS, Encoder, Linear
+from rejeu.spaces import Leaf
+
+Network = TypeVar("Network")
+
+MOMENTUM = 0.99
+"""Share of a running statistic that stays at each training step (arXiv 1902.05605, table of hyper-parameters)."""
+EPSILON = 1e-3
+"""Added to every variance, in the square of the input's unit."""
+R_MAX = 3.0
+"""Most by which the batch's standard deviation and the running one may differ, as a ratio."""
+D_MAX = 5.0
+"""Most by which their means may differ, in running standard deviations."""
+
+
+class BatchRenorm(eqx.Module):
+    """Normalises each feature over the batch axis."""
+
+    scale: Array
+    """``(width,)``, learnt."""
+    offset: Array
+    """``(width,)``, learnt."""
+    mean: Array
+    """Running mean of the input, ``(width,)``."""
+    variance: Array
+    """Running variance of the input, biased (divided by the batch size), ``(width,)``."""
+    n_batches: Array
+    """Training steps so far, ``float32[]`` so that it may stand among what is differentiated. It stops growing at 2^24,
+    long after the warm-up."""
+    warm_up: int = eqx.field(static=True)
+    """Training steps of plain batch normalisation at the beginning."""
+
+    def __init__(self, width: int, warm_up: int) -> None:
+        self.scale = jnp.ones((width,), jnp.float32)
+        self.offset = jnp.zeros((width,), jnp.float32)
+        self.mean = jnp.zeros((width,), jnp.float32)
+        self.variance = jnp.ones((width,), jnp.float32)
+        self.n_batches = jnp.zeros((), jnp.float32)
+        self.warm_up = warm_up
+
+    def __call__(self, x: Array) -> Array:
+        """Normalises ``(batch, width)`` by the running statistics."""
+        mean, variance = lax.stop_gradient((self.mean, self.variance))
+        factor = self.scale * lax.rsqrt(variance + EPSILON)
+        return x * factor[None] + (self.offset - mean * factor)[None]
+
+    def train(self, x: Array) -> tuple[Array, BatchRenorm]:
+        """Normalises ``(batch, width)`` by its own statistics, corrected; returns also the layer that has seen it."""
+        batch_mean = jnp.mean(x, axis=0)
+        centred = x - batch_mean[None]
+        batch_variance = jnp.mean(jnp.square(centred), axis=0)
+        batch_deviation = jnp.sqrt(batch_variance + EPSILON)
+        ratio, shift = lax.stop_gradient(self._correction(batch_mean, batch_deviation))
+        factor = self.scale * ratio / batch_deviation
+        y = centred * factor[None] + (self.scale * shift + self.offset)[None]
+        moved = lax.stop_gradient(
+            (
+                MOMENTUM * self.mean + (1.0 - MOMENTUM) * batch_mean,
+                MOMENTUM * self.variance + (1.0 - MOMENTUM) * batch_variance,
+                self.n_batches + 1.0,
+            )
+        )
+        return y, eqx.tree_at(_statistics, self, moved)
+
+    def _correction(self, batch_mean: Array, batch_deviation: Array) -> tuple[Array, Array]:
+        """Returns ``r`` and ``d`` of the paper, ``(width,)`` each."""
+        deviation = jnp.sqrt(self.variance + EPSILON)
+        ratio = jnp.clip(batch_deviation / deviation, 1.0 / R_MAX, R_MAX)
+        shift = jnp.clip((batch_mean - self.mean) / deviation, -D_MAX, D_MAX)
+        warm = self.n_batches >= self.warm_up
+        return jnp.where(warm, ratio, 1.0), jnp.where(warm, shift, 0.0)
+
+
+class RenormalisedMLP(eqx.Module):
+    """Hidden layers: a renormalisation of the input, then each a linear map, a nonlinearity and a renormalisation."""
+
+    layers: tuple[Linear, ...]
+    norms: tuple[BatchRenorm, ...]
+    """Of the input, then of what each layer gives: one more than layers."""
+    activation: str = eqx.field(static=True)
+
+    def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str, warm_up: int) -> None:
+        keys = jax.random.split(key, max(len(widths), 1))
+        sizes = (n_inputs, *widths)
+        self.layers = tuple(Linear(k, i, o) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=False))
+        self.norms = tuple(BatchRenorm(size, warm_up) for size in sizes)
+        self.activation = activation
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, widths[-1])`` by the running statistics."""
+        x = self.norms[0](x)
+        for layer, norm in zip(self.layers, self.norms[1:], strict=True):
+            x = norm(ACTIVATIONS[self.activation](layer(x)))
+        return x
+
+    def train(self, x: Array) -> tuple[Array, RenormalisedMLP]:
+        """Does the same by the batch's statistics; returns also the torso that has seen it."""
+        x, norm = self.norms[0].train(x)
+        norms = [norm]
+        for layer, norm in zip(self.layers, self.norms[1:], strict=True):
+            x, norm = norm.train(ACTIVATIONS[self.activation](layer(x)))
+            norms.append(norm)
+        return x, eqx.tree_at(lambda torso: torso.norms, self, tuple(norms))
+
+
+class RenormalisedNetwork(eqx.Module):
+    """Observation, and for a critic the action, to numbers: encoder, renormalised hidden layers, one linear head."""
+
+    encoder: Encoder
+    torso: RenormalisedMLP
+    head: Linear
+
+    def __init__(
+        self,
+        key: Array,
+        leaves: tuple[Leaf, ...],
+        action_dim: int | None,
+        n_outputs: int,
+        widths: Sequence[int],
+        activation: str,
+        warm_up: int,
+    ) -> None:
+        """Draws the weights; ``action_dim`` is None for a network that is given no action."""
+        encoder_key, torso_key, head_key = jax.random.split(key, 3)
+        self.encoder = Encoder(leaves, encoder_key)
+        sizes = (self.encoder.n_features + (action_dim or 0), *widths)
+        self.torso = RenormalisedMLP(torso_key, sizes[0], widths, activation, warm_up)
+        self.head = Linear(head_key, sizes[-1], n_outputs)
+
+    def __call__(self, obs: PyTree, action: Array | None = None) -> Array:
+        """Maps observations ``(batch, ...)`` to ``(batch, n_outputs)`` by the running statistics.
+
+        A critic is given actions ``(batch, action_dim)`` as well.
+        """
+        return self.head(self.torso(self._features(obs, action)))
+
+    def train(self, obs: PyTree, action: Array | None = None) -> tuple[Array, RenormalisedNetwork]:
+        """Does the same by the batch's statistics; returns also the network that has seen it."""
+        hidden, torso = self.torso.train(self._features(obs, action))
+        return self.head(hidden), eqx.tree_at(lambda network: network.torso, self, torso)
+
+    def _features(self, obs: PyTree, action: Array | None) -> Array:
+        features = self.encoder(obs)
+        return features if action is None else jnp.concatenate([features, action], axis=-1)
+
+
+def with_statistics(network: Network, trained: Network) -> Network:
+    """Returns ``network`` with the running statistics of ``trained``, a network of the same structure."""
+
+    def take(own: Any, other: Any) -> Any:
+        return eqx.tree_at(_statistics, own, _statistics(other)) if isinstance(own, BatchRenorm) else own
+
+    return jax.tree.map(take, network, trained, is_leaf=lambda node: isinstance(node, BatchRenorm))
+
+
+def _statistics(norm: BatchRenorm) -> tuple[Array, Array, Array]:
+    return norm.mean, norm.variance, norm.n_batches

@@ -1,0 +1,88 @@
+"""Probe environments: each can be solved in seconds, and only if one particular thing works.
+
+After "Debugging RL, Without the Agonizing Pain" (Andy Jones 2021). All have one number as observation and one as action, so
+that they share compiled functions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+
+class Probe(gym.Env):
+    """Episodes of ``length`` steps; subclasses say what is seen and what is earned."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Box(0.0, 2.0, (1,), np.float32)
+    length = 1
+    ends = "terminated"
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.time = 0
+        self.sign = float(self.np_random.choice([-1.0, 1.0]))
+        return self.see(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        reward = self.earn(float(action[0]))
+        self.time += 1
+        over = self.time >= self.length
+        return self.see(), reward, over and self.ends == "terminated", over and self.ends == "truncated", {}
+
+    def see(self) -> np.ndarray:
+        return np.zeros(1, np.float32)
+
+    def earn(self, action: float) -> float:
+        return 1.0
+
+
+class Constant(Probe):
+    """Always earns 1, once: the critic must learn 1."""
+
+
+class Endless(Probe):
+    """Always earns 1; the time limit of one step is no end: the critic must learn 1 / (1 - gamma)."""
+
+    ends = "truncated"
+
+
+class BySight(Probe):
+    """Earns what is seen, 1 or -1: the critic must use the observation."""
+
+    def see(self) -> np.ndarray:
+        return np.float32([self.sign])
+
+    def earn(self, action: float) -> float:
+        return self.sign
+
+
+class Later(Probe):
+    """Two steps, and only the second earns 1: the value of the first is gamma."""
+
+    length = 2
+
+    def see(self) -> np.ndarray:
+        return np.float32([min(self.time, 1)])
+
+    def earn(self, action: float) -> float:
+        return float(self.time == 1)
+
+
+class ByAction(Probe):
+    """The best action is 1.5, in bounds from 0 to 2: the actor must follow the critic, in the environment's range."""
+
+    def earn(self, action: float) -> float:
+        return 1.0 - 4.0 * (action - 1.5) ** 2
+
+
+class BySightAndAction(Probe):
+    """The best action is 1.5 where 1 is seen and 0.5 where -1 is: actor and critic must both use what is seen."""
+
+    def see(self) -> np.ndarray:
+        return np.float32([self.sign])
+
+    def earn(self, action: float) -> float:
+        return 1.0 - 4.0 * (action - 1.0 - 0.5 * self.sign) ** 2
