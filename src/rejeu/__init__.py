@@ -6,7 +6,8 @@
 100
 """
 
-from rejeu.agents import AGENTS, SAC, load
+from rejeu.agents import AGENTS, DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ, load
+from rejeu.envs.monitor import Monitor
 from rejeu.envs.vector import make_vector
 from rejeu.errors import CheckpointError, MissingExtra
 from rejeu.evaluation import Evaluation, evaluate_policy
@@ -14,23 +15,33 @@ from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNo
 from rejeu.replay.hindsight import GoalSelectionStrategy, HerReplayBuffer
 from rejeu.replay.uniform import ReplayBuffer
 from rejeu.schedules import Exponential, Linear
+from rejeu.video import record_video, show_videos
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AGENTS",
+    "DDPG",
+    "DQN",
+    "QRDQN",
     "SAC",
+    "TD3",
+    "TQC",
     "CheckpointError",
+    "CrossQ",
     "Evaluation",
     "Exponential",
     "GoalSelectionStrategy",
     "HerReplayBuffer",
     "Linear",
     "MissingExtra",
+    "Monitor",
     "NormalActionNoise",
     "OrnsteinUhlenbeckActionNoise",
     "ReplayBuffer",
     "evaluate_policy",
     "load",
     "make_vector",
+    "record_video",
+    "show_videos",
 ]

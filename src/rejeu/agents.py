@@ -13,18 +13,20 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import checkpoint, compilation, config as configs, spaces
-from rejeu.algorithms import sac
+from rejeu import checkpoint, compilation, config as configs, spaces, summary
+from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.config import OffPolicyConfig
+from rejeu.envs.auto_reset import AutoResetView
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
+from rejeu.exploration.noise import check_fits
 from rejeu.history import History
 from rejeu.interrupt import Interrupt
 from rejeu.logging import Console, Sink, TensorBoard, next_folder
@@ -32,6 +34,7 @@ from rejeu.loops import host
 from rejeu.loops.compiled import Compiled
 from rejeu.loops.host import Episode, Progress, Run
 from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
 
@@ -50,6 +53,23 @@ AGENT_ARGUMENTS = {
     "stats_window_size": "Episodes over which reported means are taken.",
     "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
 }
+
+
+BEST_WINDOW = 20
+"""Training episodes over whose mean return the best weights are judged."""
+
+
+class Best(NamedTuple):
+    """The best weights of a run so far."""
+
+    score: float
+    """Mean return, or whatever an evaluation was judged by."""
+    by: str
+    """``"training"`` or ``"evaluation"``."""
+    step: int
+    """Environment steps taken when they were kept."""
+    leaves: list[Any]
+    """The algorithm's whole state at that moment, flat."""
 
 
 class Agent:
@@ -86,6 +106,8 @@ class Agent:
         self.ep_success_buffer: deque[float] = deque(maxlen=self.stats_window_size)
         self.interrupted = False
         """Whether the last ``learn`` was ended by Ctrl-C."""
+        self.best: Best | None = None
+        """The best weights so far, by smoothed training return or by evaluation."""
         self.steps_per_second = math.nan
         """Environment steps per second of the present or last ``learn``."""
         self._steps_before = 0
@@ -102,16 +124,14 @@ class Agent:
         self.observation_space, self.action_space = observation_space, action_space
         self._obs_leaves = spaces.leaves(observation_space)
         noise = self.config.action_noise
-        if noise is not None and len(noise.mean) != math.prod(action_space.shape or ()):
-            raise ValueError(f"action_noise has {len(noise.mean)} dimensions and the actions {action_space.shape}")
+        if noise is not None:
+            check_fits(noise, action_space)
         self._compiled = Compiled(self.algorithm.make(self.config, observation_space, action_space), noise)
 
     def _start(self, env: VectorEnv) -> None:
         """Begins a run on ``env`` with a fresh state and an empty buffer."""
-        noise = self.config.action_noise
-        carry = np.zeros((env.n_envs, 0), np.float32) if noise is None else noise.init(env.n_envs)
         self._run: Run = host.initial_run(
-            env, self._make_replay(env), self._compiled, carry, self.config.learning_starts, self.seed
+            env, self._make_replay(env), self._compiled, self.config.learning_starts, self.seed
         )
 
     def _make_replay(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
@@ -126,16 +146,18 @@ class Agent:
             spaces.structure(env.observation_space),
             action.shape[1:],
             action.dtype,
+            config.frame_stack,
         )
+        priorities = None if config.priorities is None else Priorities(ring, config.priorities)
         if config.hindsight is None:
-            return ReplayBuffer(ring, config.gamma)
+            return ReplayBuffer(ring, config.gamma, config.n_steps, priorities)
         goals = env.goals()
         if goals is None:
             raise ValueError(
                 f"hindsight replay needs the environment's compute_reward(achieved_goal, desired_goal, info), and "
                 f"{env.env_id} has none; add it, or use replay_buffer_class=None"
             )
-        return HerReplayBuffer(ring, config.gamma, config.hindsight, goals)
+        return HerReplayBuffer(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities)
 
     @staticmethod
     def _check_policy(policy: str, space: gym.Space) -> None:
@@ -145,7 +167,9 @@ class Agent:
         if policy == "MlpPolicy" and is_dict:
             raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
         if policy == "MultiInputPolicy" and not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-            raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
+            raise ValueError(
+                f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'"
+            )
         if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in spaces.leaves(space)):
             raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
 
@@ -198,6 +222,7 @@ class Agent:
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         *,
+        episodes: int | None = None,
         minutes: float | None = None,
         sinks: Iterable[Sink] = (),
     ) -> Self:
@@ -205,24 +230,28 @@ class Agent:
 
         Args:
             total_timesteps: environment steps to take, over all environments; exactly so many are taken. None with
-                ``minutes``.
+                ``episodes`` or ``minutes``.
             callback: called after every step as ``callback(agent, progress)``, or several; ``False`` stops training.
             log_interval: episodes between two rows of statistics.
             tb_log_name: name of the run in ``tensorboard_log``; None: the algorithm's.
             reset_num_timesteps: start counting and log anew; learning itself goes on where it stood in either case.
             progress_bar: show one.
-            minutes: stop after so much wall time.
+            episodes: stop when so many episodes have ended, over all environments.
+            minutes: stop after so much wall time. Schedules follow whichever limit is nearest.
             sinks: further places for the rows of statistics, such as ``rejeu.logging.CsvFile(path)``.
 
         Ctrl-C ends training after the step it is in, with everything consistent; ``interrupted`` is then True.
 
         Raises:
-            ValueError: without an environment, or if neither ``total_timesteps`` nor ``minutes`` is given.
+            ValueError: without an environment, or if no limit is given.
         """
         if self._run.env is None:
-            raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
-        if total_timesteps is None and minutes is None:
-            raise ValueError("learn needs total_timesteps or minutes")
+            raise ValueError(
+                "this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)"
+            )
+        if total_timesteps is None and minutes is None and episodes is None:
+            raise ValueError("learn needs total_timesteps, episodes or minutes")
+        n_episodes = math.inf if episodes is None else configs.whole("episodes", episodes, least=1)
         n_steps = None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1)
         seconds = math.inf if minutes is None else 60 * configs.number("minutes", minutes, above=0)
         if reset_num_timesteps:
@@ -240,11 +269,13 @@ class Agent:
             bar = ProgressBar(n_steps, None if minutes is None else seconds)
             callbacks.append(bar)
         began, first, logged = time.perf_counter(), self._run.step, len(self.history)
+        first_episode = self._run.episode
 
         def progress(taken: int) -> float:
             by_steps = taken / n_steps if n_steps else 0.0
-            by_time = (time.perf_counter() - began) / seconds if n_steps is None else 0.0
-            return min(max(by_steps, by_time), 1.0)
+            by_episodes = (self._run.episode - first_episode) / n_episodes
+            by_time = (time.perf_counter() - began) / seconds
+            return min(max(by_steps, by_episodes, by_time), 1.0)
 
         self.interrupted = False
         try:
@@ -259,7 +290,12 @@ class Agent:
                         row = self.statistics()
                         for output in outputs:
                             output.write(self.num_timesteps, row)
-                    if not all([c(self, turn) is not False for c in callbacks]) or elapsed >= seconds:
+                    if turn.episodes:
+                        self._note_training_return()
+                    stops = [callback(self, turn) is False for callback in callbacks]
+                    if any(stops):
+                        break
+                    if elapsed >= seconds or self._run.episode - first_episode >= n_episodes:
                         break
                     if interrupt.requested:
                         self.interrupted = True
@@ -276,6 +312,37 @@ class Agent:
         self.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
         if not math.isnan(episode.success):
             self.ep_success_buffer.append(episode.success)
+
+    def _note_training_return(self) -> None:
+        """Remembers the present weights if the mean of the last episodes' returns is the best so far."""
+        returns = [e["r"] for e in self.ep_info_buffer]
+        if len(returns) >= BEST_WINDOW and (self.best is None or self.best.by == "training"):
+            self.remember_best(float(np.mean(returns[-BEST_WINDOW:])), "training")
+
+    def remember_best(self, score: float, by: str = "evaluation") -> bool:
+        """Keeps the present weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
+
+        ``learn`` calls it with the mean return of the last 20 training episodes; once it was called with the score of an
+        evaluation, evaluations alone count.
+        """
+        if self.best is not None and self.best.by == by and score <= self.best.score:
+            return False
+        self.best = Best(score, by, self._run.step, self._compiled.copy(self._run.leaves))
+        return True
+
+    def restore_best(self) -> Self:
+        """Puts back the best weights so far: actor, critics, their targets and optimizers as they were together.
+
+        Raises:
+            ValueError: if none were kept yet, which takes 20 finished episodes or one evaluation.
+        """
+        if self.best is None:
+            raise ValueError(
+                f"no best weights are known yet: they are kept from the {BEST_WINDOW}th finished episode on, and at every "
+                "evaluation by rejeu.callbacks.Evaluate"
+            )
+        self._run.leaves = self._compiled.copy(self.best.leaves)
+        return self
 
     def statistics(self) -> dict[str, float]:
         """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
@@ -323,15 +390,22 @@ class Agent:
 
     def _as_batch(self, observation: Any) -> tuple[Any, bool]:
         expected = spaces.structure(self.observation_space)
-        parts, tree = jax.tree.flatten(observation)
+        try:
+            parts, tree = jax.tree.flatten(spaces.plain(self.observation_space, observation))
+        except (KeyError, IndexError, TypeError, ValueError):
+            parts, tree = jax.tree.flatten(observation)
         if tree != expected:
-            raise ValueError(f"the observation has the structure {tree}, expected {expected} of {self.observation_space}")
+            raise ValueError(
+                f"the observation has the structure {tree}, expected {expected} of {self.observation_space}"
+            )
         arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(parts, self._obs_leaves, strict=True)]
         single = arrays[0].ndim == len(self._obs_leaves[0].shape)
         for array, leaf in zip(arrays, self._obs_leaves, strict=True):
             if (array.shape if single else array.shape[1:]) != leaf.shape:
                 where = f" of {leaf.path!r}" if leaf.path else ""
-                raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
+                raise ValueError(
+                    f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it"
+                )
         return jax.tree.unflatten(tree, [array[None] if single else array for array in arrays]), single
 
     def _act(self, obs: Any, deterministic: bool) -> np.ndarray:
@@ -342,9 +416,8 @@ class Agent:
         n = len(jax.tree.leaves(obs)[0])
         clock = host.clock_of(self._run, 1.0)._replace(step=np.uint32(2**32 - 1 - self._n_predictions % 2**31))
         self._n_predictions += 1
-        noise = self.config.action_noise
-        carry = np.zeros((n, 0), np.float32) if noise is None else noise.init(n)
-        action, _ = self._compiled.act(leaves, carry, obs, np.zeros(n, bool), self._run.key, clock)
+        carry = self._compiled.initial_carry(n)
+        action, _ = self._compiled.act(leaves, carry, obs, np.ones(n, bool), self._run.key, clock)
         return np.asarray(action)
 
     def evaluate(
@@ -376,9 +449,15 @@ class Agent:
             elif not isinstance(env, gym.Env | gym.vector.VectorEnv | VectorEnv):
                 vector.close()
 
-    def get_env(self) -> VectorEnv | None:
-        """Returns the environments it trains on."""
-        return self.env
+    def get_env(self) -> AutoResetView | None:
+        """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
+
+        The episodes that ran there are given up: the next ``learn`` begins new ones.
+        """
+        if self._run.env is None:
+            return None
+        self._run.obs = self._run.action = None
+        return AutoResetView(self._run.env)
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Gives the agent another environment of the same spaces; its episodes start anew.
@@ -394,8 +473,8 @@ class Agent:
         run = self._run
         if run.env is None or run.env.n_envs != vector.n_envs:
             run.replay = self._make_replay(vector)
-            noise = self.config.action_noise
-            run.carry = np.zeros((vector.n_envs, 0), np.float32) if noise is None else noise.init(vector.n_envs)
+            run.td_errors = []
+            run.carry = self._compiled.initial_carry(vector.n_envs)
         run.env = vector
         run.obs = run.action = None
         run.ended = np.ones(vector.n_envs, bool)
@@ -410,7 +489,9 @@ class Agent:
         """Returns everything learnt as arrays by name, copied: networks, targets, optimizers, temperature, counters."""
         return {key: value.copy() for key, value in checkpoint.tree_to_arrays(self.state).items()}
 
-    def set_parameters(self, load_path_or_dict: Mapping[str, np.ndarray] | str | Path, exact_match: bool = True) -> None:
+    def set_parameters(
+        self, load_path_or_dict: Mapping[str, np.ndarray] | str | Path, exact_match: bool = True
+    ) -> None:
         """Puts parameters in place, from :meth:`get_parameters` or from a model file.
 
         Args:
@@ -471,7 +552,7 @@ class Agent:
             )
         own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
         try:
-            config = configs.build(cls.algorithm.Config, {**header["config"], **changes})
+            config = configs.rebuild(cls.algorithm.Config, header["config"], changes)
             observation_space = spaces.rebuild(header["observation_space"])
             action_space = spaces.rebuild(header["action_space"])
             counters = {key: configs.whole(key, header["counters"][key], 0) for key in ("step", "episode", "n_updates")}
@@ -480,6 +561,8 @@ class Agent:
             window = configs.whole("stats_window_size", own.pop("stats_window_size", header["stats_window_size"]), 1)
             policy = own.pop("policy", header["policy"])
             cls._check_policy(policy, observation_space)
+        except CheckpointError as error:
+            raise CheckpointError(f"{path}: {error}") from None
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
             if changes and not isinstance(error, KeyError):
                 raise
@@ -493,6 +576,7 @@ class Agent:
         agent.history = History()
         agent.ep_info_buffer, agent.ep_success_buffer = deque(maxlen=window), deque(maxlen=window)
         agent.interrupted, agent.steps_per_second = False, math.nan
+        agent.best = None
         agent._n_predictions, agent._own_env = 0, isinstance(env, str)
         compilation.enable_cache()
         try:
@@ -512,7 +596,7 @@ class Agent:
         if vector is not None:
             self._start(vector)
         else:
-            self._run = host.initial_run(None, None, self._compiled, np.zeros((1, 0)), 0, self.seed)  # type: ignore[arg-type]
+            self._run = host.initial_run(None, None, self._compiled, 0, self.seed)
         run = self._run
         run.leaves = [jax.numpy.array(leaf) for leaf in leaves]
         run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
@@ -520,6 +604,10 @@ class Agent:
         run.learn_from = max(self.config.learning_starts, run.step + self.config.learning_starts)
         self._steps_before = 0
         return self
+
+    def summary(self) -> str:
+        """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.summary`."""
+        return summary.describe(self._compiled.shapes, self._obs_leaves)
 
     def save_replay_buffer(self, path: str | Path) -> Path:
         """Writes the replay buffer to one safetensors file and returns its path."""
@@ -571,12 +659,50 @@ class Agent:
 
 
 class SAC(Agent):
-    """Soft actor-critic (Haarnoja et al. 2018), for continuous actions."""
+    """Soft actor-critic (Haarnoja et al. 2018), for continuous and Discrete actions."""
 
-    algorithm = sac
+    algorithm: ClassVar[ModuleType] = sac
 
 
-AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in (SAC,)}
+class DDPG(Agent):
+    """Deep deterministic policy gradient (Lillicrap et al. 2015), for continuous and Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = ddpg
+
+
+class TD3(Agent):
+    """Twin delayed DDPG (Fujimoto et al. 2018), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = td3
+
+
+class DQN(Agent):
+    """Deep Q-learning (Mnih et al. 2015), for Discrete actions; double, dueling and n-step by option."""
+
+    algorithm: ClassVar[ModuleType] = dqn
+
+
+class QRDQN(Agent):
+    """Quantile regression DQN (Dabney et al. 2018), for Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = qrdqn
+
+
+class TQC(Agent):
+    """Truncated quantile critics (Kuznetsov et al. 2020), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = tqc
+
+
+class CrossQ(Agent):
+    """SAC with batch renormalisation instead of target networks (Bhatt et al. 2024), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = crossq
+
+
+AGENTS: dict[str, type[Agent]] = {
+    agent.algorithm.Config.name: agent for agent in (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ)
+}
 """Every agent by the name of its algorithm."""
 
 

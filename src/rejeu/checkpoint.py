@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -44,11 +44,12 @@ def write(path: str | Path, kind: str, arrays: Mapping[str, np.ndarray], header:
     path = resolve(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"schema": SCHEMA, "kind": kind, **header}, allow_nan=False)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    os.close(handle)
-    temporary = Path(name)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
         save_file({key: np.asarray(value, order="C") for key, value in arrays.items()}, temporary, {HEADER_KEY: text})
+        temporary.chmod(mode)  # safetensors makes files that only their owner may read
         with temporary.open("r+b") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -112,7 +113,9 @@ def _refuse_constant(name: str) -> None:
 
 def names(tree: PyTree) -> list[str]:
     """Returns the dotted path of each leaf of a tree, such as ``actor.torso.layers.0.weight``."""
-    return [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_leaves_with_path(tree)]
+    return [
+        jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_leaves_with_path(tree)
+    ]
 
 
 def tree_to_arrays(tree: PyTree) -> dict[str, np.ndarray]:
@@ -137,5 +140,7 @@ def arrays_to_leaves(expected: PyTree, arrays: Mapping[str, np.ndarray], path: s
                 "it was saved with other networks or for another environment"
             )
     if extra := sorted(set(arrays) - set(keys)):
-        raise CheckpointError(f"{path} has {extra[0]}, which this agent has not; it was saved with another configuration")
+        raise CheckpointError(
+            f"{path} has {extra[0]}, which this agent has not; it was saved with another configuration"
+        )
     return [arrays[key] for key in keys]

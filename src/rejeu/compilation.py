@@ -20,7 +20,8 @@ def enable_cache() -> None:
     if not _listening:
         _listening = True
         jax.monitoring.register_event_duration_secs_listener(_listen)
-    if jax.config.jax_compilation_cache_dir is None and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    unset = jax.config.jax_compilation_cache_dir is None  # type: ignore[attr-defined]
+    if unset and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("rejeu", appauthor=False))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
@@ -30,7 +31,7 @@ def seconds() -> float:
     return _seconds
 
 
-def _listen(event: str, duration: float, **_: object) -> None:
+def _listen(event: str, duration_secs: float, **_: str | int) -> None:
     global _seconds
     if event.startswith("/jax/core/compile/"):
-        _seconds += duration
+        _seconds += duration_secs

@@ -19,9 +19,11 @@ from functools import cache
 from typing import Any, ClassVar, Literal, TypeVar
 
 from rejeu import schedules
+from rejeu.errors import CheckpointError
 from rejeu.exploration import noise as action_noises
 from rejeu.networks import PolicyConfig
 from rejeu.replay.hindsight import HindsightConfig
+from rejeu.replay.prioritized import PriorityConfig
 from rejeu.schedules import Schedule
 
 C = TypeVar("C")
@@ -59,8 +61,17 @@ class OffPolicyConfig:
     """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not."""
     replay_buffer_kwargs: HindsightConfig | None = None
     """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``."""
+    n_steps: int = 1
+    """Rewards summed before bootstrapping: n-step returns. Raising it spreads rewards faster, off-policy with some bias."""
+    priorities: PriorityConfig | None = None
+    """Draw steps by their TD error: ``dict(alpha=0.6, beta=0.4)`` or ``{}`` for the defaults. None draws uniformly."""
+    frame_stack: int | None = None
+    """Observations are stacks of this many frames along the first axis; only the newest is stored and stacks are built
+    when sampled, so the replay buffer takes that many times less memory. None stores observations as they are."""
     policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
-    """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``."""
+    """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
+    (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``) or a ``torso`` of your
+    own."""
 
     name: ClassVar[str] = ""
 
@@ -75,19 +86,28 @@ class OffPolicyConfig:
         put("train_freq", _train_freq(self.train_freq))
         put("gradient_steps", whole("gradient_steps", self.gradient_steps, least=-1))
         if self.gradient_steps == 0:
-            raise ValueError("gradient_steps=0 would never learn; use 1 or more, or -1 for as many as environment steps")
+            raise ValueError(
+                "gradient_steps=0 would never learn; use 1 or more, or -1 for as many as environment steps"
+            )
         if self.batch_size > self.buffer_size:
             raise ValueError(
                 f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "
                 f"try buffer_size={max(10 * self.batch_size, 10_000)} or batch_size={self.buffer_size}"
             )
         put("action_noise", action_noises.parse(self.action_noise))
+        put("n_steps", whole("n_steps", self.n_steps, least=1))
+        if self.priorities is not None:
+            put("priorities", nested("priorities", PriorityConfig, self.priorities))
+        if self.frame_stack is not None:
+            put("frame_stack", whole("frame_stack", self.frame_stack, least=1))
         put("policy_kwargs", nested("policy_kwargs", PolicyConfig, self.policy_kwargs))
         self._parse_replay()
 
     def _parse_replay(self) -> None:
         kind = self.replay_buffer_class
-        key = "ReplayBuffer" if kind is None else kind if isinstance(kind, str) else getattr(kind, "__name__", repr(kind))
+        key = (
+            "ReplayBuffer" if kind is None else kind if isinstance(kind, str) else getattr(kind, "__name__", repr(kind))
+        )
         if key not in REPLAY_BUFFERS:
             raise ValueError(f"replay_buffer_class={key!r} is unknown; choose one of {', '.join(REPLAY_BUFFERS)}")
         settings = REPLAY_BUFFERS[key]
@@ -116,26 +136,26 @@ def whole(key: str, value: Any, least: int) -> int:
     Raises:
         ValueError: if it is not a whole number or below ``least``.
     """
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
+    good = (
+        isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
+    )
     if not good or value < least:
         raise ValueError(f"{key}={value!r} must be a whole number of at least {least}")
     return int(value)
 
 
 def whole_exact(value: Any) -> int:
-    """Returns ``value`` if it is an int of at least 0, of whatever size.
+    """Returns ``value`` if it is an int in [0, 2^128), as the state of a NumPy generator is.
 
     Raises:
         ValueError: if it is not.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"{value!r} must be a whole number of at least 0")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**128:
+        raise ValueError(f"{value!r} must be a whole number from 0 to 2**128 - 1")
     return value
 
 
-def number(
-    key: str, value: Any, least: float = -math.inf, above: float = -math.inf, most: float = math.inf
-) -> float:
+def number(key: str, value: Any, least: float = -math.inf, above: float = -math.inf, most: float = math.inf) -> float:
     """Returns ``value`` as a finite float within ``[least, most]`` and greater than ``above``.
 
     Raises:
@@ -173,6 +193,26 @@ def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
     return kind(**given)
 
 
+def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any]) -> C:
+    """Returns the configuration of a file with some settings changed; of ``policy_kwargs`` only those that are named.
+
+    Raises:
+        CheckpointError: if the file names a ``torso`` of the user's own and none is given.
+    """
+    merged = {**saved, **changes}
+    policy, old = changes.get("policy_kwargs"), saved.get("policy_kwargs")
+    if isinstance(policy, Mapping) and isinstance(old, Mapping):
+        replaced = ("pi", "qf") if "net_arch" in policy else ()
+        merged["policy_kwargs"] = {key: value for key, value in old.items() if key not in replaced} | dict(policy)
+    policy = merged.get("policy_kwargs")
+    if isinstance(policy, Mapping) and isinstance(torso := policy.get("torso"), str):
+        raise CheckpointError(
+            f"its networks have a torso of your own, {torso[:40]!r}, and no file holds code; give it again: "
+            f"load(path, policy_kwargs=dict(torso={torso[:40]}))"
+        )
+    return build(kind, merged)
+
+
 def unknown_name(key: str, names: Iterable[str], owner: str) -> str:
     """Returns the sentence for a misspelt name, with the nearest known one."""
     near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
@@ -207,7 +247,10 @@ def field_docs(kind: type) -> dict[str, str]:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """Returns a configuration as plain JSON values; ``build(kind, to_json(config)) == config``."""
+    """Returns a configuration as plain JSON values, which :func:`build` makes it from again.
+
+    A ``torso`` of the user's own is named only, and must be given again (:func:`rebuild`).
+    """
     return {field.name: _value_to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
@@ -216,6 +259,8 @@ def _value_to_json(value: Any) -> Any:
         return schedules.to_json(value)
     if isinstance(value, action_noises.Noise):
         return action_noises.to_json(value)
+    if callable(value) and not isinstance(value, tuple):
+        return getattr(value, "__name__", type(value).__name__)
     if dataclasses.is_dataclass(value):
         return to_json(value)
     return list(value) if isinstance(value, tuple) else value

@@ -37,6 +37,8 @@ class Transition(NamedTuple):
     """The observation that the target bootstraps from, same structure as ``obs``."""
     discount: Any
     """Weight of the bootstrapped value, ``(batch,)`` in [0, 1]."""
+    weight: Any = None
+    """Importance weights of prioritised replay, ``(batch,)`` in (0, 1]; None where all steps are equally likely."""
 
 
 class Clock(NamedTuple):
@@ -65,7 +67,12 @@ class Algorithm(NamedTuple):
     exploit: Callable[[PyTree, PyTree], Array]
     """``exploit(actor, obs) -> action``, the deterministic policy, ``(batch, ...)``."""
     update: Callable[[PyTree, Transition, Clock], tuple[PyTree, Metrics]]
-    """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns."""
+    """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns. The metrics are
+    scalars, and under ``TD_ERROR`` the absolute TD errors ``(batch,)`` that prioritised replay goes by."""
+
+
+TD_ERROR = "td_error"
+"""Name among the metrics of an update for the absolute TD error of each transition, ``(batch,)``."""
 
 
 def descend(
@@ -79,6 +86,11 @@ def descend(
     direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
     params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
     return params, optimizer_state
+
+
+def weighted_mean(values: Array, weight: Array | None) -> Array:
+    """Returns the mean of ``values`` over their last axis, each multiplied by its importance weight if there are any."""
+    return jnp.mean(values if weight is None else values * jnp.broadcast_to(weight, values.shape), axis=-1)
 
 
 def polyak(target: PyTree, online: PyTree, tau: Any) -> PyTree:

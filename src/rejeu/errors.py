@@ -14,5 +14,5 @@ class CheckpointError(ValueError):
     """A file could not be read as what it was asked to be; the message says what differs."""
 
 
-class EnvironmentError(RuntimeError):  # noqa: A001 - rejeu.errors.EnvironmentError reads as what it is
+class BadEnvironmentError(RuntimeError):
     """An environment returned something that nothing can be learnt from."""

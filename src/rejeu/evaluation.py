@@ -99,7 +99,7 @@ def evaluate(policy: Callable[[Any], np.ndarray], env: VectorEnv, episodes: int)
         total += step.reward
         length += 1
         done = step.terminated | step.truncated
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             if played[i] < share[i]:
                 rows.append((total[i], length[i], env.success(step, i)))
                 played[i] += 1

@@ -45,24 +45,33 @@ class Console:
 
 
 class CsvFile:
-    """Appends rows to a CSV file; the columns are those of the first row, and later ones may leave some empty."""
+    """Appends rows to a CSV file; a row may bring new columns, which are then empty in those before it."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = self.path.open("w", newline="", encoding="utf-8")
-        self._writer: csv.DictWriter[str] | None = None
+        self._file = self.path.open("w+", newline="", encoding="utf-8")
+        self._writer: csv.DictWriter[str] = csv.DictWriter(self._file, [], restval="")
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         row = {"step": step, **metrics}
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, list(row), restval="", extrasaction="ignore")
-            self._writer.writeheader()
+        if new := [name for name in row if name not in self._writer.fieldnames]:
+            self._widen(new)
         self._writer.writerow(row)
         self._file.flush()
 
     def close(self) -> None:
         self._file.close()
+
+    def _widen(self, new: list[str]) -> None:
+        """Writes the whole file again with more columns."""
+        self._file.seek(0)
+        rows = list(csv.DictReader(self._file))
+        self._file.seek(0)
+        self._file.truncate()
+        self._writer = csv.DictWriter(self._file, [*self._writer.fieldnames, *new], restval="")
+        self._writer.writeheader()
+        self._writer.writerows(rows)
 
 
 class TensorBoard:

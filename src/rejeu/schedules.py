@@ -30,7 +30,7 @@ class Linear:
     """Share of the run over which the value moves, in (0, 1]."""
 
     def __post_init__(self) -> None:
-        _check_fraction(self.fraction)
+        _check_numbers(self)
 
     def __call__(self, progress: Any) -> Any:
         done = _clip(progress / self.fraction)
@@ -53,7 +53,7 @@ class Exponential:
     """Share of the run over which the value moves, in (0, 1]."""
 
     def __post_init__(self) -> None:
-        _check_fraction(self.fraction)
+        _check_numbers(self)
         if not (self.start > 0 and self.end > 0):
             raise ValueError(f"an exponential schedule needs positive ends, got start={self.start}, end={self.end}")
 
@@ -89,11 +89,14 @@ def parse(name: str, value: Any) -> float | Schedule:
         if not math.isfinite(value):
             raise ValueError(f"{name}={value} must be finite")
         return float(value)
-    if isinstance(value, str) and value.startswith("lin_"):
-        return Linear(float(value.removeprefix("lin_")))
-    if isinstance(value, Mapping) and value.get("schedule") in SCHEDULES:
-        fields = {key: float(number) for key, number in value.items() if key != "schedule"}
-        return SCHEDULES[value["schedule"]](**fields)
+    try:
+        if isinstance(value, str) and value.startswith("lin_"):
+            return Linear(float(value.removeprefix("lin_")))
+        if isinstance(value, Mapping) and value.get("schedule") in SCHEDULES:
+            fields = {key: float(number) for key, number in value.items() if key != "schedule"}
+            return SCHEDULES[value["schedule"]](**fields)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{name}={value!r} is no schedule: {error}") from None
     raise TypeError(
         f"{name}={value!r} must be a number, rejeu.Linear(start, end), rejeu.Exponential(start, end) or 'lin_<number>'"
         + ("; a function cannot be saved with the model" if callable(value) else "")
@@ -106,9 +109,11 @@ def to_json(schedule: Schedule) -> dict[str, Any]:
     return {"schedule": name, **asdict(schedule)}
 
 
-def _check_fraction(fraction: float) -> None:
-    if not 0 < fraction <= 1:
-        raise ValueError(f"fraction={fraction} must be above 0 and at most 1")
+def _check_numbers(schedule: Schedule) -> None:
+    if not (math.isfinite(schedule.start) and math.isfinite(schedule.end)):
+        raise ValueError(f"start={schedule.start} and end={schedule.end} must be finite")
+    if not 0 < schedule.fraction <= 1:
+        raise ValueError(f"fraction={schedule.fraction} must be above 0 and at most 1")
 
 
 def _clip(done: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,6 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+LARGEST_BOX = 2**28
+"""Most numbers that a Box read from a file may hold: a damaged file must not exhaust the memory."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,7 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
             leaf for key in sorted(space.spaces) for leaf in leaves(space.spaces[key], f"{path}.{key}".lstrip("."))
         )
     if isinstance(space, spaces.Tuple):
-        return tuple(
-            leaf for i, part in enumerate(space.spaces) for leaf in leaves(part, f"{path}.{i}".lstrip("."))
-        )
+        return tuple(leaf for i, part in enumerate(space.spaces) for leaf in leaves(part, f"{path}.{i}".lstrip(".")))
     if isinstance(space, spaces.Box):
         is_image = space.dtype == np.uint8 and len(space.shape) == 3
         return (Leaf(path, "image" if is_image else "continuous", space.shape, narrow(space.dtype)),)
@@ -84,9 +85,26 @@ def narrow(dtype: Any) -> str:
     )
 
 
-def cast(space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
-    """Returns a batch of observations as arrays of the kept dtypes, with the same nesting; copies only what differs."""
-    arrays, tree = jax.tree.flatten(observation)
+def plain(space: spaces.Space, observation: Any) -> Any:
+    """Returns an observation in plain dicts and tuples, nested as ``space`` is; its arrays are left as they are.
+
+    JAX takes the leaves of a dict in the order of its sorted keys, but those of an ``OrderedDict`` (which highway-env
+    returns) as they were put in, and a list is to it another structure than a tuple: what follows :func:`leaves` must
+    not depend on that.
+
+    Raises:
+        KeyError: if a key of the space is missing.
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: plain(part, observation[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(plain(part, one) for part, one in zip(space.spaces, observation, strict=True))
+    return observation
+
+
+def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
+    """Returns a batch of observations as plain dicts and tuples of arrays of the kept dtypes; copies what differs."""
+    arrays, tree = jax.tree.flatten(plain(space, observation))
     return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
 
 
@@ -125,6 +143,11 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
     if not (space.high > space.low).all():
         raise ValueError(f"every action bound must satisfy low < high, got low={space.low}, high={space.high}")
     return space
+
+
+def action_dimension(space: spaces.Box) -> int:
+    """Returns the number of components of one action."""
+    return int(np.prod(space.shape, dtype=int))
 
 
 def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
@@ -202,8 +225,8 @@ def rebuild(description: Any) -> spaces.Space:
             return spaces.Tuple([rebuild(part) for part in body])
         if kind == "Box":
             dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
-            if dtype.kind not in "fiu":
-                raise ValueError(f"dtype {dtype}")
+            if dtype.kind not in "fiu" or math.prod(shape) > LARGEST_BOX:
+                raise ValueError(f"dtype {dtype}, shape {shape}")
             low, high = (np.asarray(body[end], np.float64).astype(dtype) for end in ("low", "high"))
             return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
         if kind == "Discrete":
@@ -220,9 +243,10 @@ def rebuild(description: Any) -> spaces.Space:
 def _bounds(bounds: np.ndarray) -> Any:
     """A single number where all are equal, a nested list otherwise; infinities as the strings ``inf`` and ``-inf``."""
     values = bounds.astype(np.float64)
-    if values.size and (values == values.flat[0]).all():
-        values = values.flat[0]
-    return jax.tree.map(lambda v: v if np.isfinite(v) else str(v), np.asarray(values).tolist())
+    all_equal = values.size and (values == values.flat[0]).all()
+    return jax.tree.map(
+        lambda v: v if np.isfinite(v) else str(v), values.flat[0].item() if all_equal else values.tolist()
+    )
 
 
 def _skeleton(space: spaces.Space) -> Any:

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition
+from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
 
 
@@ -29,31 +30,36 @@ class Compiled:
         actor = algorithm.actor(jax.tree.unflatten(self.structure, range(n_leaves)))
         actor_structure = jax.tree.structure(actor)
         self._actor_positions: list[int] = jax.tree.leaves(actor)
+        self._explorer = explorer = exploration.make(algorithm, noise)
 
         @jax.jit
         def init(key: Array) -> list[Array]:
             return jax.tree.leaves(algorithm.init(key))
 
         @jax.jit
-        def act(actor_leaves: list[Array], carry: Array, obs: PyTree, ended: Array, key: Array, clock: Clock) -> Any:
+        def act(
+            actor_leaves: list[Array], carry: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock
+        ) -> tuple[Array, PyTree]:
             actor = jax.tree.unflatten(actor_structure, actor_leaves)
-            action_key, noise_key = jax.random.split(jax.random.fold_in(key, clock.step))
-            if noise is None:
-                return algorithm.explore(actor, obs, action_key, clock), carry
-            carry = jnp.where(ended[:, None], noise.init(ended.shape[0]), carry)
-            carry, kick = noise.sample(carry, noise_key)
-            return jnp.clip(algorithm.explore(actor, obs, action_key, clock) + kick, -1.0, 1.0), carry
+            return explorer.act(carry, actor, obs, ended, jax.random.fold_in(key, clock.step), clock)
 
         @jax.jit
         def exploit(actor_leaves: list[Array], obs: PyTree) -> Array:
             return algorithm.exploit(jax.tree.unflatten(actor_structure, actor_leaves), obs)
 
         @partial(jax.jit, donate_argnums=0)
-        def update(leaves: list[Array], batches: Transition, clock: Clock) -> tuple[list[Array], Metrics]:
+        def update(leaves: list[Array], batches: Transition, clock: Clock) -> tuple[list[Array], Metrics, Array | None]:
             state = jax.tree.unflatten(self.structure, leaves)
             state, metrics = jax.lax.scan(lambda s, batch: algorithm.update(s, batch, clock), state, batches)
-            return jax.tree.leaves(state), jax.tree.map(jnp.mean, metrics)
+            td_error = metrics.pop(TD_ERROR, None)
+            return (
+                jax.tree.leaves(state),
+                jax.tree.map(jnp.mean, metrics),
+                None if batches.weight is None else td_error,
+            )
 
+        self.copy = jax.jit(lambda leaves: jax.tree.map(jnp.copy, leaves))
+        """``copy(leaves) -> leaves`` in buffers of their own."""
         self.init = init
         """``init(key) -> leaves``."""
         self.act = act
@@ -61,8 +67,13 @@ class Compiled:
         self.exploit = exploit
         """``exploit(actor_leaves, obs) -> action``."""
         self.update = update
-        """``update(leaves, batches, clock) -> (leaves, metrics)``: one gradient step for each entry of the leading axis
-        of ``batches``, in one scan. ``leaves`` are donated; metrics are means over the steps."""
+        """``update(leaves, batches, clock) -> (leaves, metrics, td_error)``: one gradient step for each entry of the
+        leading axis of ``batches``, in one scan. ``leaves`` are donated; metrics are means over the steps; the absolute
+        TD errors ``(steps, batch)`` are None unless the batches are weighted."""
+
+    def initial_carry(self, n_envs: int) -> PyTree:
+        """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""
+        return self._explorer.init(self.algorithm.actor(self.shapes), n_envs)
 
     def actor_leaves(self, leaves: list[Array]) -> list[Array]:
         """Returns the leaves of the state that choosing an action needs."""

@@ -18,17 +18,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from rejeu.config import OffPolicyConfig
 from rejeu.core import Clock, Metrics, PyTree
 from rejeu.envs.vector import Step, VectorEnv
-from rejeu.errors import EnvironmentError
+from rejeu.errors import BadEnvironmentError
 from rejeu.loops.compiled import Compiled
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.uniform import ReplayBuffer
@@ -67,16 +66,18 @@ class Progress(NamedTuple):
 class Run:
     """Everything that a loop carries from turn to turn, and that a checkpoint of a run must hold. Mutable."""
 
-    env: VectorEnv
-    replay: ReplayBuffer | HerReplayBuffer
+    env: Any
+    """The environments, a :class:`VectorEnv`; None for an agent that only predicts."""
+    replay: Any
+    """The replay buffer; None likewise."""
     leaves: list[Array]
     """The algorithm's state, flat (see :class:`Compiled`)."""
     key: Array
     """Root of the randomness of exploration."""
     rng: np.random.Generator
     """Draws batches and the first random actions."""
-    carry: Array
-    """State of the action noise."""
+    carry: PyTree
+    """What exploration remembers, per environment."""
     learn_from: int
     """The step from which on gradients are taken."""
     seed: int | None = None
@@ -96,6 +97,8 @@ class Run:
     episode_return: np.ndarray = field(default_factory=lambda: np.zeros(0))
     episode_length: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     metrics: Metrics | None = None
+    td_errors: list[Array] = field(default_factory=list)
+    """Of the newest updates, on their way to the priorities of the replay buffer, which get them one turn later."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("env", "replay", "update", "total"), 0.0))
     """Wall time by what it went into; ``update`` is the time that the loop waited for the device."""
 
@@ -113,7 +116,7 @@ def off_policy(
         progress: gives the fraction of the run that is done after so many steps of it; schedules follow it.
 
     Raises:
-        EnvironmentError: if a reward is not a finite number.
+        BadEnvironmentError: if a reward is not a finite number.
     """
     env, n_envs = run.env, run.env.n_envs
     first, last = run.step, None if n_steps is None else run.step + n_steps
@@ -129,7 +132,7 @@ def off_policy(
         step = env.step(scale_action(env.action_space, run.action))
         t1 = time.perf_counter()
         check_rewards(step, env, run.step)
-        run.replay.ring.add(run.action, step.reward, step.terminated, step.obs, active)
+        run.replay.add(run.action, step.reward, step.terminated, step.obs, active)
         taken = n_envs if active is None else len(active)
         run.step += taken
         run.seconds["total"] = t1 - began
@@ -142,16 +145,20 @@ def off_policy(
         t3 = time.perf_counter()
         restarted = run.ended if active is None else run.ended | (np.arange(n_envs) >= taken)
         if restarted.any():
-            run.replay.ring.begin(run.obs, np.flatnonzero(restarted))
+            run.replay.begin(run.obs, np.flatnonzero(restarted))
 
         done = progress(run.step - first)
         n_updates = due(run, config, taken, len(episodes))
         sizes = chunks(n_updates, per_turn)
-        batches = [run.replay.sample(run.rng, (size, config.batch_size)) for size in sizes]
+        samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
         t4 = time.perf_counter()
         run.action = choose(run, compiled, config, done)
-        for batch in batches:
-            run.leaves, run.metrics = compiled.update(run.leaves, batch, clock_of(run, done))
+        run.replay.reprioritise(run.td_errors)
+        run.td_errors = []
+        for batch in samples:
+            run.leaves, run.metrics, td_error = compiled.update(run.leaves, batch, clock_of(run, done))
+            if td_error is not None:
+                run.td_errors.append(td_error)
         run.n_updates += n_updates
         t5 = time.perf_counter()
         run.seconds["env"] += (t1 - t0) + (t3 - t2)
@@ -166,7 +173,7 @@ def restart(run: Run) -> None:
     n_envs = run.env.n_envs
     run.obs = run.env.reset(run.seed)
     run.seed = None
-    run.replay.ring.begin(run.obs)
+    run.replay.begin(run.obs)
     run.ended = np.ones(n_envs, bool)
     run.episode_return = np.zeros(n_envs)
     run.episode_length = np.zeros(n_envs, np.int64)
@@ -197,13 +204,13 @@ def book(run: Run, step: Step, active: np.ndarray | None) -> list[Episode]:
     if not run.ended.any():
         return []
     episodes = []
-    for env in np.flatnonzero(run.ended):
+    for env in np.flatnonzero(run.ended).tolist():
         if active is None or env in active:
             run.episode += 1
             episodes.append(
                 Episode(
                     run.step,
-                    int(env),
+                    env,
                     float(run.episode_return[env]),
                     int(run.episode_length[env]),
                     run.env.success(step, env),
@@ -216,10 +223,10 @@ def book(run: Run, step: Step, active: np.ndarray | None) -> list[Episode]:
 
 
 def check_rewards(step: Step, env: VectorEnv, taken: int) -> None:
-    """Raises ``EnvironmentError`` if a reward is NaN or infinite: nothing can be learnt from it."""
+    """Raises ``BadEnvironmentError`` if a reward is NaN or infinite: nothing can be learnt from it."""
     if not np.isfinite(step.reward).all():
         which = int(np.flatnonzero(~np.isfinite(step.reward))[0])
-        raise EnvironmentError(
+        raise BadEnvironmentError(
             f"{env.env_id} returned the reward {step.reward[which]} in environment {which} after {taken} steps; rewards "
             "must be finite numbers: mend the environment, or wrap it with gymnasium.wrappers.TransformReward"
         )
@@ -257,9 +264,12 @@ def chunks(n: int, usual: int) -> list[int]:
 
 
 def initial_run(
-    env: VectorEnv, replay: ReplayBuffer | HerReplayBuffer, compiled: Compiled, carry: Array, learn_from: int, seed: int
+    env: VectorEnv | None, replay: ReplayBuffer | HerReplayBuffer | None, compiled: Compiled, learn_from: int, seed: int
 ) -> Run:
-    """Returns the beginning of a run; ``seed`` determines everything that is drawn in it."""
+    """Returns the beginning of a run; ``seed`` determines everything that is drawn in it.
+
+    Without environment and replay it serves an agent that only predicts.
+    """
     learner_key, explore_key = jax.random.split(jax.random.PRNGKey(seed))
     return Run(
         env=env,
@@ -267,7 +277,7 @@ def initial_run(
         leaves=compiled.init(learner_key),
         key=explore_key,
         rng=np.random.default_rng(seed),
-        carry=jnp.asarray(carry),
+        carry=compiled.initial_carry(1 if env is None else env.n_envs),
         learn_from=learn_from,
         seed=seed,
     )

@@ -12,7 +12,7 @@ from rejeu.presets.preset import Preset
 ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS)
 """Every preset; of several for one environment the first is the best."""
 
-ALGORITHM_FOR = {"Box": "SAC"}
+ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN"}
 """The algorithm to begin with in an environment without a preset, by the class of its action space."""
 
 

@@ -1,0 +1,32 @@
+"""What holds in every test: JAX refuses to broadcast ranks silently, and compiled functions are kept between runs.
+
+Mixed dtypes are refused as well, but only around our own functions (``strict_dtypes``): Adam's bias correction in optax
+raises a Python float to an int32 power, which JAX's strict mode forbids.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "rejeu-test-cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+import hypothesis
+import jax
+import pytest
+
+hypothesis.settings.register_profile("rejeu", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("rejeu")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture
+def strict_dtypes() -> Iterator[None]:
+    """JAX raises wherever two dtypes meet; for tests of functions that hold no optimizer."""
+    with jax.numpy_dtype_promotion("strict"):
+        yield

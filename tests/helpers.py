@@ -1,0 +1,95 @@
+"""Small agents, as quick to build as an agent can be, and ways to look at them."""
+
+from __future__ import annotations
+
+import copy
+import json
+from typing import Any
+from unittest import mock
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import rejeu
+from rejeu import agents, spaces
+from rejeu.algorithms import sac
+from rejeu.core import Algorithm
+from rejeu.loops.compiled import Compiled
+
+_algorithms: dict[Any, Algorithm] = {}
+_compiled: dict[Any, Compiled] = {}
+
+
+def _make(config: sac.Config, observation_space: gym.Space, action_space: gym.Space, make: Any = sac.make) -> Algorithm:
+    key = config, json.dumps([spaces.describe(observation_space), spaces.describe(action_space)])
+    if key not in _algorithms:
+        _algorithms[key] = make(config, observation_space, action_space)
+    return _algorithms[key]
+
+
+def _compile(algorithm: Algorithm, *arguments: Any) -> Compiled:
+    key = algorithm, *arguments
+    if key not in _compiled:
+        _compiled[key] = Compiled(algorithm, *arguments)
+    return copy.copy(_compiled[key])
+
+
+def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
+    """A SAC with one narrow layer and batches of 4 that learns from step 8 on.
+
+    Agents of equal settings and spaces share their compiled functions, which are pure: building them dominates otherwise.
+    """
+    given = env.observation_space if isinstance(env, gym.Env) else getattr(env, "observation_space", None)
+    nested = isinstance(given, gym.spaces.Dict | gym.spaces.Tuple)
+    settings = {
+        "learning_starts": 8,
+        "batch_size": 4,
+        "buffer_size": 300,
+        "policy_kwargs": {"net_arch": [8]},
+        "seed": 0,
+        **settings,
+    }
+    with mock.patch.object(sac, "make", _make), mock.patch.object(agents, "Compiled", _compile):
+        return rejeu.SAC("MultiInputPolicy" if nested else "MlpPolicy", env, **settings)
+
+
+def count_updates(agent: rejeu.SAC) -> list[int]:
+    """Replaces the gradient by nothing; returns a list that will hold the number of batches of each call of it."""
+    calls: list[int] = []
+
+    def update(leaves: Any, batches: Any, clock: Any) -> tuple[Any, dict, None]:
+        calls.append(len(batches.reward))
+        return leaves, {}, None
+
+    agent._compiled.update = update
+    return calls
+
+
+def assert_same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> None:
+    """Fails unless everything learnt is the same, bit for bit."""
+    first, second = one.get_parameters(), two.get_parameters()
+    assert list(first) == list(second)
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
+
+
+def same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> bool:
+    """Whether everything learnt is the same, bit for bit."""
+    first, second = one.get_parameters(), two.get_parameters()
+    return all(np.array_equal(value, second[name]) for name, value in first.items())
+
+
+def q_values(agent: rejeu.SAC, obs: Any, action: Any) -> np.ndarray:
+    """The mean of the critics' values of each row, ``(n,)``."""
+    critics = agent.state.critics
+    values = [
+        np.asarray(_member(critics, i)(jnp.asarray(obs, jnp.float32), jnp.asarray(action, jnp.float32)))[:, 0]
+        for i in range(2)
+    ]
+    return np.mean(values, axis=0)
+
+
+def _member(critics: Any, i: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[i], critics)

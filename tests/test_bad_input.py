@@ -1,0 +1,169 @@
+"""What users get wrong: each mistake is one line that names it and the way out, and costs nothing on disk."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.errors import BadEnvironmentError, CheckpointError, MissingExtra
+from tests.environments import Counter, Reach, Sampled
+from tests.helpers import small_sac
+
+
+class WithoutGoal(Sampled):
+    """A Dict observation without ``desired_goal``."""
+
+    def __init__(self):
+        box = gym.spaces.Box(-1.0, 1.0, (2,))
+        super().__init__(gym.spaces.Dict({"observation": box, "achieved_goal": box}))
+
+
+class WithoutReward(Sampled):
+    """A goal observation, but no ``compute_reward``."""
+
+    def __init__(self):
+        box = gym.spaces.Box(-1.0, 1.0, (2,))
+        super().__init__(gym.spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box)))
+
+
+def sac(env, policy="MlpPolicy", **settings):
+    return lambda: rejeu.SAC(policy, env, **settings)
+
+
+HER = {"replay_buffer_class": rejeu.HerReplayBuffer}
+MISTAKES = {
+    "misspelt hyper-parameter": (
+        sac(Counter(), learning_rat=1e-3),
+        TypeError,
+        "SAC has no setting 'learning_rat'; did you mean learning_rate?",
+    ),
+    "hyper-parameter of nothing": (sac(Counter(), zzz=1), TypeError, "SAC has no setting 'zzz'; known: learning_rate"),
+    "misspelt argument": (sac(Counter(), verbos=1), TypeError, "no setting 'verbos'; did you mean verbose"),
+    "unbounded actions": (
+        sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-np.inf, np.inf, (2,)))),
+        ValueError,
+        "SAC needs finite action bounds, .*RescaleAction",
+    ),
+    "binary actions": (
+        sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.MultiBinary(2))),
+        ValueError,
+        r"SAC needs .* action space, got MultiBinary\(2\); .*use",
+    ),
+    "text observation": (sac(Sampled(gym.spaces.Text(5))), TypeError, "observation space is Text.* expected Box"),
+    "HER without desired_goal": (
+        sac(WithoutGoal(), "MultiInputPolicy", **HER),
+        ValueError,
+        "desired_goal is missing from a Dict with the keys .* use a goal environment or replay_buffer_class=None",
+    ),
+    "HER on a plain environment": (sac(Counter(), **HER), ValueError, "hindsight replay needs a Dict observation"),
+    "HER without compute_reward": (
+        sac(WithoutReward(), "MultiInputPolicy", **HER),
+        ValueError,
+        r"hindsight replay needs .*compute_reward.* WithoutReward has none; add it, or use replay_buffer_class=None",
+    ),
+    "batch larger than the buffer": (
+        sac(Counter(), batch_size=512, buffer_size=100),
+        ValueError,
+        "batch_size=512 must not exceed buffer_size=100; try",
+    ),
+    "buffer larger than the memory": (
+        sac(Counter(), buffer_size=10**13),
+        MemoryError,
+        r"buffer_size=10000000000000 takes .* GiB .* the machine has .*; try buffer_size=\d+",
+    ),
+    "unknown environment": (
+        sac("Pendulum-v9000x"),
+        ValueError,
+        "no environment is called 'Pendulum-v9000x'; did you mean .*Pendulum-v1",
+    ),
+    "class instead of environment": (sac(3), TypeError, "env must be an id, a Gymnasium environment, .* got int"),
+    "unknown policy": (sac(Counter(), "MlpPolcy"), ValueError, "policy='MlpPolcy' must be one of MlpPolicy"),
+    "MlpPolicy for a Dict": (sac(Reach()), ValueError, "does not fit a Dict observation; use 'MultiInputPolicy'"),
+    "MultiInputPolicy for a Box": (sac(Counter(), "MultiInputPolicy"), ValueError, "needs a Dict .*use 'MlpPolicy'"),
+    "CnnPolicy for numbers": (sac(Counter(), "CnnPolicy"), ValueError, "needs a uint8 image .*use 'MlpPolicy'"),
+    "negative seed": (sac(Counter(), seed=-1), ValueError, "seed=-1 must be a whole number from 0"),
+    "fractional seed": (sac(Counter(), seed=0.5), ValueError, "seed=0.5 must be a whole number"),
+    "noise of another dimension": (
+        sac(Counter(), action_noise=rejeu.NormalActionNoise([0.0, 0.0], [0.1, 0.1])),
+        ValueError,
+        r"action_noise has 2 dimensions and the actions \(1,\)",
+    ),
+    "window of nothing": (
+        sac(Counter(), stats_window_size=0),
+        ValueError,
+        "stats_window_size=0 must be a whole number",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_line_that_names_the_way_out(name):
+    make, error, words = MISTAKES[name]
+    with pytest.raises(error, match=words) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_reward_that_is_no_number_ends_training_with_its_place(value):
+    env = Sampled(gym.spaces.Box(-1.0, 1.0, (3,)))
+    agent = small_sac(env, learning_starts=99).learn(7)
+    env.reward = value
+    with pytest.raises(BadEnvironmentError, match=rf"Sampled returned the reward {value} .* after 7 steps; .* finite"):
+        agent.learn(5)
+    assert agent.replay_buffer.size() == 7
+    assert np.isfinite(agent.replay_buffer.arrays()["reward"]).all()
+
+
+def test_after_a_bad_reward_the_agent_can_still_be_saved_and_trained(tmp_path):
+    env = Sampled(gym.spaces.Box(-1.0, 1.0, (3,)))
+    agent = small_sac(env, learning_starts=99).learn(7)
+    env.reward = np.nan
+    with pytest.raises(BadEnvironmentError):
+        agent.learn(5)
+    env.reward = 0.0
+    agent.learn(3, reset_num_timesteps=False)
+    assert agent.replay_buffer.size() == 10
+    assert rejeu.SAC.load(agent.save(tmp_path / "model")).predict(np.zeros(3))[0].shape == (1,)
+
+
+def test_a_model_file_survives_a_mistaken_save(tmp_path):
+    """A header that cannot be written is noticed before the old file is touched."""
+    agent = small_sac(Counter())
+    path = agent.save(tmp_path / "model")
+    before = path.read_bytes()
+    agent.stats_window_size = float("nan")
+    with pytest.raises(ValueError, match="JSON"):
+        agent.save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+def test_a_truncated_file_is_named_and_left_alone(tmp_path):
+    path = small_sac(Counter()).save(tmp_path / "model")
+    path.write_bytes(path.read_bytes()[:-10])
+    before = path.read_bytes()
+    with pytest.raises(CheckpointError, match=r"model\.safetensors is not a complete safetensors file.*cut short"):
+        rejeu.SAC.load(path)
+    assert path.read_bytes() == before
+
+
+def test_a_stable_baselines3_file_is_named_as_foreign(tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "sb3.zip", "w") as file:
+        file.writestr("data", "{}")
+    with pytest.raises(CheckpointError, match=r"not a complete safetensors file.*of another program"):
+        rejeu.SAC.load(tmp_path / "sb3.zip")
+
+
+def test_a_missing_extra_is_named_with_its_command(monkeypatch):
+    import importlib.util
+
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "highway_env" else real(name, *a))
+    monkeypatch.delitem(gym.registry, "parking-v0", raising=False)
+    with pytest.raises(MissingExtra, match=r"parking-v0 needs highway-env, .*run: pip install 'rejeu\[parking\]'"):
+        rejeu.make_vector("parking-v0", backend="gymnasium")

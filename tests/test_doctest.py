@@ -1,0 +1,29 @@
+"""The examples in docstrings run, and say what they say they print."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import pkgutil
+
+import pytest
+
+import rejeu
+
+MODULES = [
+    "rejeu",
+    *sorted(m.name for m in pkgutil.walk_packages(rejeu.__path__, "rejeu.") if "__main__" not in m.name),
+]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_examples_of_a_module_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    assert result.failed == 0
+
+
+def test_there_are_examples():
+    finder = doctest.DocTestFinder()
+    found = {m for m in MODULES for test in finder.find(importlib.import_module(m)) if test.examples}
+    assert {"rejeu", "rejeu.schedules", "rejeu.envs.vector", "rejeu.exploration.noise"} <= found

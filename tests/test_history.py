@@ -1,0 +1,69 @@
+"""The table of episodes."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from rejeu.history import COLUMNS, History
+from rejeu.loops.host import Episode
+
+NAN = float("nan")
+
+
+def history():
+    rows = [
+        (10, 0, 1.0, 10, NAN, 0.5),
+        (20, 1, 3.0, 10, 1.0, 1.0),
+        (25, 0, 5.0, 5, 0.0, 1.5),
+        (40, 1, 7.0, 15, 1.0, 2.0),
+    ]
+    return History(Episode(*row) for row in rows)
+
+
+def test_columns_come_by_name_in_order():
+    table = history()
+    assert len(table) == 4
+    assert table["step"].tolist() == [10, 20, 25, 40]
+    assert table["return"].tolist() == [1, 3, 5, 7]
+    assert table["length"].dtype == np.float64
+    assert list(table.to_dict()) == list(COLUMNS)
+
+
+def test_an_unknown_column_is_named_with_the_known_ones():
+    with pytest.raises(KeyError, match="'reward' is no column; there are step, env, return"):
+        history()["reward"]
+
+
+def test_the_moving_average_takes_up_to_a_window_of_values():
+    assert history().moving_average("return", 2).tolist() == [1.0, 2.0, 4.0, 6.0]
+    assert history().moving_average("return", 50).tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_the_moving_average_leaves_out_what_is_unknown():
+    average = history().moving_average("success", 2)
+    assert math.isnan(average[0])
+    assert average[1:].tolist() == [1.0, 0.5, 0.5]
+
+
+def test_the_moving_average_of_a_long_table_equals_the_plain_mean():
+    values = np.random.default_rng(0).normal(size=200)
+    table = History(Episode(i, 0, value, 1, NAN, 0.0) for i, value in enumerate(values))
+    expected = [values[max(i - 6, 0) : i + 1].mean() for i in range(200)]
+    np.testing.assert_allclose(table.moving_average("return", 7), expected, atol=1e-12)
+
+
+def test_an_empty_table_has_empty_columns():
+    assert History()["return"].shape == History().moving_average().shape == (0,)
+
+
+def test_the_csv_file_holds_the_table(tmp_path):
+    history().write_csv(tmp_path / "episodes.csv")
+    with (tmp_path / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["return"] for row in rows] == ["1.0", "3.0", "5.0", "7.0"]
+    assert rows[0].keys() == set(COLUMNS)
+    assert rows[0]["success"] == "nan"

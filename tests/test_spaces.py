@@ -1,0 +1,235 @@
+"""What the library reads from spaces, and how it scales actions."""
+
+from __future__ import annotations
+
+import json
+from collections import OrderedDict
+
+import jax
+import numpy as np
+import pytest
+from gymnasium import spaces as gym_spaces
+
+from rejeu import spaces
+from tests.replay_model import GOAL_OBSERVATION
+
+BOX = gym_spaces.Box(-1.0, 1.0, (2,), np.float64)
+NESTED = gym_spaces.Dict(
+    {
+        "z": gym_spaces.Tuple([gym_spaces.Discrete(3, start=5), gym_spaces.Box(0, 255, (4, 4, 3), np.uint8)]),
+        "a": BOX,
+        "m": gym_spaces.Dict(
+            {"bits": gym_spaces.MultiBinary(4), "many": gym_spaces.MultiDiscrete([2, 3], start=[1, 0])}
+        ),
+    }
+)
+EVERY = [
+    BOX,
+    gym_spaces.Box(np.float32([-np.inf, 0.0]), np.float32([np.inf, 5.0])),
+    gym_spaces.Box(0, 255, (2, 2, 1), np.uint8),
+    gym_spaces.Discrete(4, start=-2),
+    gym_spaces.MultiDiscrete([[2, 3], [4, 5]], start=[[0, 1], [2, 3]]),
+    gym_spaces.MultiBinary([2, 3]),
+    gym_spaces.Tuple([BOX, gym_spaces.Discrete(2)]),
+    NESTED,
+]
+
+
+def test_leaves_stand_in_the_order_of_jax():
+    observation = spaces.cast(NESTED, spaces.leaves(NESTED), NESTED.sample())
+    paths = [
+        jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree.leaves_with_path(observation)
+    ]
+    assert [leaf.path for leaf in spaces.leaves(NESTED)] == paths == ["a", "m.bits", "m.many", "z.0", "z.1"]
+
+
+@pytest.mark.parametrize("space", EVERY, ids=str)
+def test_leaves_have_the_shapes_and_dtypes_of_cast_observations(space):
+    leaves = spaces.leaves(space)
+    arrays = jax.tree.leaves(spaces.cast(space, leaves, space.sample()))
+    assert [(a.shape, a.dtype.name) for a in arrays] == [(leaf.shape, leaf.dtype) for leaf in leaves]
+    assert jax.tree.structure(spaces.plain(space, space.sample())) == spaces.structure(space)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kept"),
+    [
+        ("float64", "float32"),
+        ("float32", "float32"),
+        ("float16", "float16"),
+        ("int64", "int32"),
+        ("uint64", "uint32"),
+        ("int16", "int16"),
+        ("uint8", "uint8"),
+        ("bool", "int8"),
+    ],
+)
+def test_only_what_has_64_bits_is_narrowed(dtype, kept):
+    assert spaces.narrow(np.dtype(dtype)) == kept
+
+
+def test_features_count_one_hot_places():
+    features = {leaf.path: (leaf.kind, leaf.n_features) for leaf in spaces.leaves(NESTED)}
+    assert features == {
+        "a": ("continuous", 2),
+        "m.bits": ("binary", 4),
+        "m.many": ("categorical", 5),
+        "z.0": ("categorical", 3),
+        "z.1": ("image", 48),
+    }
+
+
+def test_plain_takes_values_by_key_not_by_place():
+    space = gym_spaces.Dict({"a": BOX, "b": gym_spaces.Tuple([BOX, BOX])})
+    given = OrderedDict([("b", [2, 3]), ("a", 1)])
+    assert jax.tree.leaves(spaces.plain(space, given)) == [1, 2, 3]
+
+
+def test_plain_misses_a_key_that_is_not_there():
+    with pytest.raises(KeyError, match="b"):
+        spaces.plain(gym_spaces.Dict({"a": BOX, "b": BOX}), {"a": 1})
+
+
+def test_a_space_without_fixed_size_is_refused_with_its_place():
+    with pytest.raises(TypeError, match=r"observation space at 'deep\.text' is Text.*expected Box, Discrete"):
+        spaces.leaves(gym_spaces.Dict({"deep": gym_spaces.Dict({"text": gym_spaces.Text(5)})}))
+
+
+# Actions.
+
+ASYMMETRIC = gym_spaces.Box(np.float32([-1.0, 0.0, -3.0]), np.float32([3.0, 0.5, -1.0]))
+
+
+def test_the_ends_of_the_range_become_the_bounds_exactly():
+    ends = np.array([[-1.0] * 3, [1.0] * 3, [0.0] * 3], np.float32)
+    np.testing.assert_array_equal(
+        spaces.scale_action(ASYMMETRIC, ends), [ASYMMETRIC.low, ASYMMETRIC.high, [1.0, 0.25, -2.0]]
+    )
+
+
+def test_scaled_actions_never_leave_bounds_that_float32_rounds():
+    space = gym_spaces.Box(np.float32(-0.1), np.float32(0.3), (1,), np.float32)
+    action = np.linspace(-1.0, 1.0, 1001, dtype=np.float32)[:, None]
+    assert all(space.contains(a) for a in spaces.scale_action(space, action))
+
+
+def test_scaled_actions_have_the_shape_and_dtype_of_the_space():
+    space = gym_spaces.Box(-2.0, 2.0, (2, 3), np.float64)
+    scaled = spaces.scale_action(space, np.zeros((4, 6), np.float32))
+    assert (scaled.shape, scaled.dtype) == ((4, 2, 3), np.float64)
+
+
+def test_bounds_as_wide_as_float32_itself_do_not_overflow():
+    big = np.finfo(np.float32).max
+    space = gym_spaces.Box(-big, big, (1,), np.float32)
+    np.testing.assert_array_equal(spaces.scale_action(space, np.array([[-1.0], [1.0]], np.float32)), [[-big], [big]])
+
+
+def test_discrete_actions_are_counted_from_the_start_of_the_space():
+    scaled = spaces.scale_action(gym_spaces.Discrete(3, start=4), np.array([0, 2], np.int32))
+    np.testing.assert_array_equal(scaled, [4, 6])
+
+
+def test_random_actions_fill_the_range_of_the_algorithm():
+    action = spaces.random_action(ASYMMETRIC, 2000, np.random.default_rng(0))
+    assert (action.shape, action.dtype) == ((2000, 3), np.float32)
+    assert (np.abs(action) <= 1).all()
+    assert (action.min(axis=0) < -0.99).all()
+    assert (action.max(axis=0) > 0.99).all()
+    discrete = spaces.random_action(gym_spaces.Discrete(3, start=4), 100, np.random.default_rng(0))
+    assert set(discrete.tolist()) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("space", "words"),
+    [
+        (gym_spaces.Discrete(2), r"SAC needs a Box action space, got Discrete\(2\); .* use DQN or PPO"),
+        (gym_spaces.MultiDiscrete([2, 2]), "SAC needs a Box action space, .* use PPO"),
+        (gym_spaces.Box(-np.inf, np.inf, (1,)), "SAC needs finite action bounds, .*RescaleAction"),
+        (gym_spaces.Box(np.float32([0.0, 1.0]), np.float32([1.0, 1.0])), "every action bound must satisfy low < high"),
+    ],
+)
+def test_an_action_space_that_does_not_fit_is_refused(space, words):
+    with pytest.raises(ValueError, match=words):
+        spaces.check_box_action(space, "SAC")
+
+
+# Goal environments.
+
+
+def test_a_goal_space_passes():
+    spaces.check_goal_space(GOAL_OBSERVATION)
+
+
+def test_a_missing_goal_is_named():
+    space = gym_spaces.Dict(dict.fromkeys(("observation", "achieved_goal"), BOX))
+    with pytest.raises(
+        ValueError, match=r"desired_goal is missing from a Dict with the keys .*replay_buffer_class=None"
+    ):
+        spaces.check_goal_space(space)
+
+
+def test_a_space_that_is_no_dict_is_named():
+    with pytest.raises(ValueError, match=r"observation, achieved_goal, desired_goal is missing from Box"):
+        spaces.check_goal_space(BOX)
+
+
+def test_goals_of_different_shape_are_refused():
+    parts = dict(GOAL_OBSERVATION.spaces) | {"desired_goal": gym_spaces.Box(-np.inf, np.inf, (3,), np.float32)}
+    with pytest.raises(ValueError, match="must be the same space"):
+        spaces.check_goal_space(gym_spaces.Dict(parts))
+
+
+# Descriptions in files.
+
+
+@pytest.mark.parametrize("space", EVERY, ids=str)
+def test_a_space_survives_its_description_as_json(space):
+    text = json.dumps(spaces.describe(space), allow_nan=False)
+    again = spaces.rebuild(json.loads(text))
+    assert spaces.describe(again) == spaces.describe(space)
+    assert spaces.leaves(again) == spaces.leaves(space)
+    assert jax.tree.structure(spaces.plain(again, again.sample())) == spaces.structure(space)
+
+
+def test_bounds_of_a_box_survive_exactly():
+    low, high = np.float32([0.1, -np.inf]), np.float32([1 / 3, np.inf])
+    again = spaces.rebuild(spaces.describe(gym_spaces.Box(low, high)))
+    np.testing.assert_array_equal(again.low, low)
+    np.testing.assert_array_equal(again.high, high)
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        None,
+        [],
+        {},
+        {"Box": None},
+        {"Box": {"low": 0, "high": 1, "shape": [2], "dtype": "object"}},
+        {"Box": {"low": 0, "high": 1, "shape": [-2], "dtype": "float32"}},
+        {"Box": {"low": [0, 1, 2], "high": 1, "shape": [2], "dtype": "float32"}},
+        {"Box": {"low": "x", "high": 1, "shape": [2], "dtype": "float32"}},
+        {"Box": {"low": 0, "high": 1, "shape": [2], "dtype": "float32"}, "Discrete": {"n": 2, "start": 0}},
+        {"Box": {"low": 0, "high": 1, "shape": [10**15], "dtype": "float32"}},
+        {"Discrete": {"n": 0, "start": 0}},
+        {"Discrete": {"n": 3}},
+        {"Tuple": 3},
+        {"Dict": []},
+        {"MultiBinary": {"shape": "many"}},
+        {"MultiDiscrete": {"nvec": [], "start": [1]}},
+        {"os.system": "true"},
+    ],
+    ids=str,
+)
+def test_a_damaged_description_is_refused(description):
+    with pytest.raises(ValueError, match="not the description of a space"):
+        spaces.rebuild(description)
+
+
+def test_observation_bounds_do_not_tell_spaces_apart_and_action_bounds_do():
+    one, two = gym_spaces.Box(-1.0, 1.0, (2,)), gym_spaces.Box(-2.0, 2.0, (2,))
+    assert spaces.same(one, two, bounds=False)
+    assert not spaces.same(one, two, bounds=True)
+    assert not spaces.same(one, gym_spaces.Box(-1.0, 1.0, (3,)), bounds=False)
+    assert not spaces.same(gym_spaces.Dict({"a": BOX}), gym_spaces.Dict({"b": BOX}), bounds=False)
