@@ -64,7 +64,6 @@ def test_minutes_end_a_run():
     assert 1 < agent.num_timesteps < 10**6
 
 
-@pytest.mark.xfail(strict=True, reason="agents.py save/load: the file holds all steps, not where counting began")
 def test_num_timesteps_survives_saving(tmp_path):
     agent = small_sac(counters(1), learning_starts=NEVER).learn(7).learn(5)
     assert agent.num_timesteps == 5
@@ -270,7 +269,6 @@ def test_false_stops_training_at_once_and_learning_can_go_on():
     assert agent.learn(10, reset_num_timesteps=False).num_timesteps == 14
 
 
-@pytest.mark.xfail(strict=True, reason="agents.py learn: `is not False` does not see numpy's False")
 def test_a_comparison_of_numpy_numbers_that_is_false_stops_training():
     agent = small_sac(counters(1), learning_starts=NEVER)
     assert agent.learn(10, callback=lambda a, p: np.float64(p.step) < 4).num_timesteps == 4
@@ -519,7 +517,6 @@ def test_an_environment_of_other_spaces_is_refused_and_the_old_one_kept():
     assert agent.env is old
 
 
-@pytest.mark.xfail(strict=True, reason="agents.py set_env: the kept HerReplayBuffer holds the old environment's goals")
 def test_hindsight_rewards_come_from_the_new_environment():
     class Generous(Reach):
         def compute_reward(self, achieved, desired, info):

@@ -88,7 +88,7 @@ MISTAKES = {
     "noise of another dimension": (
         sac(Counter(), action_noise=rejeu.NormalActionNoise([0.0, 0.0], [0.1, 0.1])),
         ValueError,
-        r"action_noise has 2 dimensions and the actions \(1,\)",
+        "action_noise has 2 dimensions and the actions have 1; try NormalActionNoise",
     ),
     "window of nothing": (
         sac(Counter(), stats_window_size=0),

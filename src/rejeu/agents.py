@@ -33,7 +33,7 @@ from rejeu.logging import Console, Sink, TensorBoard, next_folder
 from rejeu.loops import host
 from rejeu.loops.compiled import Compiled
 from rejeu.loops.host import Episode, Progress, Run
-from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer
 from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
@@ -55,6 +55,8 @@ AGENT_ARGUMENTS = {
 }
 
 
+COUNTERS = ("step", "steps_before", "episode", "n_updates")
+"""What a model file counts; all below 2^32."""
 BEST_WINDOW = 20
 """Training episodes over whose mean return the best weights are judged."""
 
@@ -151,13 +153,17 @@ class Agent:
         priorities = None if config.priorities is None else Priorities(ring, config.priorities)
         if config.hindsight is None:
             return ReplayBuffer(ring, config.gamma, config.n_steps, priorities)
+        return HerReplayBuffer(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, priorities)
+
+    @staticmethod
+    def _goals(env: VectorEnv) -> GoalFunctions:
         goals = env.goals()
         if goals is None:
             raise ValueError(
                 f"hindsight replay needs the environment's compute_reward(achieved_goal, desired_goal, info), and "
                 f"{env.env_id} has none; add it, or use replay_buffer_class=None"
             )
-        return HerReplayBuffer(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities)
+        return goals
 
     @staticmethod
     def _check_policy(policy: str, space: gym.Space) -> None:
@@ -292,8 +298,8 @@ class Agent:
                             output.write(self.num_timesteps, row)
                     if turn.episodes:
                         self._note_training_return()
-                    stops = [callback(self, turn) is False for callback in callbacks]
-                    if any(stops):
+                    answers = [callback(self, turn) for callback in callbacks]
+                    if any(isinstance(answer, bool | np.bool_) and not answer for answer in answers):
                         break
                     if elapsed >= seconds or self._run.episode - first_episode >= n_episodes:
                         break
@@ -400,6 +406,10 @@ class Agent:
             )
         arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(parts, self._obs_leaves, strict=True)]
         single = arrays[0].ndim == len(self._obs_leaves[0].shape)
+        if not single and len({array.shape[:1] for array in arrays}) > 1:
+            raise ValueError(
+                f"the parts of the observations are batches of {[a.shape[:1] for a in arrays]}, not of one size"
+            )
         for array, leaf in zip(arrays, self._obs_leaves, strict=True):
             if (array.shape if single else array.shape[1:]) != leaf.shape:
                 where = f" of {leaf.path!r}" if leaf.path else ""
@@ -475,6 +485,8 @@ class Agent:
             run.replay = self._make_replay(vector)
             run.td_errors = []
             run.carry = self._compiled.initial_carry(vector.n_envs)
+        elif isinstance(run.replay, HerReplayBuffer):
+            run.replay.goals = self._goals(vector)
         run.env = vector
         run.obs = run.action = None
         run.ended = np.ones(vector.n_envs, bool)
@@ -526,7 +538,12 @@ class Agent:
             "env_id": run.env.env_id if run.env is not None else None,
             "seed": self.seed,
             "stats_window_size": self.stats_window_size,
-            "counters": {"step": run.step, "episode": run.episode, "n_updates": run.n_updates},
+            "counters": {
+                "step": run.step,
+                "steps_before": self._steps_before,
+                "episode": run.episode,
+                "n_updates": run.n_updates,
+            },
             "rng": run.rng.bit_generator.state["state"],
         }
         return checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), header)
@@ -555,7 +572,7 @@ class Agent:
             config = configs.rebuild(cls.algorithm.Config, header["config"], changes)
             observation_space = spaces.rebuild(header["observation_space"])
             action_space = spaces.rebuild(header["action_space"])
-            counters = {key: configs.whole(key, header["counters"][key], 0) for key in ("step", "episode", "n_updates")}
+            counters = {key: configs.whole(key, header["counters"][key], 0, 2**32 - 1) for key in COUNTERS}
             rng = {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")}
             seed = whole_seed(own.pop("seed", header["seed"]))
             window = configs.whole("stats_window_size", own.pop("stats_window_size", header["stats_window_size"]), 1)
@@ -563,7 +580,7 @@ class Agent:
             cls._check_policy(policy, observation_space)
         except CheckpointError as error:
             raise CheckpointError(f"{path}: {error}") from None
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
             if changes and not isinstance(error, KeyError):
                 raise
             raise CheckpointError(f"{path}: the header is damaged or of another version: {error}") from None
@@ -602,7 +619,8 @@ class Agent:
         run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
         run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": rng}
         run.learn_from = max(self.config.learning_starts, run.step + self.config.learning_starts)
-        self._steps_before = 0
+        run.seed = int(np.random.SeedSequence([self.seed, run.step]).generate_state(1)[0])
+        self._steps_before = counters["steps_before"]
         return self
 
     def summary(self) -> str:

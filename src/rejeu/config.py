@@ -130,17 +130,19 @@ class OffPolicyConfig:
         return self.replay_buffer_kwargs
 
 
-def whole(key: str, value: Any, least: int) -> int:
+def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     """Returns ``value`` as an int; ``1e6`` is accepted.
 
     Raises:
-        ValueError: if it is not a whole number or below ``least``.
+        ValueError: if it is not a whole number from ``least`` to ``most``.
     """
     good = (
         isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
     )
-    if not good or value < least:
-        raise ValueError(f"{key}={value!r} must be a whole number of at least {least}")
+    if not good or not least <= value <= most:
+        raise ValueError(
+            f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * (most < 2**63 - 1)
+        )
     return int(value)
 
 

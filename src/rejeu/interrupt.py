@@ -9,26 +9,27 @@ from typing import Any
 
 
 class Interrupt:
-    """While entered, the first Ctrl-C or SIGTERM sets ``requested``; the second Ctrl-C acts at once.
+    """While entered, the first Ctrl-C sets ``requested``; the second acts at once.
 
     Outside the main thread, where Python allows no signal handlers, it does nothing.
     """
 
     def __init__(self) -> None:
         self.requested = False
-        self._previous: dict[int, Any] = {}
+        self._previous: Any = None
+        self._installed = False
 
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
+            self._previous = signal.signal(signal.SIGINT, self._handle)
+            self._installed = True
         return self
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested and number == signal.SIGINT:
+        if self.requested:
             raise KeyboardInterrupt
         self.requested = True
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+        if self._installed:
+            signal.signal(signal.SIGINT, self._previous)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,30 +33,6 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 
 BRANCHES = ("state_layers", "action_layers", "common_layers", "critic_layers", "actor_layers")
 """Settings of ``PolicyConfig`` of which any one turns the branch shape on."""
-
-
-class Layers(tuple[int, ...]):
-    """Widths of the last part of a net of branches.
-
-    A call is ``PolicyConfig.actor_widths`` or ``critic_widths``: algorithms may ask for
-    ``shape.actor_layers(default)``, which was the name of those methods.
-    """
-
-    widths: tuple[int, ...] | None
-    """What a call returns; None: its argument."""
-
-    def __new__(cls, layers: Sequence[int] = (), widths: tuple[int, ...] | None = None) -> Self:
-        """Returns ``layers`` with ``widths`` remembered."""
-        self = super().__new__(cls, layers)
-        self.widths = widths
-        return self
-
-    def __call__(self, default: tuple[int, ...]) -> tuple[int, ...]:
-        """Returns the widths of the hidden layers, or ``default`` where none were chosen."""
-        return default if self.widths is None else self.widths
-
-
-NO_LAYERS = Layers()
 
 
 @dataclass(frozen=True)
@@ -89,9 +65,9 @@ class PolicyConfig:
     """Widths of the critics' branch that only the action goes through."""
     common_layers: tuple[int, ...] = ()
     """Widths after the branches have met; actor and critics have layers of this shape each, they share no weights."""
-    critic_layers: Layers = NO_LAYERS
+    critic_layers: tuple[int, ...] = ()
     """Widths between the common layers and the critics' values."""
-    actor_layers: Layers = NO_LAYERS
+    actor_layers: tuple[int, ...] = ()
     """Widths between the common layers and the actor's outputs."""
     torso: Callable[[Array, int], Any] | None = None
     """Hidden layers of your own in every network: ``torso(key, n_inputs)`` returns an ``equinox.Module`` that maps
@@ -120,9 +96,9 @@ class PolicyConfig:
         if name.lower() not in ACTIVATIONS:
             raise ValueError(f"activation_fn={name!r} is unknown; choose one of {', '.join(ACTIVATIONS)}")
         put("activation_fn", name.lower())
+        if not isinstance(self.layer_norm, bool):
+            raise TypeError(f"layer_norm={self.layer_norm!r} must be True or False")
         self._check_shape()
-        put("actor_layers", Layers(self.actor_layers, self._chosen(self.pi, self.actor_layers)))
-        put("critic_layers", Layers(self.critic_layers, self._chosen(self.qf, self.critic_layers)))
 
     def _check_shape(self) -> None:
         """Raises where settings contradict each other: there is one way to shape a network at a time."""
@@ -150,21 +126,23 @@ class PolicyConfig:
         """Whether the networks are nets of branches."""
         return any(getattr(self, key) for key in BRANCHES)
 
-    def _chosen(self, arch: tuple[int, ...] | None, branch: tuple[int, ...]) -> tuple[int, ...] | None:
-        if self.torso is not None:
-            return ()
-        if self.has_branches:
-            return tuple(branch)
-        simba = (self.width,) * self.n_blocks if self.architecture == "simba" else None
-        return next((widths for widths in (arch, self.net_arch, simba) if widths is not None), None)
-
     def actor_widths(self, default: tuple[int, ...]) -> tuple[int, ...]:
         """Returns the widths of the actor's hidden layers: of its last part with branches, of each block with SimBa."""
-        return self.actor_layers(default)
+        return self._chosen(self.pi, self.actor_layers, default)
 
     def critic_widths(self, default: tuple[int, ...]) -> tuple[int, ...]:
         """Returns the widths of each critic's hidden layers, likewise."""
-        return self.critic_layers(default)
+        return self._chosen(self.qf, self.critic_layers, default)
+
+    def _chosen(
+        self, arch: tuple[int, ...] | None, branch: tuple[int, ...], default: tuple[int, ...]
+    ) -> tuple[int, ...]:
+        if self.torso is not None:
+            return ()
+        if self.has_branches:
+            return branch
+        simba = (self.width,) * self.n_blocks if self.architecture == "simba" else default
+        return next(widths for widths in (arch, self.net_arch, simba) if widths is not None)
 
 
 def _widths(key: str, value: Any) -> tuple[int, ...] | None:

@@ -56,7 +56,7 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
     if isinstance(space, spaces.Tuple):
         return tuple(leaf for i, part in enumerate(space.spaces) for leaf in leaves(part, f"{path}.{i}".lstrip(".")))
     if isinstance(space, spaces.Box):
-        is_image = space.dtype == np.uint8 and len(space.shape) == 3
+        is_image = space.dtype == np.uint8 and len(space.shape) in (3, 4)
         return (Leaf(path, "image" if is_image else "continuous", space.shape, narrow(space.dtype)),)
     if isinstance(space, spaces.Discrete):
         return (Leaf(path, "categorical", (), "int32", (int(space.n),), (int(space.start),)),)

@@ -87,8 +87,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
-        actor = Actor(actor_key, obs_leaves, action_dim, shape.actor_layers(HIDDEN_LAYERS), shape)
-        critic = Critic(critic_key, obs_leaves, action_dim, shape.critic_layers(HIDDEN_LAYERS), shape)
+        actor = Actor(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
+        critic = Critic(critic_key, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
         return State(
             actor=actor,
             critic=critic,

@@ -63,8 +63,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
 
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
-        actor = Actor(actor_key, obs_leaves, n_actions, shape.actor_layers(HIDDEN_LAYERS), shape)
-        critic = Actor(critic_key, obs_leaves, n_actions, shape.critic_layers(HIDDEN_LAYERS), shape)
+        actor = Actor(actor_key, obs_leaves, n_actions, shape.actor_widths(HIDDEN_LAYERS), shape)
+        critic = Actor(critic_key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
         return State(
             actor=actor,
             critic=critic,

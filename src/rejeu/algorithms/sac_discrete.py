@@ -53,9 +53,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor = Actor(actor_key, obs_leaves, n_actions, shape.actor_layers(HIDDEN_LAYERS), shape)
+        actor = Actor(actor_key, obs_leaves, n_actions, shape.actor_widths(HIDDEN_LAYERS), shape)
         critics = ensemble(
-            lambda k: Actor(k, obs_leaves, n_actions, shape.critic_layers(HIDDEN_LAYERS), shape),
+            lambda k: Actor(k, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape),
             critics_key,
             config.n_critics,
         )

@@ -101,9 +101,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor = Actor(actor_key, obs_leaves, action_dim, shape.actor_layers(HIDDEN_LAYERS), shape)
+        actor = Actor(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
         critics = ensemble(
-            lambda k: Critic(k, obs_leaves, action_dim, shape.critic_layers(HIDDEN_LAYERS), shape),
+            lambda k: Critic(k, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape),
             critics_key,
             config.n_critics,
         )

@@ -115,8 +115,9 @@ def make_vector(
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
     if isinstance(env, VectorEnv):
         return env
-    if isinstance(getattr(env, "vector", None), VectorEnv):
-        return env.vector
+    behind = getattr(env, "vector", None)
+    if isinstance(behind, VectorEnv):
+        return behind
     if isinstance(env, gym.vector.VectorEnv):
         return GymnasiumVector(env, seed)
     if isinstance(env, gym.Env):

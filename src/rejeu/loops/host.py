@@ -143,9 +143,8 @@ def off_policy(
         else:
             run.obs = step.obs
         t3 = time.perf_counter()
-        restarted = run.ended if active is None else run.ended | (np.arange(n_envs) >= taken)
-        if restarted.any():
-            run.replay.begin(run.obs, np.flatnonzero(restarted))
+        if run.ended.any():
+            run.replay.begin(run.obs, np.flatnonzero(run.ended))
 
         done = progress(run.step - first)
         n_updates = due(run, config, taken, len(episodes))
@@ -196,8 +195,13 @@ def clock_of(run: Run, progress: float) -> Clock:
 
 
 def book(run: Run, step: Step, active: np.ndarray | None) -> list[Episode]:
-    """Adds a step to the running episodes and returns those that ended."""
+    """Adds a step to the running episodes and returns those that ended.
+
+    Where only some environments are ``active``, the step of the others is not kept and their episodes are given up.
+    """
     run.ended = step.terminated | step.truncated
+    if active is not None:
+        run.ended[len(active) :] = True
     counted = slice(None) if active is None else active
     run.episode_return[counted] += step.reward[counted]
     run.episode_length[counted] += 1

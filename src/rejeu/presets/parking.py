@@ -19,7 +19,7 @@ PRESETS = (
             "buffer_size": 100_000,
         },
         n_envs=16,
-        total_steps=90_000,
+        total_steps=80_000,
         evaluate_every=10_000,
         evaluate_episodes=100,
         source="rejeu's own tuning, from the hyper-parameters of highway-env's parking notebook",

@@ -110,7 +110,12 @@ class Ring:
         self._write_obs(index, obs, envs)
 
     def add(
-        self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any, envs: np.ndarray | None = None
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        next_obs: Any,
+        envs: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Records one step of each environment in ``envs``; the arrays cover all environments, ``(n_envs, ...)``.
 

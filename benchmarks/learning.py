@@ -1,0 +1,111 @@
+"""Trains a preset on several seeds and records what each came to: the evidence behind what the documentation claims.
+
+    python benchmarks/learning.py Pendulum-v1 SAC --seeds 0 1 2 3 4
+
+trains as ``rejeu train`` does, without its evaluations on the way, and evaluates the last weights (``--best``: the best by
+smoothed training return) on 100 fresh episodes. The result is written to ``benchmarks/results/learning/ENV-ALGO.json``
+with the command, the versions and the hyper-parameters.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import math
+import platform
+import shlex
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+import rejeu
+from rejeu import config as configs, presets
+from rejeu.envs import make_vector
+
+RESULTS = Path(__file__).parent / "results" / "learning"
+
+
+def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) -> dict:
+    backend = arguments.backend or preset.backend
+    began = time.perf_counter()
+    env = make_vector(preset.env_id, preset.n_envs, backend, seed, **arguments.env)
+    nested = "Dict" in type(env.observation_space).__name__
+    agent = rejeu.AGENTS[preset.algorithm](
+        "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **preset.hyperparameters
+    )
+    if arguments.minutes:
+        agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60)
+    else:
+        agent.learn(arguments.steps or preset.total_steps)
+    seconds = time.perf_counter() - began
+    if arguments.best:
+        agent.restore_best()
+    evaluation_env = make_vector(preset.env_id, 10, backend, seed + 1_000_000, **arguments.env)
+    evaluation = agent.evaluate(arguments.episodes, env=evaluation_env)
+    return {
+        "seed": seed,
+        "steps": agent.num_timesteps,
+        "n_updates": agent.n_updates,
+        "seconds": round(seconds, 1),
+        "mean_return": evaluation.mean_return,
+        "std_return": evaluation.std_return,
+        "mean_length": evaluation.mean_length,
+        "success_rate": None if math.isnan(evaluation.success_rate) else evaluation.success_rate,
+        "episodes": arguments.episodes,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("env_id")
+    parser.add_argument("algorithm")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--minutes", type=float, help="train so long instead, everything from making the agent counted")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--backend")
+    parser.add_argument("--env", type=json.loads, default={}, help="arguments of the environment, as JSON")
+    parser.add_argument("--best", action="store_true", help="evaluate the best weights by smoothed training return")
+    parser.add_argument("--name", help="of the result file")
+    arguments = parser.parse_args()
+    preset = presets.find(arguments.env_id, arguments.algorithm)
+    if preset is None:
+        parser.error(f"there is no preset of {arguments.algorithm} for {arguments.env_id}")
+    runs = []
+    for seed in arguments.seeds:
+        runs.append(train_one(preset, seed, arguments))
+        print(json.dumps(runs[-1]), flush=True)
+    result = {
+        "command": shlex.join(["python", "benchmarks/learning.py", *sys.argv[1:]]),
+        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
+        "versions": {name: importlib.metadata.version(name) for name in ("rejeu", "jax", "gymnasium", "envpool")},
+        "hyperparameters": configs.to_json(
+            configs.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, preset.hyperparameters)
+        ),
+        "n_envs": preset.n_envs,
+        "runs": runs,
+        "summary": {key: summary([run[key] for run in runs]) for key in ("mean_return", "success_rate", "seconds")},
+    }
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    name = arguments.name or f"{arguments.env_id.replace('/', '-')}-{arguments.algorithm}"
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(result["summary"]), "->", path.relative_to(Path(__file__).parent.parent))
+
+
+def summary(values: list) -> dict | None:
+    """Returns mean, least and largest over seeds, and the 95 % interval of the mean by Student's t."""
+    if any(value is None for value in values):
+        return None
+    mean, n = float(np.mean(values)), len(values)
+    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
+    interval = [mean - half, mean + half] if n > 1 else None
+    return {"mean": mean, "interval": interval, "least": min(values), "largest": max(values), "seeds": n}
+
+
+if __name__ == "__main__":
+    main()
