@@ -6,10 +6,10 @@
 
 from __future__ import annotations
 
-from rejeu.presets import classic_control, parking, robotics
+from rejeu.presets import ball, classic_control, parking, robotics
 from rejeu.presets.preset import Preset
 
-ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *robotics.PRESETS)
+ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *ball.PRESETS, *robotics.PRESETS)
 """Every preset; of several for one environment the first is the best."""
 
 ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN"}
