@@ -5,8 +5,8 @@ all environments::
 
     environments step        while the update of the turn before still runs in XLA's own threads
     the ring keeps the step; episodes that ended are counted and begun anew
-    batches are drawn        likewise
     actions are chosen       with the newest finished parameters, hence after that update
+    batches are drawn        while the device chooses
     the update is started    one gradient step per environment step by default, all in one call
 
 So the environments never wait for the gradient nor the gradient for them, and yet every number depends on the seed
@@ -125,7 +125,7 @@ def off_policy(
     if run.obs is None:
         restart(run)
     if run.action is None:
-        run.action = choose(run, compiled, config, 0.0)
+        run.action = np.asarray(choose(run, compiled, config, 0.0))
     while last is None or run.step < last:
         active = None if last is None or last - run.step >= n_envs else np.arange(last - run.step)
         t0 = time.perf_counter()
@@ -149,9 +149,12 @@ def off_policy(
         done = progress(run.step - first)
         n_updates = due(run, config, taken, len(episodes))
         sizes = chunks(n_updates, per_turn)
-        samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
         t4 = time.perf_counter()
-        run.action = choose(run, compiled, config, done)
+        chosen = choose(run, compiled, config, done)
+        t5 = time.perf_counter()
+        samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
+        t6 = time.perf_counter()
+        run.action = np.asarray(chosen)
         run.replay.reprioritise(run.td_errors)
         run.td_errors = []
         for batch in samples:
@@ -159,11 +162,11 @@ def off_policy(
             if td_error is not None:
                 run.td_errors.append(td_error)
         run.n_updates += n_updates
-        t5 = time.perf_counter()
+        t7 = time.perf_counter()
         run.seconds["env"] += (t1 - t0) + (t3 - t2)
-        run.seconds["replay"] += (t2 - t1) + (t4 - t3)
-        run.seconds["update"] += t5 - t4
-        run.seconds["total"] = t5 - began
+        run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)
+        run.seconds["update"] += (t5 - t4) + (t7 - t6)
+        run.seconds["total"] = t7 - began
         yield Progress(run.step, episodes, run.metrics)
 
 
@@ -179,14 +182,17 @@ def restart(run: Run) -> None:
     run.action = None
 
 
-def choose(run: Run, compiled: Compiled, config: OffPolicyConfig, progress: float) -> np.ndarray:
-    """Returns the actions for the present observations: random ones at first, then the exploring policy's."""
+def choose(run: Run, compiled: Compiled, config: OffPolicyConfig, progress: float) -> np.ndarray | Array:
+    """Returns the actions for the present observations: random ones at first, then the exploring policy's.
+
+    The latter may still be under way on the device; ``run.obs`` must not change until they were read.
+    """
     if run.step < config.learning_starts:
         return random_action(run.env.action_space, run.env.n_envs, run.rng)
     action, run.carry = compiled.act(
         compiled.actor_leaves(run.leaves), run.carry, run.obs, run.ended, run.key, clock_of(run, progress)
     )
-    return np.asarray(action)
+    return action
 
 
 def clock_of(run: Run, progress: float) -> Clock:

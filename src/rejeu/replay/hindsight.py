@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,9 +123,7 @@ class HerReplayBuffer:
         ring, k = self.ring, self.config.n_sampled_goal
         rows, weight = draw(ring, self.priorities, rng, int(np.prod(shape)), progress)
         index = ring.index(*rows)
-        chosen = np.zeros(shape, bool)
-        chosen[..., : int(shape[-1] * k / (k + 1))] = True
-        relabelled = np.flatnonzero(chosen)
+        relabelled = relabelled_positions(shape, k)
 
         relabelled_rows = Rows(rows.env[relabelled], rows.time[relabelled])
         goal = ring.obs[self.achieved].take(self._goal_index(rng, relabelled_rows, index[relabelled]), axis=0)
@@ -166,7 +165,7 @@ class HerReplayBuffer:
             first = rows.time + 1
         else:
             first = np.maximum(rows.time - ring.since_start[index], ring.oldest()[rows.env]) + 1
-        return ring.index(rows.env, rng.integers(first, end + 1))
+        return ring.index(rows.env, first + (rng.random(len(end)) * (end + 1 - first)).astype(np.int64))
 
     def _n_step(
         self, rows: Rows, relabelled: np.ndarray, goal: np.ndarray
@@ -196,3 +195,11 @@ class HerReplayBuffer:
         self.ring.restore(arrays)
         if self.priorities is not None:
             self.priorities.restore()
+
+
+@cache
+def relabelled_positions(shape: tuple[int, ...], k: int) -> np.ndarray:
+    """Returns which of the flattened transitions of ``shape`` get a new goal: ``k / (k + 1)`` of each batch."""
+    chosen = np.zeros(shape, bool)
+    chosen[..., : int(shape[-1] * k / (k + 1))] = True
+    return np.flatnonzero(chosen)

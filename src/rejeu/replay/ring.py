@@ -126,9 +126,8 @@ class Ring:
         self.action[index] = action[envs]
         self.reward[index] = reward[envs]
         self.kind[index] = terminated[envs]
-        self._advance(envs)
+        following = self._advance(envs)
         self.n_steps[envs] += 1
-        following = self.index(envs, self.head[envs])
         self.since_start[following] = self.since_start[index] + 1
         self._write_obs(following, next_obs, envs)
         return index, following
@@ -193,14 +192,16 @@ class Ring:
         """Returns observation leaves in the nesting of the environment's space."""
         return jax.tree.unflatten(self.obs_structure, obs_leaves)
 
-    def _advance(self, envs: np.ndarray) -> None:
-        """Moves the heads on by one row, forgetting what stood there."""
-        full = self.head[envs] >= self.rows - 1
-        self.head[envs] += 1
-        index = self.index(envs, self.head[envs])
-        self.n_steps[envs] -= full & (self.kind[index] != LAST)
+    def _advance(self, envs: np.ndarray) -> np.ndarray:
+        """Moves the heads on by one row, forgetting what stood there, and returns the positions of the new rows."""
+        head = self.head[envs] + 1
+        self.head[envs] = head
+        index = self.index(envs, head)
+        if head.max() >= self.rows:
+            self.n_steps[envs] -= (head >= self.rows) & (self.kind[index] != LAST)
         self.kind[index] = STEP
         self.until_end[index] = -1
+        return index
 
     def _close(self, env: int) -> None:
         """Marks the newest row of ``env`` as its episode's final observation."""
