@@ -157,6 +157,8 @@ def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     space's own numbers.
     """
     if isinstance(space, spaces.Box):
+        if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
+            return np.clip(action.reshape(-1, *space.shape), -1.0, 1.0)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         scaled = low + 0.5 * (action.reshape(-1, *space.shape) + 1.0) * (high - low)
         return np.clip(scaled, low, high).astype(space.dtype)
