@@ -47,6 +47,7 @@ from rejeu.core import (
 from rejeu.distributions import TanhNormal
 from rejeu.networks import PolicyConfig
 from rejeu.normalisation import RenormalisedNetwork, with_statistics
+from rejeu.randomness import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
 
@@ -155,7 +156,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return distribution(actor(obs)).mode()
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(jax.random.fold_in(state.key, state.n_updates))
+        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         next_action, next_log_prob = distribution(state.actor(batch.next_obs)).sample_and_log_prob(target_key)

@@ -44,6 +44,7 @@ from rejeu.core import (
 )
 from rejeu.distributions import TanhNormal
 from rejeu.networks import Actor, Critic, action_values
+from rejeu.randomness import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
 
@@ -141,7 +142,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return policy(actor, obs).mode()
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(jax.random.fold_in(state.key, state.n_updates))
+        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch, target_key)

@@ -40,6 +40,7 @@ from rejeu.core import (
     weighted_mean,
 )
 from rejeu.networks import Actor, Critic, action_values
+from rejeu.randomness import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
 
@@ -127,7 +128,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         next_action = smoothed_action(
             state.target_actor,
             batch.next_obs,
-            jax.random.fold_in(state.key, state.n_updates),
+            nth(state.key, state.n_updates),
             config.target_policy_noise,
             config.target_noise_clip,
         )

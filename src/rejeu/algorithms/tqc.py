@@ -41,6 +41,7 @@ from rejeu.core import (
 )
 from rejeu.networks import Actor, Critic
 from rejeu.quantiles import quantile_huber_loss
+from rejeu.randomness import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
 
@@ -123,7 +124,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return policy(actor, obs).mode()
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(jax.random.fold_in(state.key, state.n_updates))
+        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch, target_key, n_kept)
