@@ -186,7 +186,7 @@ def test_what_it_remembers_is_named_arrays_that_survive_a_file(tmp_path):
     path = checkpoint.write(tmp_path / "carry", "agent", checkpoint.tree_to_arrays(carry), {})
     shapes = jax.eval_shape(lambda: carry)
     _, arrays = checkpoint.read(path, "agent")
-    restored = jax.tree.unflatten(jax.tree.structure(carry), checkpoint.arrays_to_leaves(shapes, arrays, path))
+    restored = checkpoint.arrays_to_tree(shapes, arrays, path)
     ended, key = np.array([True, False, False, True]), jax.random.PRNGKey(9)
     one, two = (act(c, actor, observations(4), ended, key, CLOCK) for c in (carry, restored))
     jax.tree.map(np.testing.assert_array_equal, one, two)

@@ -31,7 +31,7 @@ from rejeu.history import History
 from rejeu.interrupt import Interrupt
 from rejeu.logging import Console, Sink, TensorBoard, next_folder
 from rejeu.loops import host
-from rejeu.loops.compiled import Compiled
+from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.loops.host import Episode, Progress, Run
 from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer
 from rejeu.replay.prioritized import Priorities
@@ -70,8 +70,8 @@ class Best(NamedTuple):
     """``"training"`` or ``"evaluation"``."""
     step: int
     """Environment steps taken when they were kept."""
-    leaves: list[Any]
-    """The algorithm's whole state at that moment, flat."""
+    state: PackedState
+    """The algorithm's whole state at that moment, packed."""
 
 
 class Agent:
@@ -129,6 +129,14 @@ class Agent:
         if noise is not None:
             check_fits(noise, action_space)
         self._compiled = Compiled(self.algorithm.make(self.config, observation_space, action_space), noise)
+        compilation.start_device(self._work())
+
+    def _work(self) -> float:
+        """Returns about how many multiplications the largest layer of an update takes; of images, any number."""
+        if any(leaf.kind == "image" for leaf in self._obs_leaves):
+            return math.inf
+        weights = [leaf.size for leaf in jax.tree.leaves(self._compiled.shapes) if len(leaf.shape) > 1]
+        return self.config.batch_size * max(weights, default=0)
 
     def _start(self, env: VectorEnv) -> None:
         """Begins a run on ``env`` with a fresh state and an empty buffer."""
@@ -196,8 +204,8 @@ class Agent:
 
     @property
     def state(self) -> Any:
-        """Everything learnt, as the algorithm's own class. Its arrays are given away at the next ``learn``."""
-        return self._compiled.state(self._run.leaves)
+        """Everything learnt, as the algorithm's own class; a copy."""
+        return self._compiled.state(self._run.state)
 
     @property
     def num_timesteps(self) -> int:
@@ -333,7 +341,7 @@ class Agent:
         """
         if self.best is not None and self.best.by == by and score <= self.best.score:
             return False
-        self.best = Best(score, by, self._run.step, self._compiled.copy(self._run.leaves))
+        self.best = Best(score, by, self._run.step, self._compiled.copy(self._run.state))
         return True
 
     def restore_best(self) -> Self:
@@ -347,7 +355,7 @@ class Agent:
                 f"no best weights are known yet: they are kept from the {BEST_WINDOW}th finished episode on, and at every "
                 "evaluation by rejeu.callbacks.Evaluate"
             )
-        self._run.leaves = self._compiled.copy(self.best.leaves)
+        self._run.state = self._compiled.copy(self.best.state)
         return self
 
     def statistics(self) -> dict[str, float]:
@@ -420,14 +428,14 @@ class Agent:
 
     def _act(self, obs: Any, deterministic: bool) -> np.ndarray:
         """Returns actions in the algorithm's range for a batch of cast observations."""
-        leaves = self._compiled.actor_leaves(self._run.leaves)
+        packed = self._run.state
         if deterministic:
-            return np.asarray(self._compiled.exploit(leaves, obs))
+            return np.asarray(self._compiled.exploit(packed, obs))
         n = len(jax.tree.leaves(obs)[0])
         clock = host.clock_of(self._run, 1.0)._replace(step=np.uint32(2**32 - 1 - self._n_predictions % 2**31))
         self._n_predictions += 1
         carry = self._compiled.initial_carry(n)
-        action, _ = self._compiled.act(leaves, carry, obs, np.ones(n, bool), self._run.key, clock)
+        action, _ = self._compiled.act(packed, carry, obs, np.ones(n, bool), self._run.key, clock)
         return np.asarray(action)
 
     def evaluate(
@@ -519,8 +527,8 @@ class Agent:
         arrays = {key: np.asarray(value) for key, value in source.items()}
         if not exact_match:
             arrays = self.get_parameters() | arrays
-        leaves = checkpoint.arrays_to_leaves(self._compiled.shapes, arrays, "set_parameters: the source")
-        self._run.leaves = [jax.numpy.array(leaf) for leaf in leaves]
+        state = checkpoint.arrays_to_tree(self._compiled.shapes, arrays, "set_parameters: the source")
+        self._run.state = self._compiled.pack(state)
 
     def save(self, path: str | Path) -> Path:
         """Writes the model to one safetensors file and returns its path; the replay buffer is not part of it.
@@ -600,22 +608,20 @@ class Agent:
             agent._build(observation_space, action_space)
         except (TypeError, ValueError, MemoryError, OverflowError) as error:
             raise CheckpointError(f"{path}: {error}") from None
-        leaves = checkpoint.arrays_to_leaves(agent._compiled.shapes, arrays, path)
+        state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
         vector = None if env is None else make_vector(env, 1, seed=seed)
         if vector is not None:
             agent._check_spaces(vector, "the given environment")
-        return agent._resume(vector, leaves, counters, rng)
+        return agent._resume(vector, state, counters, rng)
 
-    def _resume(
-        self, vector: VectorEnv | None, leaves: list[np.ndarray], counters: dict[str, int], rng: dict[str, int]
-    ) -> Self:
+    def _resume(self, vector: VectorEnv | None, state: Any, counters: dict[str, int], rng: dict[str, int]) -> Self:
         """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
         if vector is not None:
             self._start(vector)
         else:
             self._run = host.initial_run(None, None, self._compiled, 0, self.seed)
         run = self._run
-        run.leaves = [jax.numpy.array(leaf) for leaf in leaves]
+        run.state = self._compiled.pack(state)
         run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
         run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": rng}
         run.learn_from = max(self.config.learning_starts, run.step + self.config.learning_starts)

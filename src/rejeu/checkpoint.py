@@ -123,8 +123,8 @@ def tree_to_arrays(tree: PyTree) -> dict[str, np.ndarray]:
     return dict(zip(names(tree), map(np.asarray, jax.tree.leaves(tree)), strict=True))
 
 
-def arrays_to_leaves(expected: PyTree, arrays: Mapping[str, np.ndarray], path: str | Path) -> list[np.ndarray]:
-    """Returns the leaves of a tree like ``expected`` (of shapes) from arrays by name.
+def arrays_to_tree(expected: PyTree, arrays: Mapping[str, np.ndarray], path: str | Path) -> PyTree:
+    """Returns a tree like ``expected`` (of shapes) from arrays by name: the inverse of :func:`tree_to_arrays`.
 
     Raises:
         CheckpointError: unless names, shapes and dtypes are the same, naming the first that is not.
@@ -143,4 +143,4 @@ def arrays_to_leaves(expected: PyTree, arrays: Mapping[str, np.ndarray], path: s
         raise CheckpointError(
             f"{path} has {extra[0]}, which this agent has not; it was saved with another configuration"
         )
-    return [arrays[key] for key in keys]
+    return jax.tree.unflatten(jax.tree.structure(expected), [arrays[key] for key in keys])

@@ -1,7 +1,7 @@
-"""An algorithm's functions as the loops call them: compiled once, over the flat leaves of the state.
+"""An algorithm's functions as the loops call them: compiled once, over a packed state.
 
-A state crosses the border between Python and XLA many times a second. As a list of arrays it does so several times faster
-than as a tree of modules, and choosing an action takes only the leaves that the actor needs.
+A state crosses the border between Python and XLA many times a second. Packed into a few vectors (see
+:mod:`rejeu.loops.packing`) it does so several times faster than as a tree of modules, and so do batches.
 """
 
 from __future__ import annotations
@@ -13,9 +13,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
+from rejeu.loops.packing import HostPacker, Packing
+from rejeu.randomness import nth
+
+PackedState = list[Array]
+"""The state of an algorithm as the vectors of its :class:`Packing`."""
 
 
 class Compiled:
@@ -23,62 +28,76 @@ class Compiled:
 
     def __init__(self, algorithm: Algorithm, noise: Noise | None) -> None:
         self.algorithm = algorithm
-        shapes = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
-        n_leaves = len(jax.tree.leaves(shapes))
-        self.structure = jax.tree.structure(shapes)
-        self.shapes = shapes
-        actor = algorithm.actor(jax.tree.unflatten(self.structure, range(n_leaves)))
-        actor_structure = jax.tree.structure(actor)
-        self._actor_positions: list[int] = jax.tree.leaves(actor)
+        self.shapes = jax.eval_shape(algorithm.init, jax.ShapeDtypeStruct((2,), jnp.uint32))
+        """The state, of shapes in place of arrays."""
+        packing = Packing(self.shapes)
+        self._packer = HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
 
         @jax.jit
-        def init(key: Array) -> list[Array]:
-            return jax.tree.leaves(algorithm.init(key))
+        def init(key: Array) -> PackedState:
+            return packing.pack(algorithm.init(key))
 
-        @jax.jit
+        @partial(jax.jit, static_argnums=4)
         def act(
-            actor_leaves: list[Array], carry: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock
+            state: PackedState, carry: PyTree, key: Array, vectors: list[Array], plan: Packing
         ) -> tuple[Array, PyTree]:
-            actor = jax.tree.unflatten(actor_structure, actor_leaves)
-            return explorer.act(carry, actor, obs, ended, jax.random.fold_in(key, clock.step), clock)
+            obs, ended, clock = plan.unpack(vectors)
+            actor = algorithm.actor(packing.unpack(state))
+            return explorer.act(carry, actor, obs, ended, nth(key, clock.step), clock)
 
-        @jax.jit
-        def exploit(actor_leaves: list[Array], obs: PyTree) -> Array:
-            return algorithm.exploit(jax.tree.unflatten(actor_structure, actor_leaves), obs)
+        @partial(jax.jit, static_argnums=2)
+        def exploit(state: PackedState, vectors: list[Array], plan: Packing) -> Array:
+            return algorithm.exploit(algorithm.actor(packing.unpack(state)), plan.unpack(vectors))
 
-        @partial(jax.jit, donate_argnums=0)
-        def update(leaves: list[Array], batches: Transition, clock: Clock) -> tuple[list[Array], Metrics, Array | None]:
-            state = jax.tree.unflatten(self.structure, leaves)
-            state, metrics = jax.lax.scan(lambda s, batch: algorithm.update(s, batch, clock), state, batches)
+        @partial(jax.jit, donate_argnums=0, static_argnums=2)
+        def update(
+            state: PackedState, vectors: list[Array], plan: Packing
+        ) -> tuple[PackedState, Metrics, Array | None]:
+            batches, clock = plan.unpack(vectors)
+            after, metrics = jax.lax.scan(
+                lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
+            )
             td_error = metrics.pop(TD_ERROR, None)
             return (
-                jax.tree.leaves(state),
+                packing.pack(after),
                 jax.tree.map(jnp.mean, metrics),
                 None if batches.weight is None else td_error,
             )
 
-        self.copy = jax.jit(lambda leaves: jax.tree.map(jnp.copy, leaves))
-        """``copy(leaves) -> leaves`` in buffers of their own."""
         self.init = init
-        """``init(key) -> leaves``."""
-        self.act = act
-        """``act(actor_leaves, carry, obs, ended, key, clock) -> (action, carry)``, exploring, noise included."""
-        self.exploit = exploit
-        """``exploit(actor_leaves, obs) -> action``."""
-        self.update = update
-        """``update(leaves, batches, clock) -> (leaves, metrics, td_error)``: one gradient step for each entry of the
-        leading axis of ``batches``, in one scan. ``leaves`` are donated; metrics are means over the steps; the absolute
-        TD errors ``(steps, batch)`` are None unless the batches are weighted."""
+        """``init(key) -> state``, packed."""
+        self.state = jax.jit(lambda state: copied(packing.unpack(state)))
+        """``state(packed) -> state`` as the algorithm's own class, in buffers of its own."""
+        self.pack = jax.jit(lambda tree: copied(packing.pack(tree)))
+        """``pack(state) -> packed``: the inverse, likewise."""
+        self.copy = jax.jit(copied)
+        """``copy(packed) -> packed`` in buffers of its own."""
+        self._act, self._exploit, self._update = act, exploit, update
+
+    def act(
+        self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
+    ) -> tuple[Array, PyTree]:
+        """Returns actions for ``obs`` ``(n_envs, ...)``, exploring, noise included, and the carry of exploration.
+
+        ``ended``, ``bool (n_envs,)``, is where an episode has just begun.
+        """
+        return self._act(state, carry, key, *self._packer((obs, ended, clock)))
+
+    def exploit(self, state: PackedState, obs: PyTree) -> Array:
+        """Returns the deterministic actions for ``obs`` ``(batch, ...)``."""
+        return self._exploit(state, *self._packer(obs))
+
+    def update(
+        self, state: PackedState, batches: Transition, clock: Clock
+    ) -> tuple[PackedState, Metrics, Array | None]:
+        """Takes one gradient step for each entry of the leading axis of ``batches``, in one scan.
+
+        Returns the packed state, whose predecessor is donated, the metrics, means over the steps, and the absolute TD
+        errors ``(steps, batch)``, which are None unless the batches are weighted.
+        """
+        return self._update(state, *self._packer((batches, clock)))
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""
         return self._explorer.init(self.algorithm.actor(self.shapes), n_envs)
-
-    def actor_leaves(self, leaves: list[Array]) -> list[Array]:
-        """Returns the leaves of the state that choosing an action needs."""
-        return [leaves[i] for i in self._actor_positions]
-
-    def state(self, leaves: list[Any]) -> PyTree:
-        """Returns the state as the algorithm's own class."""
-        return jax.tree.unflatten(self.structure, leaves)

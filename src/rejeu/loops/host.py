@@ -5,9 +5,10 @@ all environments::
 
     environments step        while the update of the turn before still runs in XLA's own threads
     the ring keeps the step; episodes that ended are counted and begun anew
-    actions are chosen       with the newest finished parameters, hence after that update
-    batches are drawn        while the device chooses
-    the update is started    one gradient step per environment step by default, all in one call
+    actions are asked for    of the device, which chooses them as soon as that update is done
+    batches are drawn        meanwhile
+    the update is queued     one gradient step per environment step by default, all in one call
+    the actions are read     while it begins
 
 So the environments never wait for the gradient nor the gradient for them, and yet every number depends on the seed
 alone: the action at a step always follows the update of the step before the last.
@@ -28,7 +29,7 @@ from rejeu.config import OffPolicyConfig
 from rejeu.core import Clock, Metrics, PyTree
 from rejeu.envs.vector import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError
-from rejeu.loops.compiled import Compiled
+from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.uniform import ReplayBuffer
 from rejeu.spaces import random_action, scale_action
@@ -70,8 +71,8 @@ class Run:
     """The environments, a :class:`VectorEnv`; None for an agent that only predicts."""
     replay: Any
     """The replay buffer; None likewise."""
-    leaves: list[Array]
-    """The algorithm's state, flat (see :class:`Compiled`)."""
+    state: PackedState
+    """The algorithm's state, packed (see :class:`Compiled`)."""
     key: Array
     """Root of the randomness of exploration."""
     rng: np.random.Generator
@@ -154,14 +155,14 @@ def off_policy(
         t5 = time.perf_counter()
         samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
         t6 = time.perf_counter()
-        run.action = np.asarray(chosen)
         run.replay.reprioritise(run.td_errors)
         run.td_errors = []
         for batch in samples:
-            run.leaves, run.metrics, td_error = compiled.update(run.leaves, batch, clock_of(run, done))
+            run.state, run.metrics, td_error = compiled.update(run.state, batch, clock_of(run, done))
             if td_error is not None:
                 run.td_errors.append(td_error)
         run.n_updates += n_updates
+        run.action = np.asarray(chosen)
         t7 = time.perf_counter()
         run.seconds["env"] += (t1 - t0) + (t3 - t2)
         run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)
@@ -189,9 +190,7 @@ def choose(run: Run, compiled: Compiled, config: OffPolicyConfig, progress: floa
     """
     if run.step < config.learning_starts:
         return random_action(run.env.action_space, run.env.n_envs, run.rng)
-    action, run.carry = compiled.act(
-        compiled.actor_leaves(run.leaves), run.carry, run.obs, run.ended, run.key, clock_of(run, progress)
-    )
+    action, run.carry = compiled.act(run.state, run.carry, run.obs, run.ended, run.key, clock_of(run, progress))
     return action
 
 
@@ -284,7 +283,7 @@ def initial_run(
     return Run(
         env=env,
         replay=replay,
-        leaves=compiled.init(learner_key),
+        state=compiled.init(learner_key),
         key=explore_key,
         rng=np.random.default_rng(seed),
         carry=compiled.initial_carry(1 if env is None else env.n_envs),
