@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from rejeu.loops import packing
-from rejeu.loops.packing import HostPacker, Packing
+from rejeu.loops.packing import HostPacker, Packing, Readings
 
 DTYPES = ("float32", "int32", "uint32", "uint8", "bool")
 SHAPES = ((), (1,), (3,), (2, 3), (0, 2), (4, 1, 2), (5, 7))
@@ -59,3 +59,12 @@ def test_one_plan_serves_all_trees_of_a_kind():
     others = [packer(tree)[1] for tree in ({"a": np.ones(3, np.float32)}, {"a": np.ones(2)}, {"b": np.zeros(2)})]
     assert first is same
     assert len({first, *others}) == 4
+
+
+def test_readings_are_a_mapping_of_one_vector():
+    readings = jax.jit(lambda: Readings.of({"b": jnp.float32(2), "a": jnp.float32(1)}))()
+    assert list(readings) == ["b", "a"]
+    assert {name: float(value) for name, value in readings.items()} == {"b": 2.0, "a": 1.0}
+    assert "c" not in readings
+    with pytest.raises(KeyError, match="c"):
+        readings["c"]

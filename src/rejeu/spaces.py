@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -156,14 +157,24 @@ def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``. Discrete: from 0 to n - 1 to the
     space's own numbers.
     """
+    return action_scaler(space)(action)
+
+
+def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns :func:`scale_action` for one space, which looks at the space once."""
     if isinstance(space, spaces.Box):
+        shape = (-1, *space.shape)
         if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
-            return np.clip(action.reshape(-1, *space.shape), -1.0, 1.0)
-        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        scaled = low + 0.5 * (action.reshape(-1, *space.shape) + 1.0) * (high - low)
-        return np.clip(scaled, low, high).astype(space.dtype)
+            return lambda action: action.reshape(shape).clip(-1.0, 1.0)
+        low, high, dtype = space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
+
+        def scale(action: np.ndarray) -> np.ndarray:
+            return (low + 0.5 * (action.reshape(shape) + 1.0) * (high - low)).clip(low, high).astype(dtype)
+
+        return scale
     if isinstance(space, spaces.Discrete):
-        return action.astype(np.int64) + int(space.start)
+        start = int(space.start)
+        return lambda action: action.astype(np.int64) + start
     raise TypeError(f"cannot scale actions of {space}")
 
 

@@ -167,6 +167,7 @@ class InProcess(VectorEnv):
         stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
         self._stores = stores
         self._plain = isinstance(self.observation_space, gym.spaces.Box)
+        self._keys = box_keys(self.observation_space)
         self._obs = jax.tree.unflatten(structure(self.observation_space), stores)
 
     def reset(self, seed: int | None = None) -> Any:
@@ -207,8 +208,19 @@ class InProcess(VectorEnv):
         if self._plain:
             self._stores[0][i] = obs
             return
+        if self._keys is not None:
+            for key, store in zip(self._keys, self._stores, strict=True):
+                store[i] = obs[key]
+            return
         for store, part in zip(self._stores, jax.tree.leaves(plain(self.observation_space, obs)), strict=True):
             store[i] = part
+
+
+def box_keys(space: gym.Space) -> list[str] | None:
+    """Returns the keys of a Dict of Boxes in the order of :func:`rejeu.spaces.leaves`; None for any other space."""
+    if isinstance(space, gym.spaces.Dict) and all(isinstance(part, gym.spaces.Box) for part in space.values()):
+        return sorted(space.spaces)
+    return None
 
 
 class GymnasiumVector(VectorEnv):

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy as copied
+from rejeu.core import TD_ERROR, Algorithm, Clock, PyTree, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
-from rejeu.loops.packing import HostPacker, Packing
+from rejeu.loops.packing import HostPacker, Packing, Readings
 from rejeu.randomness import nth
 
 PackedState = list[Array]
@@ -53,7 +53,7 @@ class Compiled:
         @partial(jax.jit, donate_argnums=0, static_argnums=2)
         def update(
             state: PackedState, vectors: list[Array], plan: Packing
-        ) -> tuple[PackedState, Metrics, Array | None]:
+        ) -> tuple[PackedState, Readings, Array | None]:
             batches, clock = plan.unpack(vectors)
             after, metrics = jax.lax.scan(
                 lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
@@ -61,7 +61,7 @@ class Compiled:
             td_error = metrics.pop(TD_ERROR, None)
             return (
                 packing.pack(after),
-                jax.tree.map(jnp.mean, metrics),
+                Readings.of(jax.tree.map(jnp.mean, metrics)),
                 None if batches.weight is None else td_error,
             )
 
@@ -90,7 +90,7 @@ class Compiled:
 
     def update(
         self, state: PackedState, batches: Transition, clock: Clock
-    ) -> tuple[PackedState, Metrics, Array | None]:
+    ) -> tuple[PackedState, Readings, Array | None]:
         """Takes one gradient step for each entry of the leading axis of ``batches``, in one scan.
 
         Returns the packed state, whose predecessor is donated, the metrics, means over the steps, and the absolute TD

@@ -17,7 +17,7 @@ alone: the action at a step always follows the update of the step before the las
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -26,13 +26,13 @@ import numpy as np
 from jax import Array
 
 from rejeu.config import OffPolicyConfig
-from rejeu.core import Clock, Metrics, PyTree
+from rejeu.core import Clock, PyTree
 from rejeu.envs.vector import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError
 from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.uniform import ReplayBuffer
-from rejeu.spaces import random_action, scale_action
+from rejeu.spaces import action_scaler, random_action
 
 
 class Episode(NamedTuple):
@@ -59,7 +59,7 @@ class Progress(NamedTuple):
     """Environment steps taken in all."""
     episodes: list[Episode]
     """Those that ended in this turn."""
-    metrics: Metrics | None
+    metrics: Mapping[str, Array] | None
     """Of the newest update, on the device: reading one waits for it. None before the first."""
 
 
@@ -97,7 +97,7 @@ class Run:
     steps_since_update: int = 0
     episode_return: np.ndarray = field(default_factory=lambda: np.zeros(0))
     episode_length: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    metrics: Metrics | None = None
+    metrics: Mapping[str, Array] | None = None
     td_errors: list[Array] = field(default_factory=list)
     """Of the newest updates, on their way to the priorities of the replay buffer, which get them one turn later."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("env", "replay", "update", "total"), 0.0))
@@ -119,18 +119,18 @@ def off_policy(
     Raises:
         BadEnvironmentError: if a reward is not a finite number.
     """
-    env, n_envs = run.env, run.env.n_envs
+    env, n_envs, scale = run.env, run.env.n_envs, action_scaler(run.env.action_space)
     first, last = run.step, None if n_steps is None else run.step + n_steps
     began = time.perf_counter() - run.seconds["total"]
     per_turn = updates_per_turn(config, n_envs)
     if run.obs is None:
         restart(run)
     if run.action is None:
-        run.action = np.asarray(choose(run, compiled, config, 0.0))
+        run.action = np.asarray(choose(run, compiled, config, clock_of(run, 0.0)))
     while last is None or run.step < last:
         active = None if last is None or last - run.step >= n_envs else np.arange(last - run.step)
         t0 = time.perf_counter()
-        step = env.step(scale_action(env.action_space, run.action))
+        step = env.step(scale(run.action))
         t1 = time.perf_counter()
         check_rewards(step, env, run.step)
         run.replay.add(run.action, step.reward, step.terminated, step.obs, active)
@@ -151,14 +151,15 @@ def off_policy(
         n_updates = due(run, config, taken, len(episodes))
         sizes = chunks(n_updates, per_turn)
         t4 = time.perf_counter()
-        chosen = choose(run, compiled, config, done)
+        clock = clock_of(run, done)
+        chosen = choose(run, compiled, config, clock)
         t5 = time.perf_counter()
         samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
         t6 = time.perf_counter()
         run.replay.reprioritise(run.td_errors)
         run.td_errors = []
         for batch in samples:
-            run.state, run.metrics, td_error = compiled.update(run.state, batch, clock_of(run, done))
+            run.state, run.metrics, td_error = compiled.update(run.state, batch, clock)
             if td_error is not None:
                 run.td_errors.append(td_error)
         run.n_updates += n_updates
@@ -183,14 +184,14 @@ def restart(run: Run) -> None:
     run.action = None
 
 
-def choose(run: Run, compiled: Compiled, config: OffPolicyConfig, progress: float) -> np.ndarray | Array:
+def choose(run: Run, compiled: Compiled, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
     """Returns the actions for the present observations: random ones at first, then the exploring policy's.
 
     The latter may still be under way on the device; ``run.obs`` must not change until they were read.
     """
     if run.step < config.learning_starts:
         return random_action(run.env.action_space, run.env.n_envs, run.rng)
-    action, run.carry = compiled.act(run.state, run.carry, run.obs, run.ended, run.key, clock_of(run, progress))
+    action, run.carry = compiled.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
     return action
 
 

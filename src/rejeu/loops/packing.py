@@ -8,7 +8,7 @@ batch with its clock some ten; packed, they are five. Inside the compiled code t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -44,14 +44,14 @@ class Packing:
 
     def pack(self, tree: PyTree) -> list[Array]:
         """Returns the vectors of ``tree`` and then its large leaves, inside compiled code."""
-        return self._pack(jax.tree.leaves(tree), jnp.concatenate, jnp.ravel)
+        return self._pack(jax.tree.leaves(tree), jnp.concatenate)
 
     def pack_leaves(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
         """Returns the same of the leaves of a tree on the host; the vectors are copies."""
-        return self._pack(leaves, np.concatenate, np.ravel)
+        return self._pack(leaves, np.concatenate)
 
-    def _pack(self, leaves: list[Any], concatenate: Callable[..., Any], ravel: Callable[..., Any]) -> list[Any]:
-        vectors = [concatenate([ravel(leaves[i]) for i in group]) for group in self.groups]
+    def _pack(self, leaves: list[Any], concatenate: Callable[..., Any]) -> list[Any]:
+        vectors = [concatenate([leaves[i].reshape(-1) for i in group]) for group in self.groups]
         return vectors + [leaves[i] for i in self.large]
 
     def unpack(self, arrays: list[Any]) -> PyTree:
@@ -63,6 +63,38 @@ class Packing:
         for i, array in zip(self.large, arrays[len(self.groups) :], strict=True):
             leaves[i] = array
         return jax.tree.unflatten(self.structure, leaves)
+
+
+@jax.tree_util.register_pytree_node_class
+class Readings(Mapping[str, Array]):
+    """Named scalars that are on the device as one vector; reading one waits for it."""
+
+    def __init__(self, names: tuple[str, ...], values: Array) -> None:
+        self.names = names
+        self.vector = values
+
+    @classmethod
+    def of(cls, scalars: Mapping[str, Array]) -> Readings:
+        """Packs scalars, inside compiled code."""
+        return cls(tuple(scalars), jnp.stack(list(scalars.values())))
+
+    def __getitem__(self, name: str) -> Array:
+        if name not in self.names:
+            raise KeyError(name)
+        return self.vector[self.names.index(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def tree_flatten(self) -> tuple[tuple[Array], tuple[str, ...]]:
+        return (self.vector,), self.names
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], children: tuple[Array]) -> Readings:
+        return cls(names, *children)
 
 
 class HostPacker:

@@ -15,6 +15,7 @@ kept as it was elsewhere: a crash remains a crash.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -121,18 +122,18 @@ class HerReplayBuffer:
         Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances, ``progress`` anneals the weights.
         """
         ring, k = self.ring, self.config.n_sampled_goal
-        rows, weight = draw(ring, self.priorities, rng, int(np.prod(shape)), progress)
+        rows, weight = draw(ring, self.priorities, rng, math.prod(shape), progress)
         index = ring.index(*rows)
         relabelled = relabelled_positions(shape, k)
 
         relabelled_rows = Rows(rows.env[relabelled], rows.time[relabelled])
         goal = ring.obs[self.achieved].take(self._goal_index(rng, relabelled_rows, index[relabelled]), axis=0)
         if self.n_steps == 1:
-            reward, terminated = ring.reward[index], ring.kind[index] == TERMINATED
-            steps = np.ones(1, np.int64)
+            reward, terminated = ring.reward.take(index), ring.kind.take(index) == TERMINATED
+            steps: int | np.ndarray = 1
             following = ring.index(rows.env, rows.time + steps)
             reached = ring.obs[self.achieved].take(following[relabelled], axis=0)
-            if len(relabelled):
+            if len(goal):
                 reward[relabelled] = self.goals.reward(reached, goal)
                 if self.goals.terminated is not None:
                     terminated[relabelled] = self.goals.terminated(reached, goal)
@@ -144,7 +145,7 @@ class HerReplayBuffer:
         obs[self.desired][relabelled] = goal
         next_obs[self.desired][relabelled] = goal
         discount = bootstrap_discount(self.gamma, steps, terminated)
-        return batch(ring, shape, obs, ring.action[index], reward, next_obs, discount, weight)
+        return batch(ring, shape, obs, ring.action.take(index, axis=0), reward, next_obs, discount, weight)
 
     def reprioritise(self, td_errors: list[Any]) -> None:
         """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
@@ -157,7 +158,7 @@ class HerReplayBuffer:
         if strategy == "random":
             other = ring.draw(rng, len(index))
             return ring.index(other.env, other.time + 1)
-        until_end = ring.until_end[index]
+        until_end = ring.until_end.take(index)
         end = np.where(until_end >= 0, rows.time + until_end, ring.head[rows.env])
         if strategy == "final":
             return ring.index(rows.env, end)
@@ -168,7 +169,7 @@ class HerReplayBuffer:
         return ring.index(rows.env, first + (rng.random(len(end)) * (end + 1 - first)).astype(np.int64))
 
     def _n_step(
-        self, rows: Rows, relabelled: np.ndarray, goal: np.ndarray
+        self, rows: Rows, relabelled: slice | np.ndarray, goal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns n-step reward, number of steps and ``terminated``, for the new goals where there are any."""
         ring = self.ring
@@ -198,8 +199,11 @@ class HerReplayBuffer:
 
 
 @cache
-def relabelled_positions(shape: tuple[int, ...], k: int) -> np.ndarray:
-    """Returns which of the flattened transitions of ``shape`` get a new goal: ``k / (k + 1)`` of each batch."""
+def relabelled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
+    """Returns which of the flattened transitions of ``shape`` get a new goal: the first ``k / (k + 1)`` of each batch."""
+    n = int(shape[-1] * k / (k + 1))
+    if math.prod(shape) == shape[-1]:
+        return slice(n)
     chosen = np.zeros(shape, bool)
-    chosen[..., : int(shape[-1] * k / (k + 1))] = True
+    chosen[..., :n] = True
     return np.flatnonzero(chosen)

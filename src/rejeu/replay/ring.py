@@ -11,7 +11,7 @@ Of stacked frames (``frame_stack``) a row holds the newest only, and the others 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -85,6 +85,9 @@ class Ring:
         """Steps kept, by environment: the rows that are not ``LAST`` and not the newest."""
         self.base = np.arange(n_envs, dtype=np.int64) * self.rows
         self.all_envs = np.arange(n_envs)
+        skeleton = self.tree(range(len(obs_leaves)))
+        is_flat = isinstance(skeleton, dict) and all(isinstance(part, int) for part in skeleton.values())
+        self._keys = list(skeleton) if is_flat else None
 
     def __len__(self) -> int:
         """Number of steps that can be sampled."""
@@ -134,7 +137,7 @@ class Ring:
 
     def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Returns the position in the arrays of rows given by environment and absolute time."""
-        return self.base[env] + time % self.rows
+        return time % self.rows if self.n_envs == 1 else self.base[env] + time % self.rows
 
     def oldest(self) -> np.ndarray:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
@@ -148,10 +151,10 @@ class Ring:
         Raises:
             ValueError: if there is none.
         """
-        if not len(self):
+        if not self.n_steps.any():
             raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
         rows = self._draw_rows(rng, n)
-        last = self.kind[self.index(*rows)] == LAST
+        last = self.kind.take(self.index(*rows)) == LAST
         while last.any():
             again = np.flatnonzero(last)
             redrawn = self._draw_rows(rng, len(again))
@@ -160,11 +163,12 @@ class Ring:
         return rows
 
     def _draw_rows(self, rng: np.random.Generator, n: int) -> Rows:
-        oldest = self.oldest()
         if self.n_envs == 1:
-            return Rows(np.zeros(n, np.int64), rng.integers(oldest[0], self.head[0], n))
-        ends = np.cumsum(np.maximum(self.head - oldest, 0))
-        ticket = rng.integers(ends[-1], size=n)
+            head = int(self.head[0])
+            oldest = max(head - self.rows + 1, 0)
+            return Rows(np.zeros(n, np.int64), oldest + (rng.random(n) * (head - oldest)).astype(np.int64))
+        ends = np.cumsum(np.maximum(self.head - self.oldest(), 0))
+        ticket = (rng.random(n) * ends[-1]).astype(np.int64)
         env = np.searchsorted(ends, ticket, side="right")
         return Rows(env, self.head[env] - 1 - (ends[env] - 1 - ticket))
 
@@ -188,7 +192,7 @@ class Ring:
         back = np.minimum(np.arange(self.frame_stack)[::-1], available[..., None])
         return self.base[env][..., None] + (slot[..., None] - back) % self.rows
 
-    def tree(self, obs_leaves: list[np.ndarray]) -> Any:
+    def tree(self, obs_leaves: Sequence[Any]) -> Any:
         """Returns observation leaves in the nesting of the environment's space."""
         return jax.tree.unflatten(self.obs_structure, obs_leaves)
 
@@ -218,7 +222,7 @@ class Ring:
         Raises:
             ValueError: if the older frames of a stack are not those of the rows before, so that it cannot be rebuilt.
         """
-        leaves = jax.tree.leaves(obs)
+        leaves = jax.tree.leaves(obs) if self._keys is None else [obs[key] for key in self._keys]
         for store, leaf, stacked in zip(self.obs, leaves, self.stacked, strict=True):
             store[index] = leaf[envs, -1] if stacked else leaf[envs]
         if self.frame_stack is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -44,11 +45,11 @@ class ReplayBuffer:
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
         """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances, ``progress`` anneals the weights."""
-        rows, weight = draw(self.ring, self.priorities, rng, int(np.prod(shape)), progress)
+        rows, weight = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
         index = self.ring.index(*rows)
         if self.n_steps == 1:
-            reward, terminated = self.ring.reward[index], self.ring.kind[index] == TERMINATED
-            steps = np.ones(1, np.int64)
+            reward, terminated = self.ring.reward.take(index), self.ring.kind.take(index) == TERMINATED
+            steps: int | np.ndarray = 1
         else:
             window = look_ahead(self.ring, rows, self.n_steps)
             reward = discounted_sum(self.ring.reward[window.position], window.valid, self.gamma)
@@ -56,7 +57,7 @@ class ReplayBuffer:
         following = self.ring.index(rows.env, rows.time + steps)
         obs, next_obs = self.ring.observation(index), self.ring.observation(following)
         discount = bootstrap_discount(self.gamma, steps, terminated)
-        return batch(self.ring, shape, obs, self.ring.action[index], reward, next_obs, discount, weight)
+        return batch(self.ring, shape, obs, self.ring.action.take(index, axis=0), reward, next_obs, discount, weight)
 
     def reprioritise(self, td_errors: list[Any]) -> None:
         """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
@@ -148,6 +149,6 @@ def discounted_sum(rewards: np.ndarray, valid: np.ndarray, gamma: float) -> np.n
     return (np.where(valid, rewards, 0.0) @ weights).astype(np.float32)
 
 
-def bootstrap_discount(gamma: float, steps: np.ndarray, terminated: np.ndarray) -> np.ndarray:
+def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
     """Returns ``gamma^steps``, and 0 where the MDP terminated, ``float32``."""
-    return (gamma**steps * ~terminated).astype(np.float32)
+    return np.where(terminated, 0.0, gamma**steps).astype(np.float32)
