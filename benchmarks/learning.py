@@ -2,9 +2,10 @@
 
     python benchmarks/learning.py Pendulum-v1 SAC --seeds 0 1 2 3 4
 
-trains as ``rejeu train`` does, without its evaluations on the way, and evaluates the last weights (``--best``: the best by
-smoothed training return) on 100 fresh episodes. The result is written to ``benchmarks/results/learning/ENV-ALGO.json``
-with the command, the versions and the hyper-parameters.
+trains as ``rejeu train`` does, without its evaluations on the way, and evaluates the last weights on 100 fresh episodes.
+With ``--best`` it is evaluated on the way, as often as the preset says and as ``rejeu train`` does, and the best weights by
+those evaluations are evaluated again, on fresh episodes. The result is written to
+``benchmarks/results/learning/ENV-ALGO.json`` with the command, the versions and the hyper-parameters.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scipy import stats
 
 import rejeu
 from rejeu import config as configs, presets
+from rejeu.callbacks import Evaluate
 from rejeu.envs import make_vector
 
 RESULTS = Path(__file__).parent / "results" / "learning"
@@ -37,10 +39,14 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     agent = rejeu.AGENTS[preset.algorithm](
         "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **preset.hyperparameters
     )
+    callback = None
+    if arguments.best:
+        test_env = make_vector(preset.env_id, 10, backend, seed + 2_000_000, **arguments.env)
+        callback = Evaluate(test_env, preset.evaluate_every, preset.evaluate_episodes)
     if arguments.minutes:
-        agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60)
+        agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60, callback=callback)
     else:
-        agent.learn(arguments.steps or preset.total_steps)
+        agent.learn(arguments.steps or preset.total_steps, callback=callback)
     seconds = time.perf_counter() - began
     if arguments.best:
         agent.restore_best()
@@ -69,7 +75,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--backend")
     parser.add_argument("--env", type=json.loads, default={}, help="arguments of the environment, as JSON")
-    parser.add_argument("--best", action="store_true", help="evaluate the best weights by smoothed training return")
+    parser.add_argument("--best", action="store_true", help="evaluate the best weights by evaluations on the way")
     parser.add_argument("--name", help="of the result file")
     arguments = parser.parse_args()
     preset = presets.find(arguments.env_id, arguments.algorithm)

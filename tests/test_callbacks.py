@@ -33,7 +33,7 @@ def scripted_agent(evaluations):
     """An agent whose evaluations are given, and which remembers what was saved."""
     remaining = deque(evaluations)
     saved = []
-    agent = SimpleNamespace(env=None, n_envs=1, saved=saved, save=saved.append)
+    agent = SimpleNamespace(env=None, n_envs=1, saved=saved, save=saved.append, remember_best=lambda score, by: True)
     agent.evaluate = lambda episodes, env: remaining.popleft()
     return agent
 
@@ -201,3 +201,44 @@ def test_a_progress_bar_that_never_began_closes_silently():
 def test_learn_shows_progress_when_asked(capsys):
     pendulum().learn(30, progress_bar=True)
     assert "30/30 steps" in capsys.readouterr().out
+
+
+class Turning(gym.Env):
+    """Wants the action 1, and after ``turn`` steps the action -1: what was learnt first is then unlearnt."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, turn=math.inf):
+        self.turn, self.taken = turn, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.taken += 1
+        wanted = 1.0 if self.taken <= self.turn else -1.0
+        return np.zeros(1, np.float32), -float((action[0] - wanted) ** 2), True, False, {}
+
+
+def test_an_agent_that_improves_and_then_cracks_is_restored_to_its_best():
+    evaluate = Evaluate(Turning, every=100, episodes=1, seed=0)
+    agent = rejeu.SAC(
+        "MlpPolicy",
+        Turning(turn=600),
+        policy_kwargs={"net_arch": [16]},
+        learning_rate=1e-2,
+        batch_size=32,
+        buffer_size=200,
+        learning_starts=50,
+        ent_coef=0.01,
+        seed=0,
+    ).learn(1500, callback=evaluate)
+    score = lambda: agent.evaluate(1, env=Turning()).mean_return  # noqa: E731
+    best, cracked = max(result.evaluation.mean_return for result in evaluate.results), score()
+    assert best > -0.1
+    assert cracked < -2.0
+    agent.restore_best()
+    assert score() == pytest.approx(best, abs=1e-6)
+    assert agent.best.step == evaluate.best.step <= 700

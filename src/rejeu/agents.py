@@ -64,8 +64,8 @@ BEST_WINDOW = 20
 class Best(NamedTuple):
     """The best weights of a run so far."""
 
-    score: float
-    """Mean return, or whatever an evaluation was judged by."""
+    score: float | tuple[float, ...]
+    """Mean training return, or what evaluations are judged by: success rate and mean return."""
     by: str
     """``"training"`` or ``"evaluation"``."""
     step: int
@@ -333,13 +333,14 @@ class Agent:
         if len(returns) >= BEST_WINDOW and (self.best is None or self.best.by == "training"):
             self.remember_best(float(np.mean(returns[-BEST_WINDOW:])), "training")
 
-    def remember_best(self, score: float, by: str = "evaluation") -> bool:
+    def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
         """Keeps the present weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
 
-        ``learn`` calls it with the mean return of the last 20 training episodes; once it was called with the score of an
-        evaluation, evaluations alone count.
+        ``learn`` calls it with the mean return of the last 20 training episodes, :class:`rejeu.callbacks.Evaluate` with
+        success rate and mean return; once it was called with the score of an evaluation, evaluations alone count.
+        Scores of one kind must compare with each other.
         """
-        if self.best is not None and self.best.by == by and score <= self.best.score:
+        if self.best is not None and self.best.by == by and score <= self.best.score:  # type: ignore[operator]
             return False
         self.best = Best(score, by, self._run.step, self._compiled.copy(self._run.state))
         return True

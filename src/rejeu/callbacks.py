@@ -48,6 +48,8 @@ class Evaluated(NamedTuple):
 class Evaluate:
     """Evaluates the deterministic policy every so many steps, on environments of its own, and keeps the best model.
 
+    ``agent.restore_best()`` puts the best weights back.
+
     >>> import rejeu
     >>> evaluate = Evaluate("Pendulum-v1", every=200, episodes=2, seed=0)
     >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", learning_starts=400, seed=0).learn(400, evaluate)
@@ -106,6 +108,7 @@ class Evaluate:
         is_best = self.best is None or better(result.evaluation, self.best.evaluation)
         if is_best:
             self.best = result
+            agent.remember_best(merit(result.evaluation), "evaluation")
             if self.best_path is not None:
                 agent.save(self.best_path)
         if self.report is not None:
@@ -295,7 +298,7 @@ def better(evaluation: Evaluation, other: Evaluation) -> bool:
 
     An unknown success rate counts as none, so where the environment does not say, the return decides.
     """
-    return _merit(evaluation) > _merit(other)
+    return merit(evaluation) > merit(other)
 
 
 def crossed(before: int, now: int, every: int) -> bool:
@@ -313,7 +316,8 @@ def step_before(agent: Agent, progress: Progress, n_steps: int | None = None) ->
     return max(progress.step - taken, 0)
 
 
-def _merit(evaluation: Evaluation) -> tuple[float, float]:
+def merit(evaluation: Evaluation) -> tuple[float, float]:
+    """Returns what evaluations are compared by: success rate, -1 where it is unknown, and mean return."""
     rate = evaluation.success_rate
     return (-1.0 if math.isnan(rate) else rate), evaluation.mean_return
 
