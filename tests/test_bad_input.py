@@ -49,7 +49,7 @@ MISTAKES = {
     "binary actions": (
         sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.MultiBinary(2))),
         ValueError,
-        r"SAC needs .* action space, got MultiBinary\(2\); .*use",
+        r"SAC needs .* action space, got MultiBinary\(2\); .*ActionWrapper",
     ),
     "text observation": (sac(Sampled(gym.spaces.Text(5))), TypeError, "observation space is Text.* expected Box"),
     "HER without desired_goal": (

@@ -12,6 +12,7 @@ from rejeu.envs.vector import make_vector
 from rejeu.errors import CheckpointError, MissingExtra
 from rejeu.evaluation import Evaluation, evaluate_policy
 from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.replay.hindsight import GoalSelectionStrategy, HerReplayBuffer
 from rejeu.replay.uniform import ReplayBuffer
 from rejeu.schedules import Exponential, Linear
@@ -38,6 +39,7 @@ __all__ = [
     "Monitor",
     "NormalActionNoise",
     "OrnsteinUhlenbeckActionNoise",
+    "ParameterNoise",
     "ReplayBuffer",
     "evaluate_policy",
     "load",

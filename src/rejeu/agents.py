@@ -296,7 +296,7 @@ class Agent:
             with Interrupt() as interrupt:
                 for turn in host.off_policy(self._run, self._compiled, self.config, n_steps, progress):
                     elapsed = time.perf_counter() - began
-                    self.steps_per_second = (turn.step - first) / elapsed
+                    self.steps_per_second = (turn.step - first) / max(elapsed, 1e-9)
                     for episode in turn.episodes:
                         self._record(episode)
                     if len(self.history) - logged >= log_interval and outputs:

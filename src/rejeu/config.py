@@ -78,6 +78,8 @@ class OffPolicyConfig:
     def __post_init__(self) -> None:
         put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
         put("learning_rate", schedules.parse("learning_rate", self.learning_rate))
+        if min(schedules.at(self.learning_rate, 0.0), schedules.at(self.learning_rate, 1.0)) < 0:
+            raise ValueError(f"learning_rate={self.learning_rate!r} must not fall below 0: the agent would unlearn")
         for key in ("buffer_size", "batch_size"):
             put(key, whole(key, getattr(self, key), least=1))
         put("learning_starts", whole("learning_starts", self.learning_starts, least=0))

@@ -134,15 +134,21 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
         ValueError: otherwise, naming what to use instead.
     """
     if not isinstance(space, spaces.Box):
-        instead = "DQN or PPO" if isinstance(space, spaces.Discrete) else "PPO"
-        raise ValueError(f"{algorithm} needs a Box action space, got {space}; for this environment use {instead}")
+        instead = (
+            "for this environment use DQN"
+            if isinstance(space, spaces.Discrete)
+            else "wrap the environment in a gymnasium.ActionWrapper with a Box action space"
+        )
+        raise ValueError(f"{algorithm} needs a Box action space, got {space}; {instead}")
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise ValueError(
-            f"{algorithm} needs finite action bounds, got low={space.low}, high={space.high}; "
+            f"{algorithm} needs finite action bounds, got low={space.low.tolist()}, high={space.high.tolist()}; "
             "wrap the environment with gymnasium.wrappers.RescaleAction or declare the bounds it really has"
         )
     if not (space.high > space.low).all():
-        raise ValueError(f"every action bound must satisfy low < high, got low={space.low}, high={space.high}")
+        raise ValueError(
+            f"every action bound must satisfy low < high, got low={space.low.tolist()}, high={space.high.tolist()}"
+        )
     return space
 
 
@@ -209,7 +215,7 @@ def describe(space: spaces.Space) -> Any:
                 "low": _bounds(space.low),
                 "high": _bounds(space.high),
                 "shape": list(space.shape),
-                "dtype": narrow(space.dtype),
+                "dtype": np.dtype(space.dtype).name if np.dtype(space.dtype).kind == "f" else narrow(space.dtype),
             }
         }
     if isinstance(space, spaces.Discrete):

@@ -86,3 +86,13 @@ class BySightAndAction(Probe):
 
     def earn(self, action: float) -> float:
         return 1.0 - 4.0 * (action - 1.0 - 0.5 * self.sign) ** 2
+
+
+class Discretely(gym.ActionWrapper):
+    """A probe with the actions 1, 2 and 3, which stand for 0.5, 1 and 1.5: the best action is one of them."""
+
+    action_space = gym.spaces.Discrete(3, start=1)
+
+    def action(self, action: Any) -> np.ndarray:
+        assert self.action_space.contains(action), action
+        return np.float32([action / 2.0])

@@ -299,8 +299,12 @@ def check_discrete_action(space: spaces.Space, algorithm: str) -> int:
         ValueError: for another space, naming what to use instead.
     """
     if not isinstance(space, spaces.Discrete):
-        instead = "SAC, TD3 or PPO" if isinstance(space, spaces.Box) else "PPO"
-        raise ValueError(f"{algorithm} needs a Discrete action space, got {space}; for this environment use {instead}")
+        instead = (
+            "for this environment use SAC or TD3"
+            if isinstance(space, spaces.Box)
+            else "wrap the environment in a gymnasium.ActionWrapper with a Discrete action space"
+        )
+        raise ValueError(f"{algorithm} needs a Discrete action space, got {space}; {instead}")
     return int(space.n)
 
 

@@ -33,7 +33,7 @@ PRESETS = (
         evaluate_episodes=20,
         backend="gymnasium",
         source="RL Baselines3 Zoo, hyperparams/ddpg.yml, with smaller networks and batches",
-        result="",
+        result="mean return -159.1 over 5 seeds (95 % interval -162.4 to -155.9), 100 episodes each",
     ),
     Preset(
         env_id="Pendulum-v1",
@@ -52,7 +52,7 @@ PRESETS = (
         evaluate_episodes=20,
         backend="gymnasium",
         source="RL Baselines3 Zoo, hyperparams/td3.yml, with smaller networks and batches",
-        result="",
+        result="mean return -153.3 over 5 seeds (95 % interval -155.3 to -151.3), 100 episodes each",
     ),
     Preset(
         env_id="Pendulum-v1",
@@ -64,19 +64,24 @@ PRESETS = (
         evaluate_episodes=20,
         backend="gymnasium",
         source="RL Baselines3 Zoo, hyperparams/tqc.yml, with smaller networks and batches",
-        result="",
+        result="mean return -152.0 over 5 seeds (95 % interval -155.0 to -149.1), 100 episodes each",
     ),
     Preset(
         env_id="Pendulum-v1",
         algorithm="CrossQ",
-        hyperparameters={"policy_delay": 2, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}},
+        hyperparameters={
+            "learning_rate": "lin_1e-3",
+            "policy_delay": 2,
+            "batch_size": 64,
+            "policy_kwargs": {"net_arch": [64, 64]},
+        },
         n_envs=1,
         total_steps=20_000,
         evaluate_every=2_000,
         evaluate_episodes=20,
         backend="gymnasium",
-        source="RL Baselines3 Zoo, hyperparams/crossq.yml, with smaller networks and batches",
-        result="",
+        source="RL Baselines3 Zoo, hyperparams/crossq.yml, with smaller networks and batches, and a learning rate that falls",
+        result="mean return -154.6 over 5 seeds (95 % interval -157.6 to -151.6), 100 episodes each",
     ),
     Preset(
         env_id="CartPole-v1",
@@ -98,7 +103,7 @@ PRESETS = (
         evaluate_every=2_500,
         evaluate_episodes=20,
         source="rejeu's own tuning, from RL Baselines3 Zoo, hyperparams/dqn.yml",
-        result="",
+        result="mean return 500 on each of 5 seeds, 100 episodes each, with the best weights by evaluation",
     ),
     # One environment, not several: the flag is first found by chance, and in our tuning runs with one environment found it
     # where most of those with four, under similar settings, never did.
@@ -125,6 +130,6 @@ PRESETS = (
         evaluate_every=5_000,
         evaluate_episodes=50,
         source="rejeu's own tuning, from RL Baselines3 Zoo, hyperparams/dqn.yml",
-        result="",
+        result="mean return -103.4 over 5 seeds (95 % interval -109.3 to -97.5), 100 episodes each",
     ),
 )

@@ -28,7 +28,7 @@ PRESETS = (
         evaluate_every=2_000,
         evaluate_episodes=100,
         source=SOURCE.format("sac"),
-        result="",
+        result="success 100, 100 and 100 % on seeds 0 to 2, 100 episodes each",
     ),
     Preset(
         env_id="FetchReach-v4",
@@ -39,6 +39,6 @@ PRESETS = (
         evaluate_every=2_000,
         evaluate_episodes=100,
         source=SOURCE.format("tqc"),
-        result="",
+        result="success 95, 100 and 100 % on seeds 0 to 2, 100 episodes each",
     ),
 )

@@ -1,0 +1,89 @@
+"""Networks, gradients and Adam in float64 NumPy, knowing nothing of JAX: what whole updates are checked against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Layers = list[list[np.ndarray]]
+"""Weight ``(n_inputs, n_outputs)`` and bias of each layer."""
+
+
+def layers(network: Any, index: Any = ...) -> Layers:
+    """Copies the weights of a plain network, or of its optimizer's moments; ``index`` picks one of an ensemble."""
+    parts = [*network.torso.layers, network.head]
+    return [[np.array(np.float64(part.weight)[index]), np.array(np.float64(part.bias)[index])] for part in parts]
+
+
+def forward(network: Layers, x: Any) -> np.ndarray:
+    """What comes out of layers with a relu between them, ``(batch, n_outputs)``."""
+    x = np.float64(x)
+    for weight, bias in network[:-1]:
+        x = np.maximum(x @ weight + bias, 0.0)
+    return x @ network[-1][0] + network[-1][1]
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    """Probabilities, ``(batch, n)``."""
+    powers = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return powers / powers.sum(axis=1, keepdims=True)
+
+
+def gradient(network: Layers, loss: Callable[[], float], width: float = 1e-6) -> Layers:
+    """Central differences of ``loss()``, which reads ``network``, in the direction of every weight."""
+    slopes = [[np.zeros_like(array) for array in layer] for layer in network]
+    for layer, slope in zip(network, slopes, strict=True):
+        for array, along in zip(layer, slope, strict=True):
+            for i in np.ndindex(array.shape):
+                kept = array[i]
+                array[i] = kept + width
+                above = loss()
+                array[i] = kept - width
+                along[i] = (above - loss()) / (2.0 * width)
+                array[i] = kept
+    return slopes
+
+
+class Adam:
+    """Adam as its authors write it (Kingma and Ba 2015, algorithm 1), on ``network`` in place."""
+
+    def __init__(self, network: Layers, rate: float, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8) -> None:
+        self.network, self.rate, self.b1, self.b2, self.eps = network, rate, b1, b2, eps
+        self.first, self.second = ([[np.zeros_like(array) for array in layer] for layer in network] for _ in range(2))
+        self.t = 0
+
+    def step(self, slopes: Layers) -> None:
+        """Moves the network one step against ``slopes``."""
+        self.t += 1
+        for layer, slope, m, v in zip(self.network, slopes, self.first, self.second, strict=True):
+            for i, g in enumerate(slope):
+                m[i] = self.b1 * m[i] + (1.0 - self.b1) * g
+                v[i] = self.b2 * v[i] + (1.0 - self.b2) * g**2
+                corrected = m[i] / (1.0 - self.b1**self.t), v[i] / (1.0 - self.b2**self.t)
+                layer[i][...] = layer[i] - self.rate * corrected[0] / (np.sqrt(corrected[1]) + self.eps)
+
+    def descend(self, loss: Callable[[], float]) -> None:
+        """Moves the network one step against the gradient of ``loss()``, which reads it."""
+        self.step(gradient(self.network, loss))
+
+
+def follow(target: Layers, online: Layers, tau: float) -> None:
+    """Moves ``target`` by the share ``tau`` towards ``online``, in place."""
+    for target_layer, online_layer in zip(target, online, strict=True):
+        for t, o in zip(target_layer, online_layer, strict=True):
+            t[...] = (1.0 - tau) * t + tau * o
+
+
+def assert_equal_layers(given: Layers, expected: Layers, what: str, atol: float = 2e-5, rtol: float = 0.0) -> None:
+    """Fails unless all weights and biases agree."""
+    for i, (one, two) in enumerate(zip(given, expected, strict=True)):
+        for kind, a, b in zip(("weight", "bias"), one, two, strict=True):
+            np.testing.assert_allclose(a, b, atol=atol, rtol=rtol, err_msg=f"{what}: {kind} {i}")
+
+
+def largest_difference(one: Layers, two: Layers) -> float:
+    """The largest difference between any two corresponding numbers."""
+    pairs = zip(one, two, strict=True)
+    return max(float(np.abs(a - b).max()) for p, q in pairs for a, b in zip(p, q, strict=True))
