@@ -25,7 +25,7 @@ PRESETS = tuple(
         result="",
     )
     for algorithm, extra in (
-        ("SAC", {}),
+        ("SAC", {"target_entropy": -6.0}),
         ("DDPG", {"action_noise": {"noise": "normal", "mean": [0.0, 0.0], "sigma": [0.2, 0.2]}}),
     )
 )

@@ -23,6 +23,6 @@ PRESETS = (
         evaluate_every=10_000,
         evaluate_episodes=100,
         source="rejeu's own tuning, from the hyper-parameters of highway-env's parking notebook",
-        result="success 100, 100 and 97 % (seeds 0 to 2) in 200 episodes each of highway-env's own parking-v0",
+        result="success 98, 98 and 99.5 % (seeds 0 to 2) in 200 episodes each of highway-env's own parking-v0",
     ),
 )
