@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from rejeu.presets.preset import Preset
 
+RESULT = "after one minute, seeds 0 to 2, of 200 episodes each held: {} % with sigma 1, {} % with sigma 2"
+
 PRESETS = tuple(
     Preset(
         env_id="rejeu/Ball-v0",
@@ -22,10 +24,14 @@ PRESETS = tuple(
         evaluate_episodes=50,
         backend="gymnasium",
         source="rejeu's own tuning",
-        result="",
+        result=result,
     )
-    for algorithm, extra in (
-        ("SAC", {"target_entropy": -6.0}),
-        ("DDPG", {"action_noise": {"noise": "normal", "mean": [0.0, 0.0], "sigma": [0.2, 0.2]}}),
+    for algorithm, extra, result in (
+        ("SAC", {"target_entropy": -6.0}, RESULT.format("99.5, 100 and 100", "75.5, 81.5 and 76")),
+        (
+            "DDPG",
+            {"action_noise": {"noise": "normal", "mean": [0.0, 0.0], "sigma": [0.2, 0.2]}},
+            RESULT.format("100, 100 and 100", "78, 76.5 and 81.5"),
+        ),
     )
 )
