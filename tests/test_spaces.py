@@ -233,3 +233,11 @@ def test_observation_bounds_do_not_tell_spaces_apart_and_action_bounds_do():
     assert not spaces.same(one, two, bounds=True)
     assert not spaces.same(one, gym_spaces.Box(-1.0, 1.0, (3,)), bounds=False)
     assert not spaces.same(gym_spaces.Dict({"a": BOX}), gym_spaces.Dict({"b": BOX}), bounds=False)
+
+
+def test_flat_keys_are_those_of_dicts_of_arrays_alone():
+    box = gym_spaces.Box(-1.0, 1.0, (2,))
+    flat = gym_spaces.Dict({"z": box, "a.b": gym_spaces.Discrete(3), "m": box})
+    assert spaces.flat_keys(spaces.structure(flat)) == [leaf.path for leaf in spaces.leaves(flat)] == ["a.b", "m", "z"]
+    for other in (box, gym_spaces.Tuple([box]), gym_spaces.Dict({"a": gym_spaces.Dict({"b": box})})):
+        assert spaces.flat_keys(spaces.structure(other)) is None

@@ -19,7 +19,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from rejeu.envs import goals as goals_module
 from rejeu.envs.registry import make_env, maker, provider, register, unknown_environment
 from rejeu.replay.hindsight import GoalFunctions
-from rejeu.spaces import cast, leaves, plain, structure
+from rejeu.spaces import cast, flat_keys, leaves, plain, structure
 
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
@@ -167,7 +167,7 @@ class InProcess(VectorEnv):
         stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
         self._stores = stores
         self._plain = isinstance(self.observation_space, gym.spaces.Box)
-        self._keys = box_keys(self.observation_space)
+        self._keys = flat_keys(structure(self.observation_space))
         self._obs = jax.tree.unflatten(structure(self.observation_space), stores)
 
     def reset(self, seed: int | None = None) -> Any:
@@ -214,13 +214,6 @@ class InProcess(VectorEnv):
             return
         for store, part in zip(self._stores, jax.tree.leaves(plain(self.observation_space, obs)), strict=True):
             store[i] = part
-
-
-def box_keys(space: gym.Space) -> list[str] | None:
-    """Returns the keys of a Dict of Boxes in the order of :func:`rejeu.spaces.leaves`; None for any other space."""
-    if isinstance(space, gym.spaces.Dict) and all(isinstance(part, gym.spaces.Box) for part in space.values()):
-        return sorted(space.spaces)
-    return None
 
 
 class GymnasiumVector(VectorEnv):

@@ -69,9 +69,9 @@ class Packing:
 class Readings(Mapping[str, Array]):
     """Named scalars that are on the device as one vector; reading one waits for it."""
 
-    def __init__(self, names: tuple[str, ...], values: Array) -> None:
+    def __init__(self, names: tuple[str, ...], vector: Array) -> None:
         self.names = names
-        self.vector = values
+        self.vector = vector
 
     @classmethod
     def of(cls, scalars: Mapping[str, Array]) -> Readings:

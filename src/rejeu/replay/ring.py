@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rejeu.spaces import Leaf
+from rejeu.spaces import Leaf, flat_keys
 
 STEP, TERMINATED, LAST = 0, 1, 2
 """Kinds of row: an ordinary step, a step into a terminal state of the MDP, a final observation without a step."""
@@ -85,9 +85,7 @@ class Ring:
         """Steps kept, by environment: the rows that are not ``LAST`` and not the newest."""
         self.base = np.arange(n_envs, dtype=np.int64) * self.rows
         self.all_envs = np.arange(n_envs)
-        skeleton = self.tree(range(len(obs_leaves)))
-        is_flat = isinstance(skeleton, dict) and all(isinstance(part, int) for part in skeleton.values())
-        self._keys = list(skeleton) if is_flat else None
+        self._keys = flat_keys(obs_structure)
 
     def __len__(self) -> int:
         """Number of steps that can be sampled."""
