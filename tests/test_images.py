@@ -167,7 +167,7 @@ def test_stacks_whose_frames_are_all_kept_are_exact():
     for env in range(n_envs):
         oldest = history.oldest(env)
         for place in range(oldest, len(history.starts[env])):
-            (camera, _) = ring.observation(ring.index(np.array(env), np.array(place)))
+            _, (camera, _) = ring.read(ring.index(np.array(env), np.array(place)))
             kept = min(place - history.starts[env][place], stack - 1) <= place - oldest
             assert kept == np.array_equal(camera, history.seen(env, place))
             exact += kept
@@ -295,15 +295,16 @@ def test_goals_are_never_taken_for_stacks():
 def test_the_bytes_of_a_ring_are_told(frame_stack):
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
     ring = Ring(100, 2, leaves(space), structure(space), (2,), np.float32, frame_stack)
-    # Per row: the frames; two actions and a reward of 4 bytes; the kind; the steps since the start and until the end.
+    # Per row: the frames; two actions and a reward of 4 bytes; the kind; the steps since the start and until the end;
+    # and 3 bytes so that the next row's numbers begin at a multiple of 4.
     frames = 4 if frame_stack is None else 1
-    assert ring.nbytes == 100 * (frames * 84 * 84 + 2 * 4 + 4 + 1 + 2 * 4)
+    assert ring.nbytes == 100 * (frames * 84 * 84 + 2 * 4 + 4 + 1 + 2 * 4 + 3)
 
 
 def test_a_buffer_that_memory_cannot_hold_is_refused_before_anything_is_reserved(monkeypatch):
     monkeypatch.setattr("os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**20}[name])  # 4 GiB
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
-    per_row = 84 * 84 + 4 + 4 + 1 + 8
+    per_row = 84 * 84 + 4 + 4 + 1 + 8 + 3
     tracemalloc.start()
     try:
         with pytest.raises(MemoryError) as refused:

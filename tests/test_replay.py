@@ -145,7 +145,8 @@ def test_an_empty_buffer_says_that_it_is_empty():
 def test_capacity_is_shared_among_environments():
     ring = make_ring(10, 3)
     assert ring.rows == 3
-    assert ring.nbytes == sum(a.nbytes for a in (*ring.obs, ring.action, ring.reward, ring.kind)) + 9 * 8
+    needed = sum(a.nbytes for a in (*ring.obs, ring.action, ring.reward, ring.kind)) + 9 * 8
+    assert needed <= ring.nbytes < needed + 9 * 8, "a row takes what it holds, and less than 8 bytes of alignment"
 
 
 def test_memory_beyond_the_machine_is_refused_with_the_numbers():

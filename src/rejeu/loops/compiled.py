@@ -31,7 +31,7 @@ class Compiled:
         self.shapes = jax.eval_shape(algorithm.init, jax.ShapeDtypeStruct((2,), jnp.uint32))
         """The state, of shapes in place of arrays."""
         packing = Packing(self.shapes)
-        self._packer = HostPacker()
+        self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
 
         @jax.jit
@@ -82,11 +82,11 @@ class Compiled:
 
         ``ended``, ``bool (n_envs,)``, is where an episode has just begun.
         """
-        return self._act(state, carry, key, *self._packer((obs, ended, clock)))
+        return self._act(state, carry, key, *self._act_packer((obs, ended, clock), len(ended)))
 
     def exploit(self, state: PackedState, obs: PyTree) -> Array:
         """Returns the deterministic actions for ``obs`` ``(batch, ...)``."""
-        return self._exploit(state, *self._packer(obs))
+        return self._exploit(state, *self._exploit_packer(obs, len(jax.tree.leaves(obs)[0])))
 
     def update(
         self, state: PackedState, batches: Transition, clock: Clock
@@ -96,7 +96,9 @@ class Compiled:
         Returns the packed state, whose predecessor is donated, the metrics, means over the steps, and the absolute TD
         errors ``(steps, batch)``, which are None unless the batches are weighted.
         """
-        return self._update(state, *self._packer((batches, clock)))
+        return self._update(
+            state, *self._update_packer((batches, clock), (batches.reward.shape, batches.weight is None))
+        )
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""

@@ -8,7 +8,7 @@ batch with its clock some ten; packed, they are five. Inside the compiled code t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -98,16 +98,17 @@ class Readings(Mapping[str, Array]):
 
 
 class HostPacker:
-    """Packs trees of NumPy arrays, planning once for each kind of tree that it meets."""
+    """Packs trees of NumPy arrays, planning once for each size of tree that it meets."""
 
     def __init__(self) -> None:
         self._plans: dict[Any, Packing] = {}
 
-    def __call__(self, tree: PyTree) -> tuple[list[np.ndarray], Packing]:
-        """Returns the vectors of ``tree`` and the plan to unpack them by."""
-        leaves, structure = jax.tree.flatten(tree)
-        kind = (structure, *[(leaf.shape, leaf.dtype) for leaf in leaves])
-        plan = self._plans.get(kind)
+    def __call__(self, tree: PyTree, size: Hashable) -> tuple[list[np.ndarray], Packing]:
+        """Returns the vectors of ``tree`` and the plan to unpack them by.
+
+        Trees of one ``size`` must have the same structure, shapes and dtypes: comparing them takes longer than packing.
+        """
+        plan = self._plans.get(size)
         if plan is None:
-            plan = self._plans[kind] = Packing(tree)
-        return plan.pack_leaves(leaves), plan
+            plan = self._plans[size] = Packing(tree)
+        return plan.pack_leaves(jax.tree.leaves(tree)), plan

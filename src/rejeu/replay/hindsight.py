@@ -124,48 +124,52 @@ class HerReplayBuffer:
         ring, k = self.ring, self.config.n_sampled_goal
         rows, weight = draw(ring, self.priorities, rng, math.prod(shape), progress)
         index = ring.index(*rows)
+        step, obs = ring.read(index)
         relabelled = relabelled_positions(shape, k)
 
         relabelled_rows = Rows(rows.env[relabelled], rows.time[relabelled])
-        goal = ring.obs[self.achieved].take(self._goal_index(rng, relabelled_rows, index[relabelled]), axis=0)
+        goal_index = self._goal_index(rng, relabelled_rows, step[relabelled])
+        goal = ring.read(goal_index)[1][self.achieved]
         if self.n_steps == 1:
-            reward, terminated = ring.reward.take(index), ring.kind.take(index) == TERMINATED
-            steps: int | np.ndarray = 1
+            following = ring.index(rows.env, rows.time + 1)
+        else:
+            reward, steps, terminated = self._n_step(rows, relabelled, goal)
             following = ring.index(rows.env, rows.time + steps)
-            reached = ring.obs[self.achieved].take(following[relabelled], axis=0)
+        _, next_obs = ring.read(following)
+        if self.n_steps == 1:
+            reward, terminated, steps = step["reward"], step["kind"] == TERMINATED, 1
+            reached = next_obs[self.achieved][relabelled]
             if len(goal):
                 reward[relabelled] = self.goals.reward(reached, goal)
                 if self.goals.terminated is not None:
                     terminated[relabelled] = self.goals.terminated(reached, goal)
-        else:
-            reward, steps, terminated = self._n_step(rows, relabelled, goal)
-            following = ring.index(rows.env, rows.time + steps)
-
-        obs, next_obs = ring.observation(index), ring.observation(following)
         obs[self.desired][relabelled] = goal
         next_obs[self.desired][relabelled] = goal
         discount = bootstrap_discount(self.gamma, steps, terminated)
-        return batch(ring, shape, obs, ring.action.take(index, axis=0), reward, next_obs, discount, weight)
+        return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight)
 
     def reprioritise(self, td_errors: list[Any]) -> None:
         """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
         if self.priorities is not None:
             self.priorities.update(td_errors)
 
-    def _goal_index(self, rng: np.random.Generator, rows: Rows, index: np.ndarray) -> np.ndarray:
-        """Returns where in the ring the new goals of ``rows`` stand: observations after a step, by the strategy."""
+    def _goal_index(self, rng: np.random.Generator, rows: Rows, step: np.ndarray) -> np.ndarray:
+        """Returns where in the ring the new goals of ``rows`` stand: observations after a step, by the strategy.
+
+        ``step`` is what the ring holds of them, records ``(n,)``.
+        """
         ring, strategy = self.ring, self.config.goal_selection_strategy
         if strategy == "random":
-            other = ring.draw(rng, len(index))
+            other = ring.draw(rng, len(step))
             return ring.index(other.env, other.time + 1)
-        until_end = ring.until_end.take(index)
-        end = np.where(until_end >= 0, rows.time + until_end, ring.head[rows.env])
+        until_end = step["until_end"]
+        end = np.where(until_end > 0, rows.time + until_end, ring.head[rows.env])
         if strategy == "final":
             return ring.index(rows.env, end)
         if strategy == "future":
             first = rows.time + 1
         else:
-            first = np.maximum(rows.time - ring.since_start[index], ring.oldest()[rows.env]) + 1
+            first = np.maximum(rows.time - step["since_start"], ring.oldest()[rows.env]) + 1
         return ring.index(rows.env, first + (rng.random(len(end)) * (end + 1 - first)).astype(np.int64))
 
     def _n_step(

@@ -10,7 +10,6 @@ Of stacked frames (``frame_stack``) a row holds the newest only, and the others 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -63,22 +62,26 @@ class Ring:
                 f"frame_stack={frame_stack} needs uint8 observations ({frame_stack}, height, width[, channels]), got "
                 f"{given}; wrap the environment with gymnasium.wrappers.FrameStackObservation(env, {frame_stack})"
             )
-        per_row = 4 + 1 + 8
-        shapes = []
-        for leaf, stacked in zip(obs_leaves, self.stacked, strict=True):
-            shapes.append(leaf.shape[1:] if stacked else leaf.shape)
-            per_row += leaf.nbytes // (leaf.shape[0] if stacked else 1)
-        per_row += math.prod(action_shape) * np.dtype(action_dtype).itemsize
-        check_memory(per_row * self.rows * n_envs, capacity)
+        fields: list[tuple[Any, ...]] = [("reward", np.float32), ("since_start", np.int32), ("until_end", np.int32)]
+        fields.append(("action", action_dtype, action_shape))
+        fields += [(f"obs.{i}", leaf.dtype, leaf.shape) for i, leaf in enumerate(obs_leaves) if not self.stacked[i]]
+        record = np.dtype([*fields, ("kind", np.uint8)], align=True)
+        frames = [leaf.nbytes // leaf.shape[0] for leaf, is_ in zip(obs_leaves, self.stacked, strict=True) if is_]
         n = self.rows * n_envs
-        self.obs = [np.zeros((n, *shape), leaf.dtype) for leaf, shape in zip(obs_leaves, shapes, strict=True)]
-        self.action = np.zeros((n, *action_shape), action_dtype)
-        self.reward = np.zeros(n, np.float32)
-        self.kind = np.zeros(n, np.uint8)
-        self.since_start = np.zeros(n, np.int32)
+        check_memory((record.itemsize + sum(frames)) * n, capacity)
+        self.records = np.zeros(n, record)
+        """The rows, all that belongs to one side by side in memory; what follows are views of them, and stacked frames."""
+        self.obs = [
+            np.zeros((n, *leaf.shape[1:]), leaf.dtype) if self.stacked[i] else self.records[f"obs.{i}"]
+            for i, leaf in enumerate(obs_leaves)
+        ]
+        self.action = self.records["action"]
+        self.reward = self.records["reward"]
+        self.kind = self.records["kind"]
+        self.since_start = self.records["since_start"]
         """Steps since the row's episode began."""
-        self.until_end = np.full(n, -1, np.int32)
-        """Steps until the ``LAST`` row of the row's episode; -1 while it runs."""
+        self.until_end = self.records["until_end"]
+        """Steps from the row to the ``LAST`` row of its episode; 0 while the episode runs, and in the ``LAST`` row."""
         self.head = np.full(n_envs, -1, np.int64)
         """Absolute time of each environment's newest row; -1 before the first."""
         self.n_steps = np.zeros(n_envs, np.int64)
@@ -86,6 +89,7 @@ class Ring:
         self.base = np.arange(n_envs, dtype=np.int64) * self.rows
         self.all_envs = np.arange(n_envs)
         self._keys = flat_keys(obs_structure)
+        self._names = [f"obs.{i}" for i in range(len(obs_leaves))]
 
     def __len__(self) -> int:
         """Number of steps that can be sampled."""
@@ -94,8 +98,8 @@ class Ring:
     @property
     def nbytes(self) -> int:
         """Bytes reserved."""
-        arrays = [*self.obs, self.action, self.reward, self.kind, self.since_start, self.until_end]
-        return sum(array.nbytes for array in arrays)
+        stacks = [array for array, stacked in zip(self.obs, self.stacked, strict=True) if stacked]
+        return self.records.nbytes + sum(array.nbytes for array in stacks)
 
     def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
         """Starts an episode with ``obs`` ``(n_envs, ...)`` in the environments ``envs`` (indices; None: all).
@@ -122,11 +126,14 @@ class Ring:
 
         Returns the positions of the steps and of the rows after them.
         """
-        envs = self.all_envs if envs is None else envs
+        if envs is None:
+            envs = self.all_envs
+        else:
+            action, reward, terminated = action[envs], reward[envs], terminated[envs]
         index = self.index(envs, self.head[envs])
-        self.action[index] = action[envs]
-        self.reward[index] = reward[envs]
-        self.kind[index] = terminated[envs]
+        self.action[index] = action
+        self.reward[index] = reward
+        self.kind[index] = terminated
         following = self._advance(envs)
         self.n_steps[envs] += 1
         self.since_start[following] = self.since_start[index] + 1
@@ -149,10 +156,10 @@ class Ring:
         Raises:
             ValueError: if there is none.
         """
-        if not self.n_steps.any():
+        if not np.count_nonzero(self.n_steps):
             raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
         rows = self._draw_rows(rng, n)
-        last = self.kind.take(self.index(*rows)) == LAST
+        last = self.kind[self.index(*rows)] == LAST
         while last.any():
             again = np.flatnonzero(last)
             redrawn = self._draw_rows(rng, len(again))
@@ -170,15 +177,19 @@ class Ring:
         env = np.searchsorted(ends, ticket, side="right")
         return Rows(env, self.head[env] - 1 - (ends[env] - 1 - ticket))
 
-    def observation(self, index: np.ndarray) -> list[np.ndarray]:
-        """Returns the observation leaves at positions ``index``, each ``(*index.shape, ...)``, stacks rebuilt.
+    def read(self, index: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Returns copies of the rows at positions ``index`` as records, and their observation leaves, stacks rebuilt.
 
-        Before an episode's first frame a stack repeats it, as ``FrameStackObservation(padding_type="reset")`` does. At
-        the far end of the ring an episode counts as begun with the oldest frame that is kept.
+        Both have the shape of ``index``; leaves that are no stacks are views of the records. Before an episode's first
+        frame a stack repeats it, as ``FrameStackObservation(padding_type="reset")`` does. At the far end of the ring an
+        episode counts as begun with the oldest frame that is kept.
         """
-        frames = self._frames(index) if any(self.stacked) else index
-        kinds = zip(self.obs, self.stacked, strict=True)
-        return [leaf.take(frames if stacked else index, axis=0) for leaf, stacked in kinds]
+        records = self.records.take(index)
+        if self.frame_stack is None:
+            return records, [records[name] for name in self._names]
+        frames = self._frames(index)
+        kinds = zip(self.obs, self.stacked, self._names, strict=True)
+        return records, [leaf.take(frames, axis=0) if stacked else records[name] for leaf, stacked, name in kinds]
 
     def _frames(self, index: np.ndarray) -> np.ndarray:
         """Returns where the frames of the stacks at ``index`` are, oldest first, ``(*index.shape, frame_stack)``."""
@@ -202,7 +213,7 @@ class Ring:
         if head.max() >= self.rows:
             self.n_steps[envs] -= (head >= self.rows) & (self.kind[index] != LAST)
         self.kind[index] = STEP
-        self.until_end[index] = -1
+        self.until_end[index] = 0
         return index
 
     def _close(self, env: int) -> None:
@@ -228,7 +239,7 @@ class Ring:
         # A run may begin an episode in the ring midway, whose older frames are then padded like those of any other; the
         # first that an environment ever begins does follow a reset, and shows how its stacks are padded.
         length = np.where(self.head[envs] == 0, self.frame_stack, self.since_start[index] + 1)
-        for rebuilt, leaf, stacked in zip(self.observation(index), leaves, self.stacked, strict=True):
+        for rebuilt, leaf, stacked in zip(self.read(index)[1], leaves, self.stacked, strict=True):
             if stacked:
                 differs = (rebuilt != leaf[envs]).any(axis=tuple(range(2, leaf.ndim)))
                 if (differs[:, ::-1] & (np.arange(leaf.shape[1]) < length[:, None])).any():
@@ -289,7 +300,7 @@ class Ring:
                 kind[env, rows].max(initial=0) > LAST
                 or n_steps[env] != (kind[env, rows[:-1]] != LAST).sum()
                 or not ((since_start[env, rows] >= 0) & (since_start[env, rows] <= times)).all()
-                or not ((until_end[env, rows] >= -1) & (times + until_end[env, rows] <= head[env])).all()
+                or not ((until_end[env, rows] >= 0) & (times + until_end[env, rows] <= head[env])).all()
             ):
                 return False
         return True

@@ -47,17 +47,18 @@ class ReplayBuffer:
         """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances, ``progress`` anneals the weights."""
         rows, weight = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
         index = self.ring.index(*rows)
+        step, obs = self.ring.read(index)
         if self.n_steps == 1:
-            reward, terminated = self.ring.reward.take(index), self.ring.kind.take(index) == TERMINATED
+            reward, terminated = step["reward"], step["kind"] == TERMINATED
             steps: int | np.ndarray = 1
         else:
             window = look_ahead(self.ring, rows, self.n_steps)
             reward = discounted_sum(self.ring.reward[window.position], window.valid, self.gamma)
             steps, terminated = window.steps, window.terminated
         following = self.ring.index(rows.env, rows.time + steps)
-        obs, next_obs = self.ring.observation(index), self.ring.observation(following)
+        _, next_obs = self.ring.read(following)
         discount = bootstrap_discount(self.gamma, steps, terminated)
-        return batch(self.ring, shape, obs, self.ring.action.take(index, axis=0), reward, next_obs, discount, weight)
+        return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight)
 
     def reprioritise(self, td_errors: list[Any]) -> None:
         """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
