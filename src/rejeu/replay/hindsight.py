@@ -130,14 +130,12 @@ class HerReplayBuffer:
         relabelled_rows = Rows(rows.env[relabelled], rows.time[relabelled])
         goal_index = self._goal_index(rng, relabelled_rows, step[relabelled])
         goal = ring.read(goal_index)[1][self.achieved]
-        if self.n_steps == 1:
-            following = ring.index(rows.env, rows.time + 1)
-        else:
+        steps: int | np.ndarray = 1
+        if self.n_steps > 1:
             reward, steps, terminated = self._n_step(rows, relabelled, goal)
-            following = ring.index(rows.env, rows.time + steps)
-        _, next_obs = ring.read(following)
+        _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
-            reward, terminated, steps = step["reward"], step["kind"] == TERMINATED, 1
+            reward, terminated = step["reward"], step["kind"] == TERMINATED
             reached = next_obs[self.achieved][relabelled]
             if len(goal):
                 reward[relabelled] = self.goals.reward(reached, goal)

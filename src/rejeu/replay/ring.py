@@ -87,6 +87,8 @@ class Ring:
         self.n_steps = np.zeros(n_envs, np.int64)
         """Steps kept, by environment: the rows that are not ``LAST`` and not the newest."""
         self.base = np.arange(n_envs, dtype=np.int64) * self.rows
+        self._newest = self.base
+        """Positions of the newest rows, by environment."""
         self.all_envs = np.arange(n_envs)
         self._keys = flat_keys(obs_structure)
         self._names = [f"obs.{i}" for i in range(len(obs_leaves))]
@@ -126,18 +128,15 @@ class Ring:
 
         Returns the positions of the steps and of the rows after them.
         """
-        if envs is None:
-            envs = self.all_envs
-        else:
-            action, reward, terminated = action[envs], reward[envs], terminated[envs]
-        index = self.index(envs, self.head[envs])
-        self.action[index] = action
-        self.reward[index] = reward
-        self.kind[index] = terminated
-        following = self._advance(envs)
-        self.n_steps[envs] += 1
+        chosen = slice(None) if envs is None else envs
+        index = self._newest[chosen]
+        self.action[index] = action[chosen]
+        self.reward[index] = reward[chosen]
+        self.kind[index] = terminated[chosen]
+        following = self._advance(chosen)
+        self.n_steps[chosen] += 1
         self.since_start[following] = self.since_start[index] + 1
-        self._write_obs(following, next_obs, envs)
+        self._write_obs(following, next_obs, chosen)
         return index, following
 
     def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -205,11 +204,12 @@ class Ring:
         """Returns observation leaves in the nesting of the environment's space."""
         return jax.tree.unflatten(self.obs_structure, obs_leaves)
 
-    def _advance(self, envs: np.ndarray) -> np.ndarray:
+    def _advance(self, envs: np.ndarray | slice) -> np.ndarray:
         """Moves the heads on by one row, forgetting what stood there, and returns the positions of the new rows."""
         head = self.head[envs] + 1
         self.head[envs] = head
-        index = self.index(envs, head)
+        index = self.base[envs] + head % self.rows
+        self._newest = index if isinstance(envs, slice) else self.base + self.head % self.rows
         if head.max() >= self.rows:
             self.n_steps[envs] -= (head >= self.rows) & (self.kind[index] != LAST)
         self.kind[index] = STEP
@@ -225,7 +225,7 @@ class Ring:
         times = np.arange(head - length, head + 1)
         self.until_end[self.base[env] + times % self.rows] = head - times
 
-    def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray) -> None:
+    def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray | slice) -> None:
         """Writes observations ``(n_envs, ...)`` at ``index``, of stacks the newest frame.
 
         Raises:
@@ -288,6 +288,7 @@ class Ring:
         for name, array in own.items():
             array.reshape(self.n_envs, self.rows, *array.shape[1:])[:, :used] = arrays[name]
         self.head, self.n_steps = head.copy(), n_steps.copy()
+        self._newest = self.base + self.head % self.rows
 
     def _consistent(
         self, head: np.ndarray, n_steps: np.ndarray, kind: np.ndarray, since_start: np.ndarray, until_end: np.ndarray

@@ -104,7 +104,7 @@ def batch(
     """Returns transitions in ``shape`` from flat arrays; weights are divided by the largest of each batch."""
 
     def shaped(array: np.ndarray) -> np.ndarray:
-        return array.reshape(*shape, *array.shape[1:])
+        return array.reshape(shape + array.shape[1:])
 
     if weight is not None:
         weight = shaped(weight)
