@@ -51,7 +51,7 @@ def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
         "seed": 0,
         **settings,
     }
-    with mock.patch.object(sac, "make", _make), mock.patch.object(agents, "Compiled", _compile):
+    with mock.patch.object(sac, "make", _make), mock.patch.object(agents.base, "Compiled", _compile):
         return rejeu.SAC("MultiInputPolicy" if nested else "MlpPolicy", env, **settings)
 
 

@@ -6,7 +6,7 @@
 100
 """
 
-from rejeu.agents import AGENTS, DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ, load
+from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, load
 from rejeu.envs.monitor import Monitor
 from rejeu.envs.vector import make_vector
 from rejeu.errors import CheckpointError, MissingExtra
@@ -21,9 +21,11 @@ from rejeu.video import record_video, show_videos
 __version__ = "0.1.0"
 
 __all__ = [
+    "A2C",
     "AGENTS",
     "DDPG",
     "DQN",
+    "PPO",
     "QRDQN",
     "SAC",
     "TD3",

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.config import whole
 from rejeu.envs.vector import InProcess, VectorEnv, make_vector
 from rejeu.evaluation import Evaluation
@@ -141,6 +142,8 @@ class Checkpoint:
         if crossed(before, progress.step, self.every):
             agent.save(self.folder / f"agent_{progress.step}.safetensors")
             if self.replay_buffer:
+                if not isinstance(agent, OffPolicyAgent):
+                    raise TypeError(f"Checkpoint(replay_buffer=True): {agent.name} has none; leave replay_buffer out")
                 agent.save_replay_buffer(self.folder / "replay_buffer.safetensors")
 
 

@@ -41,6 +41,40 @@ class Transition(NamedTuple):
     """Importance weights of prioritised replay, ``(batch,)`` in (0, 1]; None where all steps are equally likely."""
 
 
+class Masked(NamedTuple):
+    """An observation together with which actions are allowed."""
+
+    obs: PyTree
+    """The observation itself."""
+    mask: Any
+    """Whether each choice is allowed, ``bool (batch, n)``: n is the number of actions of a Discrete space, the sum of the
+    numbers of a MultiDiscrete one, and of MultiBinary the bits that may be 1."""
+
+
+class Rollout(NamedTuple):
+    """The steps that all environments took under one policy; leaves are ``(steps, n_envs, ...)`` where not said."""
+
+    obs: PyTree
+    """Observations, as of :class:`Transition`."""
+    action: Any
+    """Actions as they were drawn: of continuous ones, not clipped."""
+    reward: Any
+    """Rewards, ``(steps, n_envs)``."""
+    next_obs: PyTree
+    """True successors of ``obs``, also where an episode ended."""
+    discount: Any
+    """0 where the MDP terminated, gamma elsewhere, ``(steps, n_envs)``."""
+    ended: Any
+    """Where an episode ended, by terminal state or time limit, ``bool (steps, n_envs)``: the step after it belongs to
+    another."""
+    valid: Any
+    """Which steps there are, ``bool (steps, n_envs)``; the others are padding. Padding follows what is valid."""
+    started: Any
+    """Where an episode began with the first step, ``bool (n_envs,)``."""
+    carry: PyTree
+    """What a policy with memory remembered before the first step, leaves ``(n_envs, ...)``; ``()`` without memory."""
+
+
 class Clock(NamedTuple):
     """Where a run stands; passed to exploration and update so that schedules are pure functions of it."""
 
@@ -50,6 +84,18 @@ class Clock(NamedTuple):
     """Episodes finished so far, over all environments."""
     progress: Any
     """Fraction of the present ``learn`` call that is done, in [0, 1]."""
+
+
+class Memory(NamedTuple):
+    """How a policy acts whose actions depend on a *carry*: a small pytree per environment, begun anew with an episode."""
+
+    init: Callable[[PyTree, int], PyTree]
+    """``init(actor, n_envs) -> carry``, leaves ``(n_envs, ...)``; of ``actor`` only the shapes are used."""
+    explore: Callable[[PyTree, PyTree, PyTree, Array, Array, Clock], tuple[Array, PyTree]]
+    """``explore(carry, actor, obs, ended, key, clock) -> (action, carry)``; ``ended``, ``bool (n_envs,)``, is where an
+    episode has just begun."""
+    exploit: Callable[[PyTree, PyTree, PyTree, Array], tuple[Array, PyTree]]
+    """``exploit(carry, actor, obs, ended) -> (action, carry)``, the deterministic policy."""
 
 
 class Algorithm(NamedTuple):
@@ -66,9 +112,12 @@ class Algorithm(NamedTuple):
     """``explore(actor, obs, key, clock) -> action`` for training, ``(batch, ...)``."""
     exploit: Callable[[PyTree, PyTree], Array]
     """``exploit(actor, obs) -> action``, the deterministic policy, ``(batch, ...)``."""
-    update: Callable[[PyTree, Transition, Clock], tuple[PyTree, Metrics]]
-    """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns. The metrics are
+    update: Callable[[PyTree, Any, Clock], tuple[PyTree, Metrics]]
+    """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns on a batch of
+    :class:`Transition`, or for on-policy algorithms all the steps that one :class:`Rollout` is good for. The metrics are
     scalars, and under ``TD_ERROR`` the absolute TD errors ``(batch,)`` that prioritised replay goes by."""
+    memory: Memory | None = None
+    """How a policy acts that remembers earlier observations; None where it needs the present one alone."""
 
 
 TD_ERROR = "td_error"

@@ -10,6 +10,10 @@ import jax.numpy as jnp
 from jax import Array
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+FORBIDDEN = -1e9
+"""Logit of an action that a mask forbids: its probability is exactly 0 in float32, and every gradient stays finite."""
+EDGE = 1.0 - 1e-6
+"""Largest magnitude at which a squashed action is unsquashed: beyond it, float32 knows no slope."""
 
 
 class Normal(NamedTuple):
@@ -60,11 +64,98 @@ class TanhNormal(NamedTuple):
         """Returns one sample in (-1, 1), ``(..., action_dim)``."""
         return jnp.tanh(Normal(self.mean, self.log_std).sample(key))
 
+    def log_prob(self, value: Array) -> Array:
+        """Returns the log-density of ``value`` in [-1, 1], ``(...)``, in nats; values at the edge count as near it."""
+        unsquashed = jnp.arctanh(jnp.clip(value, -EDGE, EDGE))
+        density = Normal(self.mean, self.log_std).log_prob(unsquashed)
+        return density - jnp.sum(log_tanh_slope(unsquashed), axis=-1)
+
     def mode(self) -> Array:
         """Returns the squashed mean, ``(..., action_dim)``."""
         return jnp.tanh(self.mean)
 
 
+class Categorical(NamedTuple):
+    """One choice among several; the last axis of the logits is the choices."""
+
+    logits: Array
+    """Unnormalised log-probabilities, ``(..., n)``; :data:`FORBIDDEN` where a choice is not allowed."""
+
+    def sample(self, key: Array) -> Array:
+        """Returns one choice, ``int32 (...)``, by the Gumbel trick."""
+        noise = jax.random.gumbel(key, self.logits.shape, self.logits.dtype)
+        return jnp.argmax(self.logits + noise, axis=-1).astype(jnp.int32)
+
+    def log_prob(self, value: Array) -> Array:
+        """Returns the log-probability of the choices ``value``, ``int (...)``, in nats."""
+        log_probabilities = jax.nn.log_softmax(self.logits)
+        return jnp.take_along_axis(log_probabilities, value[..., None].astype(jnp.int32), axis=-1)[..., 0]
+
+    def entropy(self) -> Array:
+        """Returns the entropy, ``(...)``, in nats."""
+        log_probabilities = jax.nn.log_softmax(self.logits)
+        return -jnp.sum(jnp.exp(log_probabilities) * log_probabilities, axis=-1)
+
+    def mode(self) -> Array:
+        """Returns the most likely choice, ``int32 (...)``, the first of equals."""
+        return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)
+
+
+class MultiCategorical(NamedTuple):
+    """Several independent choices, each among its own number of possibilities; the last axis of a value is one event."""
+
+    parts: tuple[Categorical, ...]
+    """One for each choice, all of the same leading shape."""
+
+    def sample(self, key: Array) -> Array:
+        """Returns one sample, ``int32 (..., n_choices)``."""
+        keys = jax.random.split(key, len(self.parts))
+        return jnp.stack([part.sample(keys[i]) for i, part in enumerate(self.parts)], axis=-1)
+
+    def log_prob(self, value: Array) -> Array:
+        """Returns the log-probability of ``value``, ``int (..., n_choices)``, summed over the choices, in nats."""
+        return sum_of([part.log_prob(value[..., i]) for i, part in enumerate(self.parts)])
+
+    def entropy(self) -> Array:
+        """Returns the entropy, ``(...)``, in nats."""
+        return sum_of([part.entropy() for part in self.parts])
+
+    def mode(self) -> Array:
+        """Returns the most likely value, ``int32 (..., n_choices)``."""
+        return jnp.stack([part.mode() for part in self.parts], axis=-1)
+
+
+class Bernoulli(NamedTuple):
+    """Independent bits; the last axis is one event."""
+
+    logits: Array
+    """Log-odds of a one, ``(..., n)``."""
+
+    def sample(self, key: Array) -> Array:
+        """Returns one sample of zeros and ones, ``int32 (..., n)``."""
+        uniform = jax.random.uniform(key, self.logits.shape, self.logits.dtype)
+        return (uniform < jax.nn.sigmoid(self.logits)).astype(jnp.int32)
+
+    def log_prob(self, value: Array) -> Array:
+        """Returns the log-probability of the bits ``value``, ``(..., n)``, in nats."""
+        signed = jnp.where(value > 0, self.logits, -self.logits)
+        return jnp.sum(jax.nn.log_sigmoid(signed), axis=-1)
+
+    def entropy(self) -> Array:
+        """Returns the entropy, ``(...)``, in nats."""
+        one, zero = jax.nn.log_sigmoid(self.logits), jax.nn.log_sigmoid(-self.logits)
+        return -jnp.sum(jnp.exp(one) * one + jnp.exp(zero) * zero, axis=-1)
+
+    def mode(self) -> Array:
+        """Returns the most likely bits, ``int32 (..., n)``."""
+        return (self.logits > 0).astype(jnp.int32)
+
+
 def log_tanh_slope(unsquashed: Array) -> Array:
     """Returns ``log(1 - tanh(u)^2)`` elementwise, without cancellation for large ``|u|``."""
     return 2.0 * (math.log(2.0) - unsquashed - jax.nn.softplus(-2.0 * unsquashed))
+
+
+def sum_of(parts: list[Array]) -> Array:
+    """Returns the sum of arrays of one shape."""
+    return jnp.sum(jnp.stack(parts), axis=0)

@@ -162,6 +162,27 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
     return space
 
 
+def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
+    """Returns ``space`` if a stochastic policy can act in it: a Box with an axis, Discrete, MultiDiscrete, MultiBinary.
+
+    Raises:
+        ValueError: otherwise, naming what to do instead.
+    """
+    if isinstance(space, spaces.Box):
+        if space.dtype.kind != "f" or not space.shape:
+            raise ValueError(f"{algorithm} needs Box actions of floats with an axis, got {space}; use MultiDiscrete")
+        if not (space.high > space.low).all():
+            raise ValueError(
+                f"every action bound must satisfy low < high, got low={space.low.tolist()}, high={space.high.tolist()}"
+            )
+    elif not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        raise ValueError(
+            f"{algorithm} needs a Box, Discrete, MultiDiscrete or MultiBinary action space, got {space}; wrap the "
+            "environment in a gymnasium.ActionWrapper"
+        )
+    return space
+
+
 def action_dimension(space: spaces.Box) -> int:
     """Returns the number of components of one action."""
     return int(np.prod(space.shape, dtype=int))
@@ -170,8 +191,9 @@ def action_dimension(space: spaces.Box) -> int:
 def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     """Returns actions in the environment's own range from what an algorithm gives.
 
-    Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``. Discrete: from 0 to n - 1 to the
-    space's own numbers.
+    Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; what lies beyond is clipped, and
+    components without finite bounds are left as they are. Discrete and MultiDiscrete: from 0 to n - 1 to the space's own
+    numbers. MultiBinary: the bits.
     """
     return action_scaler(space)(action)
 
@@ -182,15 +204,24 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
         shape = (-1, *space.shape)
         if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
             return lambda action: action.reshape(shape).clip(-1.0, 1.0)
-        low, high, dtype = space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
+        bounded = np.isfinite(space.low) & np.isfinite(space.high)
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        start, half = np.where(bounded, low, -1.0), np.where(bounded, 0.5 * (high - low), 1.0)
+        dtype = space.dtype
 
         def scale(action: np.ndarray) -> np.ndarray:
-            return (low + 0.5 * (action.reshape(shape) + 1.0) * (high - low)).clip(low, high).astype(dtype)
+            return (start + (action.reshape(shape) + 1.0) * half).clip(low, high).astype(dtype)
 
         return scale
     if isinstance(space, spaces.Discrete):
-        start = int(space.start)
-        return lambda action: action.astype(np.int64) + start
+        first = int(space.start)
+        return lambda action: action.astype(np.int64) + first
+    if isinstance(space, spaces.MultiDiscrete):
+        shape, starts, dtype = (-1, *space.nvec.shape), np.broadcast_to(space.start, space.nvec.shape), space.dtype
+        return lambda action: (action.reshape(shape) + starts).astype(dtype)
+    if isinstance(space, spaces.MultiBinary):
+        shape, dtype = (-1, *space.shape), space.dtype
+        return lambda action: action.reshape(shape).astype(dtype)
     raise TypeError(f"cannot scale actions of {space}")
 
 
@@ -200,6 +231,10 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.n
         return rng.uniform(-1.0, 1.0, (n, int(np.prod(space.shape)))).astype(np.float32)
     if isinstance(space, spaces.Discrete):
         return rng.integers(int(space.n), size=n, dtype=np.int32)
+    if isinstance(space, spaces.MultiDiscrete):
+        return rng.integers(space.nvec.ravel(), size=(n, space.nvec.size), dtype=np.int32)
+    if isinstance(space, spaces.MultiBinary):
+        return rng.integers(2, size=(n, int(np.prod(space.shape))), dtype=np.int32)
     raise TypeError(f"cannot draw random actions of {space}")
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import TD_ERROR, Algorithm, Clock, PyTree, Transition, copy as copied
+from rejeu.core import TD_ERROR, Algorithm, Clock, PyTree, Rollout, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
 from rejeu.loops.packing import HostPacker, Packing, Readings
@@ -55,6 +55,9 @@ class Compiled:
             state: PackedState, vectors: list[Array], plan: Packing
         ) -> tuple[PackedState, Readings, Array | None]:
             batches, clock = plan.unpack(vectors)
+            if isinstance(batches, Rollout):
+                after, metrics = algorithm.update(packing.unpack(state), batches, clock)
+                return packing.pack(after), Readings.of(metrics), None
             after, metrics = jax.lax.scan(
                 lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
             )
@@ -89,16 +92,15 @@ class Compiled:
         return self._exploit(state, *self._exploit_packer(obs, len(jax.tree.leaves(obs)[0])))
 
     def update(
-        self, state: PackedState, batches: Transition, clock: Clock
+        self, state: PackedState, batches: Transition | Rollout, clock: Clock
     ) -> tuple[PackedState, Readings, Array | None]:
-        """Takes one gradient step for each entry of the leading axis of ``batches``, in one scan.
+        """Takes one gradient step for each entry of the leading axis of ``batches``, in one scan; or learns a rollout.
 
         Returns the packed state, whose predecessor is donated, the metrics, means over the steps, and the absolute TD
         errors ``(steps, batch)``, which are None unless the batches are weighted.
         """
-        return self._update(
-            state, *self._update_packer((batches, clock), (batches.reward.shape, batches.weight is None))
-        )
+        weighted = isinstance(batches, Transition) and batches.weight is not None
+        return self._update(state, *self._update_packer((batches, clock), (batches.reward.shape, weighted)))
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""

@@ -1,4 +1,4 @@
-"""The agents: what owns an environment, a learner and a replay buffer, under Stable-Baselines3's names.
+"""What all agents share: they own an environment and a learner, under Stable-Baselines3's names.
 
 An agent holds what changes and calls what computes; it contains no mathematics. Its hyper-parameters are those of its
 algorithm's configuration.
@@ -9,8 +9,9 @@ from __future__ import annotations
 import inspect
 import math
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
@@ -20,23 +21,17 @@ import jax
 import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, spaces, summary
-from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
-from rejeu.config import OffPolicyConfig
 from rejeu.envs.auto_reset import AutoResetView
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
-from rejeu.exploration.noise import check_fits
+from rejeu.exploration.noise import Noise, check_fits
 from rejeu.history import History
 from rejeu.interrupt import Interrupt
 from rejeu.logging import Console, Sink, TensorBoard, next_folder
 from rejeu.loops import host
 from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.loops.host import Episode, Progress, Run
-from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer
-from rejeu.replay.prioritized import Priorities
-from rejeu.replay.ring import Ring
-from rejeu.replay.uniform import ReplayBuffer
 
 Callback = Callable[["Agent", Progress], bool | None]
 """Called after every step of the environments; ``False``, and nothing else, stops training."""
@@ -74,8 +69,8 @@ class Best(NamedTuple):
     """The algorithm's whole state at that moment, packed."""
 
 
-class Agent:
-    """What all agents share. Abstract: use SAC and its kin."""
+class Agent(ABC):
+    """What all agents share. Abstract: use SAC, PPO and their kin."""
 
     algorithm: ClassVar[ModuleType]
     """The module with ``Config`` and ``make``."""
@@ -96,7 +91,7 @@ class Agent:
         for key in hyperparameters:
             if key not in known:
                 raise TypeError(configs.unknown_name(key, known, self.name))
-        self.config: OffPolicyConfig = self.algorithm.Config(**hyperparameters)
+        self.config: Any = self.algorithm.Config(**hyperparameters)
         self.policy = policy
         self.seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed)
         self.verbose = verbose
@@ -118,60 +113,53 @@ class Agent:
         compilation.enable_cache()
         vector = make_vector(env, 1, seed=self.seed)
         self._check_policy(policy, vector.observation_space)
-        self._build(vector.observation_space, vector.action_space)
+        self._build(vector.observation_space, vector.action_space, vector.n_envs)
         self._start(vector)
 
-    def _build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
+    def _build(self, observation_space: gym.Space, action_space: gym.Space, n_envs: int) -> None:
         """Compiles the algorithm for these spaces."""
         self.observation_space, self.action_space = observation_space, action_space
         self._obs_leaves = spaces.leaves(observation_space)
-        noise = self.config.action_noise
+        noise = self._noise()
         if noise is not None:
             check_fits(noise, action_space)
         self._compiled = Compiled(self.algorithm.make(self.config, observation_space, action_space), noise)
-        compilation.start_device(self._work())
+        compilation.start_device(self._work(n_envs))
 
-    def _work(self) -> float:
+    def _work(self, n_envs: int) -> float:
         """Returns about how many multiplications the largest layer of an update takes; of images, any number."""
         if any(leaf.kind == "image" for leaf in self._obs_leaves):
             return math.inf
         weights = [leaf.size for leaf in jax.tree.leaves(self._compiled.shapes) if len(leaf.shape) > 1]
-        return self.config.batch_size * max(weights, default=0)
+        return self._batch_size(n_envs) * max(weights, default=0)
 
     def _start(self, env: VectorEnv) -> None:
         """Begins a run on ``env`` with a fresh state and an empty buffer."""
-        self._run: Run = host.initial_run(
-            env, self._make_replay(env), self._compiled, self.config.learning_starts, self.seed
-        )
+        self._run: Run = host.initial_run(env, self._make_buffer(env), self._compiled, self._learn_from(0), self.seed)
 
-    def _make_replay(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
-        config = self.config
-        if config.hindsight is not None:
-            spaces.check_goal_space(env.observation_space)
-        action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
-        ring = Ring(
-            config.buffer_size,
-            env.n_envs,
-            self._obs_leaves,
-            spaces.structure(env.observation_space),
-            action.shape[1:],
-            action.dtype,
-            config.frame_stack,
-        )
-        priorities = None if config.priorities is None else Priorities(ring, config.priorities)
-        if config.hindsight is None:
-            return ReplayBuffer(ring, config.gamma, config.n_steps, priorities)
-        return HerReplayBuffer(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, priorities)
+    @abstractmethod
+    def _noise(self) -> Noise | None:
+        """Returns the noise that exploration adds to actions."""
 
-    @staticmethod
-    def _goals(env: VectorEnv) -> GoalFunctions:
-        goals = env.goals()
-        if goals is None:
-            raise ValueError(
-                f"hindsight replay needs the environment's compute_reward(achieved_goal, desired_goal, info), and "
-                f"{env.env_id} has none; add it, or use replay_buffer_class=None"
-            )
-        return goals
+    @abstractmethod
+    def _batch_size(self, n_envs: int) -> int:
+        """Returns how many steps of ``n_envs`` environments a gradient is taken on."""
+
+    @abstractmethod
+    def _make_buffer(self, env: VectorEnv) -> Any:
+        """Returns an empty buffer for the experience of ``env``."""
+
+    @abstractmethod
+    def _keep_buffer(self, env: VectorEnv) -> None:
+        """Prepares the buffer for a new environment of the same number and spaces."""
+
+    @abstractmethod
+    def _learn_from(self, step: int) -> int:
+        """Returns the step from which on a run that begins at ``step`` takes gradients."""
+
+    @abstractmethod
+    def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+        """Returns the loop."""
 
     @staticmethod
     def _check_policy(policy: str, space: gym.Space) -> None:
@@ -216,11 +204,6 @@ class Agent:
     def n_updates(self) -> int:
         """Gradient steps taken in all."""
         return self._run.n_updates
-
-    @property
-    def replay_buffer(self) -> ReplayBuffer | HerReplayBuffer:
-        """The replay buffer."""
-        return self._run.replay
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -294,7 +277,7 @@ class Agent:
         self.interrupted = False
         try:
             with Interrupt() as interrupt:
-                for turn in host.off_policy(self._run, self._compiled, self.config, n_steps, progress):
+                for turn in self._turns(n_steps, progress):
                     elapsed = time.perf_counter() - began
                     self.steps_per_second = (turn.step - first) / max(elapsed, 1e-9)
                     for episode in turn.episodes:
@@ -481,7 +464,7 @@ class Agent:
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Gives the agent another environment of the same spaces; its episodes start anew.
 
-        With another number of environments the replay buffer starts empty; otherwise it is kept.
+        With another number of environments a replay buffer starts empty; otherwise it is kept.
 
         Raises:
             ValueError: if the spaces differ.
@@ -491,11 +474,11 @@ class Agent:
         self._own_env = isinstance(env, str)
         run = self._run
         if run.env is None or run.env.n_envs != vector.n_envs:
-            run.replay = self._make_replay(vector)
+            run.replay = self._make_buffer(vector)
             run.td_errors = []
             run.carry = self._compiled.initial_carry(vector.n_envs)
-        elif isinstance(run.replay, HerReplayBuffer):
-            run.replay.goals = self._goals(vector)
+        else:
+            self._keep_buffer(vector)
         run.env = vector
         run.obs = run.action = None
         run.ended = np.ones(vector.n_envs, bool)
@@ -606,7 +589,7 @@ class Agent:
         agent._n_predictions, agent._own_env = 0, isinstance(env, str)
         compilation.enable_cache()
         try:
-            agent._build(observation_space, action_space)
+            agent._build(observation_space, action_space, 1)
         except (TypeError, ValueError, MemoryError, OverflowError) as error:
             raise CheckpointError(f"{path}: {error}") from None
         state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
@@ -625,7 +608,7 @@ class Agent:
         run.state = self._compiled.pack(state)
         run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
         run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": rng}
-        run.learn_from = max(self.config.learning_starts, run.step + self.config.learning_starts)
+        run.learn_from = self._learn_from(run.step)
         run.seed = int(np.random.SeedSequence([self.seed, run.step]).generate_state(1)[0])
         self._steps_before = counters["steps_before"]
         return self
@@ -634,41 +617,14 @@ class Agent:
         """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.summary`."""
         return summary.describe(self._compiled.shapes, self._obs_leaves)
 
-    def save_replay_buffer(self, path: str | Path) -> Path:
-        """Writes the replay buffer to one safetensors file and returns its path."""
-        header = {
-            "observation_space": spaces.describe(self.observation_space),
-            "action_space": spaces.describe(self.action_space),
-        }
-        return checkpoint.write(path, "replay", self._run.replay.arrays(), header)
-
-    def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
-        """Replaces the replay buffer by a saved one; learning can then go on at once.
-
-        Args:
-            path: as given to :meth:`save_replay_buffer`.
-            truncate_last_traj: accepted; the episodes that ran when it was saved are closed without a terminal state
-                when the next begins, so hindsight uses them as far as they went.
-
-        Raises:
-            CheckpointError: if the file is damaged, or of another environment or buffer size.
-        """
-        if self._run.replay is None:
-            raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
-        _, arrays = checkpoint.read(path, "replay")
-        try:
-            self._run.replay.restore(arrays)
-        except ValueError as error:
-            raise CheckpointError(f"{path}: {error}") from None
-        self._run.learn_from = self.config.learning_starts
-        self._run.obs = self._run.action = None
-
     def __repr__(self) -> str:
         where = self._run.env.env_id if self._run.env is not None else "no environment"
         return f"<rejeu.{self.name} on {where}, {self._run.step} steps, {self._run.n_updates} updates>"
 
     def __init_subclass__(cls) -> None:
         """Writes signature and docstring from the configuration, where every hyper-parameter is declared once."""
+        if "algorithm" not in cls.__dict__:
+            return
         config = cls.algorithm.Config
         docs = configs.field_docs(config)
         lines = [f"{(config.__doc__ or '').strip()}", "", "Args:"]
@@ -681,63 +637,6 @@ class Agent:
             parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
         cls.__doc__ = "\n".join([f"{(cls.__doc__ or '').strip()}", "", *lines])
         cls.__signature__ = inspect.Signature(parameters[1:])  # type: ignore[attr-defined]
-
-
-class SAC(Agent):
-    """Soft actor-critic (Haarnoja et al. 2018), for continuous and Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = sac
-
-
-class DDPG(Agent):
-    """Deep deterministic policy gradient (Lillicrap et al. 2015), for continuous and Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = ddpg
-
-
-class TD3(Agent):
-    """Twin delayed DDPG (Fujimoto et al. 2018), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = td3
-
-
-class DQN(Agent):
-    """Deep Q-learning (Mnih et al. 2015), for Discrete actions; double, dueling and n-step by option."""
-
-    algorithm: ClassVar[ModuleType] = dqn
-
-
-class QRDQN(Agent):
-    """Quantile regression DQN (Dabney et al. 2018), for Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = qrdqn
-
-
-class TQC(Agent):
-    """Truncated quantile critics (Kuznetsov et al. 2020), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = tqc
-
-
-class CrossQ(Agent):
-    """SAC with batch renormalisation instead of target networks (Bhatt et al. 2024), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = crossq
-
-
-AGENTS: dict[str, type[Agent]] = {
-    agent.algorithm.Config.name: agent for agent in (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ)
-}
-"""Every agent by the name of its algorithm."""
-
-
-def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
-    """Returns the agent of a model file, whichever algorithm it is of; see :meth:`Agent.load`."""
-    header, _ = checkpoint.read(path, "agent")
-    name = header.get("algorithm")
-    if name not in AGENTS:
-        raise CheckpointError(f"{path} holds an agent of {str(name)[:40]!r}; this rejeu has {', '.join(AGENTS)}")
-    return AGENTS[name].load(path, env, **changes)
 
 
 def whole_seed(seed: Any) -> int:

@@ -1,0 +1,151 @@
+"""The agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC and CrossQ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import ClassVar
+
+import numpy as np
+
+from rejeu import checkpoint, spaces
+from rejeu.agents.base import Agent
+from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
+from rejeu.config import OffPolicyConfig
+from rejeu.envs.vector import VectorEnv
+from rejeu.errors import CheckpointError
+from rejeu.exploration.noise import Noise
+from rejeu.loops.host import Progress
+from rejeu.loops.off_policy import off_policy
+from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer
+from rejeu.replay.prioritized import Priorities
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
+
+
+class OffPolicyAgent(Agent):
+    """What the agents share that learn from a replay buffer. Abstract."""
+
+    config: OffPolicyConfig
+
+    @property
+    def replay_buffer(self) -> ReplayBuffer | HerReplayBuffer:
+        """The replay buffer."""
+        return self._run.replay
+
+    def save_replay_buffer(self, path: str | Path) -> Path:
+        """Writes the replay buffer to one safetensors file and returns its path."""
+        header = {
+            "observation_space": spaces.describe(self.observation_space),
+            "action_space": spaces.describe(self.action_space),
+        }
+        return checkpoint.write(path, "replay", self._run.replay.arrays(), header)
+
+    def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
+        """Replaces the replay buffer by a saved one; learning can then go on at once.
+
+        Args:
+            path: as given to :meth:`save_replay_buffer`.
+            truncate_last_traj: accepted; the episodes that ran when it was saved are closed without a terminal state
+                when the next begins, so hindsight uses them as far as they went.
+
+        Raises:
+            CheckpointError: if the file is damaged, or of another environment or buffer size.
+        """
+        if self._run.replay is None:
+            raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
+        _, arrays = checkpoint.read(path, "replay")
+        try:
+            self._run.replay.restore(arrays)
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {error}") from None
+        self._run.learn_from = self.config.learning_starts
+        self._run.obs = self._run.action = None
+
+    def _noise(self) -> Noise | None:
+        return self.config.action_noise
+
+    def _batch_size(self, n_envs: int) -> int:
+        return self.config.batch_size
+
+    def _learn_from(self, step: int) -> int:
+        return step + self.config.learning_starts
+
+    def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+        return off_policy(self._run, self._compiled, self.config, n_steps, progress)
+
+    def _make_buffer(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
+        config = self.config
+        if config.hindsight is not None:
+            spaces.check_goal_space(env.observation_space)
+        action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
+        ring = Ring(
+            config.buffer_size,
+            env.n_envs,
+            self._obs_leaves,
+            spaces.structure(env.observation_space),
+            action.shape[1:],
+            action.dtype,
+            config.frame_stack,
+        )
+        priorities = None if config.priorities is None else Priorities(ring, config.priorities)
+        if config.hindsight is None:
+            return ReplayBuffer(ring, config.gamma, config.n_steps, priorities)
+        return HerReplayBuffer(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, priorities)
+
+    def _keep_buffer(self, env: VectorEnv) -> None:
+        if isinstance(self._run.replay, HerReplayBuffer):
+            self._run.replay.goals = self._goals(env)
+
+    @staticmethod
+    def _goals(env: VectorEnv) -> GoalFunctions:
+        goals = env.goals()
+        if goals is None:
+            raise ValueError(
+                f"hindsight replay needs the environment's compute_reward(achieved_goal, desired_goal, info), and "
+                f"{env.env_id} has none; add it, or use replay_buffer_class=None"
+            )
+        return goals
+
+
+class SAC(OffPolicyAgent):
+    """Soft actor-critic (Haarnoja et al. 2018), for continuous and Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = sac
+
+
+class DDPG(OffPolicyAgent):
+    """Deep deterministic policy gradient (Lillicrap et al. 2015), for continuous and Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = ddpg
+
+
+class TD3(OffPolicyAgent):
+    """Twin delayed DDPG (Fujimoto et al. 2018), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = td3
+
+
+class DQN(OffPolicyAgent):
+    """Deep Q-learning (Mnih et al. 2015), for Discrete actions; double, dueling and n-step by option."""
+
+    algorithm: ClassVar[ModuleType] = dqn
+
+
+class QRDQN(OffPolicyAgent):
+    """Quantile regression DQN (Dabney et al. 2018), for Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = qrdqn
+
+
+class TQC(OffPolicyAgent):
+    """Truncated quantile critics (Kuznetsov et al. 2020), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = tqc
+
+
+class CrossQ(OffPolicyAgent):
+    """SAC with batch renormalisation instead of target networks (Bhatt et al. 2024), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = crossq

@@ -1,0 +1,142 @@
+"""Advantage actor-critic: one gradient step on each short rollout.
+
+Source: Mnih et al. 2016, "Asynchronous Methods for Deep Reinforcement Learning" (arXiv 1602.01783, algorithm S3), in its
+synchronous form: all environments step together and the gradient is that of all their steps. With advantages ``A`` and the
+value's targets ``R = A + V_old``::
+
+    loss = -mean log pi(a | s) A + vf_coef mean (V(s) - R)^2 - ent_coef mean entropy(pi(. | s))
+
+By default advantages sum the rewards to the rollout's end and add the value there (``gae_lambda`` 1), and the optimizer is
+RMSprop, as in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms.actor_critic import (
+    ActorCritic,
+    OnPolicyConfig,
+    Samples,
+    action_kind,
+    check_flag,
+    entropy_of,
+    explained_variance,
+    is_value,
+    masked_mean,
+    samples,
+    standardised,
+)
+from rejeu.algorithms.ppo import descend
+from rejeu.config import number
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.schedules import Schedule, at
+from rejeu.spaces import check_action, leaves
+
+RMSPROP_DECAY = 0.99
+"""Share of RMSprop's running mean of squared gradients that stays at each step (the paper's alpha)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(OnPolicyConfig):
+    """Hyper-parameters of A2C; the defaults are Stable-Baselines3's."""
+
+    learning_rate: float | Schedule = 7e-4
+    """Step size of the optimizer; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
+    ``"lin_7e-4"``. Raising it learns faster until it diverges."""
+    n_steps: int = 5
+    """Steps of each environment between two updates. Raising it estimates the gradient better and updates more rarely."""
+    gae_lambda: float = 1.0
+    """Mixes advantages of all lengths, in [0, 1]: 0 trusts the value after one step, 1 sums all rewards of the rollout.
+    Raising it has less bias and more variance."""
+    normalize_advantage: bool = False
+    """Scale the advantages of every rollout to mean 0 and standard deviation 1."""
+    use_rms_prop: bool = True
+    """Use RMSprop as the paper does; False uses Adam."""
+    rms_prop_eps: float = 1e-5
+    """Added to the optimizer's denominator. Raising it shortens the steps of rarely used weights."""
+
+    name: ClassVar[str] = "A2C"
+
+    def __post_init__(self) -> None:
+        OnPolicyConfig.__post_init__(self)
+        check_flag("use_rms_prop", self.use_rms_prop)
+        object.__setattr__(self, "rms_prop_eps", number("rms_prop_eps", self.rms_prop_eps, above=0))
+
+
+class State(eqx.Module):
+    """Everything that A2C learns, every leaf an array."""
+
+    network: ActorCritic
+    optimizer: PyTree
+    n_updates: Array
+    """Gradient steps so far, ``int32[]``."""
+
+
+class Losses(NamedTuple):
+    """What a rollout came to, each ``float32[]``."""
+
+    policy_loss: Array
+    value_loss: Array
+    entropy: Array
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns A2C for these spaces.
+
+    Raises:
+        ValueError: if no policy can act in the action space.
+    """
+    check_action(action_space, config.name)
+    obs_leaves, kind = leaves(observation_space), action_kind(action_space)
+    eps = config.rms_prop_eps
+    optimizer = (
+        optax.scale_by_rms(RMSPROP_DECAY, eps, initial_scale=1.0)
+        if config.use_rms_prop
+        else optax.scale_by_adam(eps=eps)
+    )
+
+    def init(key: Array) -> State:
+        network = ActorCritic(key, obs_leaves, kind, config.policy_kwargs)
+        return State(network, optimizer.init(network), jnp.int32(0))
+
+    def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
+        return actor.policy(obs).sample(key)
+
+    def exploit(actor: ActorCritic, obs: PyTree) -> Array:
+        return actor.policy(obs).mode()
+
+    def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
+        data = samples(state.network, rollout, config.gae_lambda)
+        if config.normalize_advantage:
+            data = data._replace(advantage=standardised(data.advantage, data.valid))
+        (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.network, data, config, clock)
+        network, optimizer_state = descend(
+            state.network, state.optimizer, gradients, is_value(state.network), optimizer, config, clock
+        )
+        metrics = losses._asdict()
+        metrics["explained_variance"] = explained_variance(data.value, data.target, data.valid)
+        if network.log_std is not None:
+            metrics["std"] = jnp.mean(jnp.exp(network.log_std))
+        return State(network, optimizer_state, state.n_updates + 1), metrics
+
+    return Algorithm(init, lambda state: state.network, explore, exploit, update)
+
+
+def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
+    """Returns the whole loss of a rollout, and its parts (see the top of this file)."""
+    distribution, value = network.both(batch.obs)
+    log_prob = distribution.log_prob(batch.action)
+    policy_loss = -masked_mean(batch.advantage * log_prob, batch.valid)
+    value_loss = masked_mean(jnp.square(value - batch.target), batch.valid)
+    entropy = masked_mean(entropy_of(distribution, log_prob), batch.valid)
+    total = policy_loss + config.vf_coef * value_loss - at(config.ent_coef, clock.progress) * entropy
+    return total, Losses(policy_loss, value_loss, entropy)

@@ -1,0 +1,136 @@
+"""The loop of off-policy learning: environments fill a replay buffer, and gradients are taken on batches of it.
+
+:func:`off_policy` is a generator: it trains, and whoever iterates it decides what else happens. One turn is one step of
+all environments::
+
+    environments step        while the update of the turn before still runs in XLA's own threads
+    the ring keeps the step; episodes that ended are counted and begun anew
+    actions are asked for    of the device, which chooses them as soon as that update is done
+    batches are drawn        meanwhile
+    the update is queued     one gradient step per environment step by default, all in one call
+    the actions are read     while it begins
+
+So the environments never wait for the gradient nor the gradient for them, and yet every number depends on the seed
+alone: the action at a step always follows the update of the step before the last.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jax import Array
+
+from rejeu.config import OffPolicyConfig
+from rejeu.core import Clock
+from rejeu.loops.compiled import Compiled
+from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, restart
+from rejeu.spaces import action_scaler, random_action
+
+
+def off_policy(
+    run: Run, compiled: Compiled, config: OffPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
+) -> Iterator[Progress]:
+    """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
+
+    Args:
+        run: mutated; consistent whenever the generator has yielded.
+        compiled: the algorithm.
+        config: its hyper-parameters.
+        n_steps: over all environments; where their number does not divide it, the last turn keeps as many as remain.
+        progress: gives the fraction of the run that is done after so many steps of it; schedules follow it.
+
+    Raises:
+        BadEnvironmentError: if a reward is not a finite number.
+    """
+    env, n_envs, scale = run.env, run.env.n_envs, action_scaler(run.env.action_space)
+    first, last = run.step, None if n_steps is None else run.step + n_steps
+    began = time.perf_counter() - run.seconds["total"]
+    per_turn = updates_per_turn(config, n_envs)
+    if run.obs is None:
+        restart(run)
+        run.replay.begin(run.obs)
+    if run.action is None:
+        run.action = np.asarray(choose_or_draw(run, compiled, config, clock_of(run, 0.0)))
+    while last is None or run.step < last:
+        active = None if last is None or last - run.step >= n_envs else np.arange(last - run.step)
+        t0 = time.perf_counter()
+        step = env.step(scale(run.action))
+        t1 = time.perf_counter()
+        check_rewards(step, env, run.step)
+        run.replay.add(run.action, step.reward, step.terminated, step.obs, active)
+        taken = n_envs if active is None else len(active)
+        run.step += taken
+        run.seconds["total"] = t1 - began
+        episodes = book(run, step, active)
+        t2 = time.perf_counter()
+        if run.ended.any():
+            run.obs = env.reset_done(run.ended)
+        else:
+            run.obs = step.obs
+        t3 = time.perf_counter()
+        if run.ended.any():
+            run.replay.begin(run.obs, np.flatnonzero(run.ended))
+
+        done = progress(run.step - first)
+        n_updates = due(run, config, taken, len(episodes))
+        sizes = chunks(n_updates, per_turn)
+        t4 = time.perf_counter()
+        clock = clock_of(run, done)
+        chosen = choose_or_draw(run, compiled, config, clock)
+        t5 = time.perf_counter()
+        samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
+        t6 = time.perf_counter()
+        run.replay.reprioritise(run.td_errors)
+        run.td_errors = []
+        for batch in samples:
+            run.state, run.metrics, td_error = compiled.update(run.state, batch, clock)
+            if td_error is not None:
+                run.td_errors.append(td_error)
+        run.n_updates += n_updates
+        run.action = np.asarray(chosen)
+        t7 = time.perf_counter()
+        run.seconds["env"] += (t1 - t0) + (t3 - t2)
+        run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)
+        run.seconds["update"] += (t5 - t4) + (t7 - t6)
+        run.seconds["total"] = t7 - began
+        yield Progress(run.step, episodes, run.metrics)
+
+
+def choose_or_draw(run: Run, compiled: Compiled, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
+    """Returns random actions at first, then the exploring policy's; see :func:`rejeu.loops.host.choose`."""
+    if run.step < config.learning_starts:
+        return random_action(run.env.action_space, run.env.n_envs, run.rng)
+    return choose(run, compiled, clock)
+
+
+def due(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> int:
+    """Returns how many gradient steps this turn owes; counts what has passed since the last ones."""
+    if run.step <= run.learn_from:
+        return 0
+    taken = min(taken, run.step - run.learn_from)
+    run.steps_since_update += taken
+    if isinstance(config.train_freq, int):
+        run.owed += taken
+        every = config.train_freq
+    else:
+        run.owed += ended
+        every = config.train_freq[0]
+    times, run.owed = divmod(run.owed, every)
+    if not times or not run.replay.size():
+        return 0
+    steps, run.steps_since_update = run.steps_since_update, 0
+    return steps if config.gradient_steps == -1 else times * config.gradient_steps
+
+
+def updates_per_turn(config: OffPolicyConfig, n_envs: int) -> int:
+    """Returns how many gradient steps one turn usually owes: the size for which the scan is compiled, at most 64."""
+    if isinstance(config.train_freq, int) and config.gradient_steps > 0:
+        return min(max(n_envs // config.train_freq, 1) * config.gradient_steps, 64)
+    return 16
+
+
+def chunks(n: int, usual: int) -> list[int]:
+    """Returns ``n`` as a sum of the usual size and of ones, so that only two sizes are ever compiled."""
+    return [usual] * (n // usual) + [1] * (n % usual)

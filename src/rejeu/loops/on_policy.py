@@ -1,0 +1,76 @@
+"""The loop of on-policy learning: environments fill a rollout under one policy, and the policy learns from all of it.
+
+:func:`on_policy` is a generator: it trains, and whoever iterates it decides what else happens. One turn is one step of all
+environments; where it fills the rollout, the update follows, one call into compiled code for all epochs and minibatches.
+Acting costs one call for all environments, and gives actions only: the values and log-probabilities that learning needs
+are computed with the update, in one pass over the rollout.
+
+The rollout is handed to XLA as it lies in memory, and written to again only after the next actions were read, which the
+update must precede.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.loops.compiled import Compiled
+from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, restart
+from rejeu.spaces import action_scaler
+
+
+def on_policy(
+    run: Run, compiled: Compiled, config: OnPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
+) -> Iterator[Progress]:
+    """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
+
+    What a last rollout holds that is not full is learnt from as well.
+
+    Args:
+        run: mutated; consistent whenever the generator has yielded. ``run.replay`` is a rollout buffer.
+        compiled: the algorithm.
+        config: its hyper-parameters.
+        n_steps: over all environments; where their number does not divide it, the last turn keeps as many as remain.
+        progress: gives the fraction of the run that is done after so many steps of it; schedules follow it.
+
+    Raises:
+        BadEnvironmentError: if a reward is not a finite number.
+    """
+    env, n_envs, scale, rollout = run.env, run.env.n_envs, action_scaler(run.env.action_space), run.replay
+    first, last = run.step, None if n_steps is None else run.step + n_steps
+    began = time.perf_counter() - run.seconds["total"]
+    if run.obs is None:
+        restart(run)
+        rollout.begin(run.carry, run.ended)
+    while last is None or run.step < last:
+        active = None if last is None or last - run.step >= n_envs else np.arange(last - run.step)
+        t0 = time.perf_counter()
+        clock = clock_of(run, progress(run.step - first))
+        run.action = np.asarray(choose(run, compiled, clock))
+        rollout.observe(run.obs)
+        t1 = time.perf_counter()
+        step = env.step(scale(run.action))
+        t2 = time.perf_counter()
+        check_rewards(step, env, run.step)
+        valid = True if active is None else np.arange(n_envs) < len(active)
+        rollout.add(run.action, step.reward, step.terminated, step.truncated, step.obs, valid)
+        run.step += n_envs if active is None else len(active)
+        run.seconds["total"] = t2 - began
+        episodes = book(run, step, active)
+        t3 = time.perf_counter()
+        run.obs = env.reset_done(run.ended) if run.ended.any() else step.obs
+        t4 = time.perf_counter()
+        if rollout.full or run.step == last:
+            clock = clock_of(run, progress(run.step - first))
+            run.state, run.metrics, _ = compiled.update(run.state, rollout.rollout(), clock)
+            run.n_updates += config.gradient_steps(rollout.size())
+            rollout.begin(run.carry, run.ended)
+        t5 = time.perf_counter()
+        run.seconds["env"] += (t2 - t1) + (t4 - t3)
+        run.seconds["replay"] += t3 - t2
+        run.seconds["update"] += (t1 - t0) + (t5 - t4)
+        run.seconds["total"] = t5 - began
+        yield Progress(run.step, episodes, run.metrics)

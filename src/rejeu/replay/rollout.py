@@ -1,0 +1,174 @@
+"""What on-policy learning keeps of experience: the steps since the policy last changed, and their advantages.
+
+Source of the advantages: Schulman et al. 2016, "High-Dimensional Continuous Control Using Generalized Advantage
+Estimation" (arXiv 1506.02438, equations 11 and 16), with the discount of each step in place of one gamma, so that a time
+limit bootstraps from the state it was reached in and a terminal state from nothing::
+
+    delta_t = r_t + discount_t V(s'_t) - V(s_t)
+    A_t     = delta_t + discount_t lambda A_{t+1},           the last term 0 where an episode or the rollout ends
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu.core import PyTree, Rollout
+from rejeu.spaces import Leaf
+
+
+class RolloutBuffer:
+    """The steps of all environments since the last update. Mutable; ``add`` writes in place."""
+
+    def __init__(
+        self,
+        n_steps: int,
+        n_envs: int,
+        obs_leaves: tuple[Leaf, ...],
+        obs_structure: Any,
+        action_shape: tuple[int, ...],
+        action_dtype: Any,
+        gamma: float,
+    ) -> None:
+        """Reserves ``n_steps`` steps of each environment."""
+        self.n_steps, self.n_envs, self.gamma = n_steps, n_envs, gamma
+        self.obs_structure = obs_structure
+        shape = (n_steps, n_envs)
+        make = lambda: [np.zeros((*shape, *leaf.shape), leaf.dtype) for leaf in obs_leaves]  # noqa: E731
+        self.obs, self.next_obs = make(), make()
+        self.action = np.zeros((*shape, *action_shape), action_dtype)
+        self.reward = np.zeros(shape, np.float32)
+        self.discount = np.zeros(shape, np.float32)
+        self.ended = np.zeros(shape, bool)
+        self.valid = np.zeros(shape, bool)
+        self.started = np.zeros(n_envs, bool)
+        """Where an episode began with the first step, ``(n_envs,)``."""
+        self.carry: PyTree = ()
+        """What the policy remembered before the first step, leaves ``(n_envs, ...)``."""
+        self.length = 0
+        """Steps of each environment kept so far."""
+
+    @property
+    def full(self) -> bool:
+        """Whether no further step fits in."""
+        return self.length == self.n_steps
+
+    def size(self) -> int:
+        """Returns the number of steps kept, over all environments."""
+        return int(self.valid[: self.length].sum())
+
+    def begin(self, carry: PyTree, started: np.ndarray) -> None:
+        """Begins a rollout, forgetting the one before.
+
+        Args:
+            carry: what the policy remembers before its first step.
+            started: where an episode begins with it, ``bool (n_envs,)``.
+        """
+        self.length = 0
+        self.carry, self.started = carry, started.copy()
+
+    def observe(self, obs: PyTree) -> None:
+        """Notes the observations ``(n_envs, ...)`` that the next step starts from."""
+        for store, leaf in zip(self.obs, jax.tree.leaves(obs), strict=True):
+            store[self.length] = leaf
+
+    def add(
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        truncated: np.ndarray,
+        next_obs: PyTree,
+        valid: np.ndarray | bool = True,
+    ) -> None:
+        """Records one step of every environment, ``(n_envs, ...)``; only those where ``valid`` count.
+
+        The observations that it started from were given to :meth:`observe`.
+        """
+        t = self.length
+        for store, leaf in zip(self.next_obs, jax.tree.leaves(next_obs), strict=True):
+            store[t] = leaf
+        self.action[t] = action
+        self.reward[t] = reward
+        self.discount[t] = np.where(terminated, 0.0, self.gamma)
+        self.ended[t] = terminated | truncated
+        self.valid[t] = valid
+        self.length += 1
+
+    def rollout(self, n_steps: int | None = None) -> Rollout:
+        """Returns what is kept, padded to ``n_steps`` (None: all that was reserved); views, so use them before adding."""
+        n = self.n_steps if n_steps is None else n_steps
+        self.valid[self.length :] = False
+        tree = lambda stores: jax.tree.unflatten(self.obs_structure, [store[:n] for store in stores])  # noqa: E731
+        return Rollout(
+            tree(self.obs),
+            self.action[:n],
+            self.reward[:n],
+            tree(self.next_obs),
+            self.discount[:n],
+            self.ended[:n],
+            self.valid[:n],
+            self.started,
+            self.carry,
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns everything kept, as named arrays ``(steps, n_envs, ...)``."""
+        stored = {f"obs.{i}": store for i, store in enumerate(self.obs)}
+        stored |= {f"next_obs.{i}": store for i, store in enumerate(self.next_obs)}
+        stored |= {name: getattr(self, name) for name in ("action", "reward", "discount", "ended", "valid")}
+        return {name: array[: self.length] for name, array in stored.items()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Puts back what :meth:`arrays` returned.
+
+        Raises:
+            ValueError: if names, shapes or dtypes are not those of this buffer; nothing is then changed.
+        """
+        self.length, length = self.n_steps, self.length
+        own = self.arrays()
+        self.length = length
+        if {*own} != {*arrays}:
+            raise ValueError(f"the file and this buffer differ in the arrays {sorted({*own} ^ {*arrays})}")
+        n = len(arrays["reward"])
+        for name, array in own.items():
+            given = arrays[name]
+            if given.shape[1:] != array.shape[1:] or given.dtype != array.dtype or len(given) != n or n > self.n_steps:
+                raise ValueError(
+                    f"{name} in the file is {given.dtype}{list(given.shape)}, expected {array.dtype} and at most "
+                    f"{list(array.shape)}"
+                )
+        for name, array in own.items():
+            array[:n] = arrays[name]
+        self.length = n
+
+
+def advantages(
+    reward: Array, value: Array, next_value: Array, discount: Array, ended: Array, gae_lambda: float
+) -> Array:
+    """Returns the generalised advantage estimates, ``(steps, n_envs)``.
+
+    Args:
+        reward: ``(steps, n_envs)``, as are all others.
+        value: of the states that were left.
+        next_value: of their true successors, also where an episode ended.
+        discount: gamma, and 0 where the MDP terminated.
+        ended: where an episode ended, by terminal state or time limit.
+        gae_lambda: in [0, 1]. With 1 the advantage is the discounted sum of rewards to the episode's end (or, where it
+            was cut, to the cut and the value there) minus the value; with 0 it is the TD error.
+    """
+    delta = reward + discount * next_value - value
+    factor = jnp.where(ended, 0.0, gae_lambda * discount)
+
+    def back(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, factor = step
+        advantage = delta + factor * following
+        return advantage, advantage
+
+    _, result = jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, factor), reverse=True)
+    return result
