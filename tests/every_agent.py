@@ -101,7 +101,10 @@ def shared_functions(kind: Kind) -> Iterator[None]:
             _compiled[key] = Compiled(algorithm, noise)
         return copy.copy(_compiled[key])
 
-    with mock.patch.object(kind.agent.algorithm, "make", noted), mock.patch.object(agents.base, "Compiled", compile_once):
+    with (
+        mock.patch.object(kind.agent.algorithm, "make", noted),
+        mock.patch.object(agents.base, "Compiled", compile_once),
+    ):
         yield
 
 

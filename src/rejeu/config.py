@@ -18,12 +18,13 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Literal, TypeVar
 
-from rejeu import schedules
+from rejeu import running_stats, schedules
 from rejeu.errors import CheckpointError
 from rejeu.exploration import noise as action_noises
 from rejeu.networks import PolicyConfig
 from rejeu.replay.hindsight import HindsightConfig
 from rejeu.replay.prioritized import PriorityConfig
+from rejeu.running_stats import NormalizationConfig
 from rejeu.schedules import Schedule
 
 C = TypeVar("C")
@@ -68,6 +69,9 @@ class OffPolicyConfig:
     frame_stack: int | None = None
     """Observations are stacks of this many frames along the first axis; only the newest is stored and stacks are built
     when sampled, so the replay buffer takes that many times less memory. None stores observations as they are."""
+    normalize: NormalizationConfig | None = None
+    """Scale observations and rewards by what has been seen: True, or a dict with ``norm_obs``, ``norm_reward``,
+    ``clip_obs``, ``clip_reward``. The statistics are learnt and saved with the agent, which takes raw observations."""
     policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
     (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``) or a ``torso`` of your
@@ -102,6 +106,7 @@ class OffPolicyConfig:
             put("priorities", nested("priorities", PriorityConfig, self.priorities))
         if self.frame_stack is not None:
             put("frame_stack", whole("frame_stack", self.frame_stack, least=1))
+        put("normalize", running_stats.parse(self.normalize))
         put("policy_kwargs", nested("policy_kwargs", PolicyConfig, self.policy_kwargs))
         self._parse_replay()
 

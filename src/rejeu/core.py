@@ -69,6 +69,8 @@ class Rollout(NamedTuple):
     another."""
     valid: Any
     """Which steps there are, ``bool (steps, n_envs)``; the others are padding. Padding follows what is valid."""
+    running_return: Any
+    """The discounted sum of the rewards of the episode so far, ``sum_k gamma^k r_{t-k}``, ``(steps, n_envs)``."""
     started: Any
     """Where an episode began with the first step, ``bool (n_envs,)``."""
     carry: PyTree
@@ -86,16 +88,17 @@ class Clock(NamedTuple):
     """Fraction of the present ``learn`` call that is done, in [0, 1]."""
 
 
-class Memory(NamedTuple):
-    """How a policy acts whose actions depend on a *carry*: a small pytree per environment, begun anew with an episode."""
+class Explorer(NamedTuple):
+    """How training actions are chosen that depend on a *carry*: a small pytree that travels from step to step.
+
+    Its leaves have a leading axis of environments, or are shared by all; it is renewed where an episode begins.
+    """
 
     init: Callable[[PyTree, int], PyTree]
-    """``init(actor, n_envs) -> carry``, leaves ``(n_envs, ...)``; of ``actor`` only the shapes are used."""
-    explore: Callable[[PyTree, PyTree, PyTree, Array, Array, Clock], tuple[Array, PyTree]]
-    """``explore(carry, actor, obs, ended, key, clock) -> (action, carry)``; ``ended``, ``bool (n_envs,)``, is where an
+    """``init(actor, n_envs) -> carry``; of ``actor`` only the shapes are used."""
+    act: Callable[[PyTree, PyTree, PyTree, Array, Array, Clock], tuple[Array, PyTree]]
+    """``act(carry, actor, obs, ended, key, clock) -> (action, carry)``; ``ended``, ``bool (n_envs,)``, is where an
     episode has just begun."""
-    exploit: Callable[[PyTree, PyTree, PyTree, Array], tuple[Array, PyTree]]
-    """``exploit(carry, actor, obs, ended) -> (action, carry)``, the deterministic policy."""
 
 
 class Algorithm(NamedTuple):
@@ -116,8 +119,15 @@ class Algorithm(NamedTuple):
     """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns on a batch of
     :class:`Transition`, or for on-policy algorithms all the steps that one :class:`Rollout` is good for. The metrics are
     scalars, and under ``TD_ERROR`` the absolute TD errors ``(batch,)`` that prioritised replay goes by."""
-    memory: Memory | None = None
-    """How a policy acts that remembers earlier observations; None where it needs the present one alone."""
+    explorer: Explorer | None = None
+    """How training actions are chosen where that takes more than ``explore``; its carry is the policy's memory if it has
+    one. None where ``explore`` is all."""
+    recall: Callable[[PyTree, PyTree, PyTree, Array], tuple[Array, PyTree]] | None = None
+    """``recall(carry, actor, obs, ended) -> (action, carry)``: the deterministic policy where it has a memory, with the
+    carry of ``explorer``. None where the present observation is all that it needs."""
+    observe: Callable[[PyTree, PyTree, Array], PyTree] | None = None
+    """``observe(state, obs, running_return) -> state``: takes in observations ``(batch, ...)`` and discounted sums of
+    rewards ``(batch,)`` as they come, for statistics. None where the state needs no more than ``update``."""
 
 
 TD_ERROR = "td_error"

@@ -22,6 +22,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from rejeu import running_stats
 from rejeu.networks import MLP, Actor, Branches, Critic, SimBa, convolutions
 from rejeu.spaces import Leaf
 
@@ -35,6 +36,8 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
         state: the algorithm's state, of arrays or of their shapes; its fields named ``target_...`` are passed over.
         leaves: those of the observations.
     """
+    if isinstance(state, running_stats.State):
+        state = state.learner
     fields = [(field.name, getattr(state, field.name)) for field in dataclasses.fields(state)]
     networks = {
         name: network

@@ -25,6 +25,7 @@ from rejeu.envs.auto_reset import AutoResetView
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
+from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.history import History
 from rejeu.interrupt import Interrupt
@@ -32,6 +33,7 @@ from rejeu.logging import Console, Sink, TensorBoard, next_folder
 from rejeu.loops import host
 from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.loops.host import Episode, Progress, Run
+from rejeu.running_stats import normalised
 
 Callback = Callable[["Agent", Progress], bool | None]
 """Called after every step of the environments; ``False``, and nothing else, stops training."""
@@ -123,7 +125,11 @@ class Agent(ABC):
         noise = self._noise()
         if noise is not None:
             check_fits(noise, action_space)
-        self._compiled = Compiled(self.algorithm.make(self.config, observation_space, action_space), noise)
+        algorithm = self.algorithm.make(self.config, observation_space, action_space)
+        if self.config.normalize is not None:
+            explorer = exploration.make(algorithm, noise)
+            algorithm = normalised(algorithm, explorer, self._obs_leaves, self.config.normalize)
+        self._compiled = Compiled(algorithm, noise)
         compilation.start_device(self._work(n_envs))
 
     def _work(self, n_envs: int) -> float:

@@ -21,12 +21,13 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu import schedules
+from rejeu import running_stats, schedules
 from rejeu.config import nested, number, whole
 from rejeu.core import Masked, PyTree, Rollout
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
 from rejeu.networks import Convolution, Encoder, Linear, PolicyConfig, Torso, make_torso
 from rejeu.replay.rollout import advantages
+from rejeu.running_stats import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
 
@@ -109,6 +110,9 @@ class OnPolicyConfig:
     optimizer for both. Needs ``share_layers=False``, and of images ``share_features_extractor=False``."""
     normalize_advantage: bool = True
     """Scale the advantages of every batch to mean 0 and standard deviation 1."""
+    normalize: NormalizationConfig | None = None
+    """Scale observations and rewards by what has been seen: True, or a dict with ``norm_obs``, ``norm_reward``,
+    ``clip_obs``, ``clip_reward``. The statistics are learnt and saved with the agent, which takes raw observations."""
     policy_kwargs: ActorCriticConfig = dataclasses.field(default_factory=ActorCriticConfig)
     """Shape of the networks: ``net_arch`` (also ``dict(pi=[...], vf=[...])``), ``activation_fn``, ``ortho_init``,
     ``log_std_init``, ``share_layers``, ``squash_output``, ``state_dependent_std``, ``layer_norm``, ``architecture`` or a
@@ -133,6 +137,7 @@ class OnPolicyConfig:
         if self.max_grad_norm is not None:
             put("max_grad_norm", number("max_grad_norm", self.max_grad_norm, above=0))
         check_flag("normalize_advantage", self.normalize_advantage)
+        put("normalize", running_stats.parse(self.normalize))
         put("policy_kwargs", nested("policy_kwargs", ActorCriticConfig, self.policy_kwargs))
         if self.critic_learning_rate is not None and self.policy_kwargs.share_layers:
             raise ValueError(

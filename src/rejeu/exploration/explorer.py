@@ -6,31 +6,23 @@ where an episode begins, and is saved with the run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Algorithm, Clock, PyTree
+from rejeu.core import Algorithm, Clock, Explorer, PyTree
 from rejeu.exploration import parameter_space
 from rejeu.exploration.noise import ActionNoise, Noise
 from rejeu.exploration.parameter_space import ParameterNoise
 
 
-class Explorer(NamedTuple):
-    """Pure functions over a carry, whose leaves are arrays with a leading axis of environments, or shared by all."""
-
-    init: Callable[[PyTree, int], PyTree]
-    """``init(actor, n_envs) -> carry``; of ``actor`` only the shapes are used."""
-    act: Callable[[PyTree, PyTree, PyTree, Array, Array, Clock], tuple[Array, PyTree]]
-    """``act(carry, actor, obs, ended, key, clock) -> (action, carry)``; ``ended``, ``bool (n_envs,)``, is where an
-    episode has just begun."""
-
-
 def make(algorithm: Algorithm, noise: Noise | None) -> Explorer:
-    """Returns how ``algorithm`` explores with ``noise`` (None: as it does by itself)."""
+    """Returns how ``algorithm`` explores with ``noise`` (None: as it does by itself).
+
+    An algorithm that brings an explorer of its own has seen to noise already.
+    """
+    if algorithm.explorer is not None:
+        return algorithm.explorer
     if noise is None:
         return plain(algorithm)
     if isinstance(noise, ParameterNoise):

@@ -32,6 +32,7 @@ class Compiled:
         """The state, of shapes in place of arrays."""
         packing = Packing(self.shapes)
         self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
+        self._observe_packer = HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
 
         @jax.jit
@@ -49,6 +50,11 @@ class Compiled:
         @partial(jax.jit, static_argnums=2)
         def exploit(state: PackedState, vectors: list[Array], plan: Packing) -> Array:
             return algorithm.exploit(algorithm.actor(packing.unpack(state)), plan.unpack(vectors))
+
+        @partial(jax.jit, donate_argnums=0, static_argnums=2)
+        def observe(state: PackedState, vectors: list[Array], plan: Packing) -> PackedState:
+            assert algorithm.observe is not None
+            return packing.pack(algorithm.observe(packing.unpack(state), *plan.unpack(vectors)))
 
         @partial(jax.jit, donate_argnums=0, static_argnums=2)
         def update(
@@ -76,7 +82,10 @@ class Compiled:
         """``pack(state) -> packed``: the inverse, likewise."""
         self.copy = jax.jit(copied)
         """``copy(packed) -> packed`` in buffers of its own."""
-        self._act, self._exploit, self._update = act, exploit, update
+        self.observe = None if algorithm.observe is None else self._observe_packed
+        """``observe(state, obs, running_return) -> state``, packed, whose predecessor is donated; None where the algorithm
+        has no use for it (see :class:`rejeu.core.Algorithm`)."""
+        self._act, self._exploit, self._observe, self._update = act, exploit, observe, update
 
     def act(
         self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
@@ -86,6 +95,9 @@ class Compiled:
         ``ended``, ``bool (n_envs,)``, is where an episode has just begun.
         """
         return self._act(state, carry, key, *self._act_packer((obs, ended, clock), len(ended)))
+
+    def _observe_packed(self, state: PackedState, obs: PyTree, running_return: Any) -> PackedState:
+        return self._observe(state, *self._observe_packer((obs, running_return), len(running_return)))
 
     def exploit(self, state: PackedState, obs: PyTree) -> Array:
         """Returns the deterministic actions for ``obs`` ``(batch, ...)``."""

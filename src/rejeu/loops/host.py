@@ -82,6 +82,8 @@ class Run:
     steps_since_update: int = 0
     episode_return: np.ndarray = field(default_factory=lambda: np.zeros(0))
     episode_length: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    running_return: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    """The discounted sum of each running episode's rewards, ``sum_k gamma^k r_{t-k}``, for scaling rewards."""
     metrics: Mapping[str, Array] | None = None
     td_errors: list[Array] = field(default_factory=list)
     """Of the newest updates, on their way to the priorities of the replay buffer, which get them one turn later."""
@@ -97,6 +99,7 @@ def restart(run: Run) -> None:
     run.ended = np.ones(n_envs, bool)
     run.episode_return = np.zeros(n_envs)
     run.episode_length = np.zeros(n_envs, np.int64)
+    run.running_return = np.zeros(n_envs, np.float32)
     run.action = None
 
 

@@ -59,6 +59,8 @@ def off_policy(
         step = env.step(scale(run.action))
         t1 = time.perf_counter()
         check_rewards(step, env, run.step)
+        if compiled.observe is not None:
+            run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
         run.replay.add(run.action, step.reward, step.terminated, step.obs, active)
         taken = n_envs if active is None else len(active)
         run.step += taken
@@ -73,6 +75,8 @@ def off_policy(
         if run.ended.any():
             run.replay.begin(run.obs, np.flatnonzero(run.ended))
 
+        if compiled.observe is not None:
+            run.state = compiled.observe(run.state, run.obs, run.running_return)
         done = progress(run.step - first)
         n_updates = due(run, config, taken, len(episodes))
         sizes = chunks(n_updates, per_turn)

@@ -56,7 +56,8 @@ def on_policy(
         t2 = time.perf_counter()
         check_rewards(step, env, run.step)
         valid = True if active is None else np.arange(n_envs) < len(active)
-        rollout.add(run.action, step.reward, step.terminated, step.truncated, step.obs, valid)
+        run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
+        rollout.add(run.action, step.reward, step.terminated, step.truncated, step.obs, run.running_return, valid)
         run.step += n_envs if active is None else len(active)
         run.seconds["total"] = t2 - began
         episodes = book(run, step, active)

@@ -46,6 +46,7 @@ class RolloutBuffer:
         self.discount = np.zeros(shape, np.float32)
         self.ended = np.zeros(shape, bool)
         self.valid = np.zeros(shape, bool)
+        self.running_return = np.zeros(shape, np.float32)
         self.started = np.zeros(n_envs, bool)
         """Where an episode began with the first step, ``(n_envs,)``."""
         self.carry: PyTree = ()
@@ -84,6 +85,7 @@ class RolloutBuffer:
         terminated: np.ndarray,
         truncated: np.ndarray,
         next_obs: PyTree,
+        running_return: np.ndarray | float = 0.0,
         valid: np.ndarray | bool = True,
     ) -> None:
         """Records one step of every environment, ``(n_envs, ...)``; only those where ``valid`` count.
@@ -98,6 +100,7 @@ class RolloutBuffer:
         self.discount[t] = np.where(terminated, 0.0, self.gamma)
         self.ended[t] = terminated | truncated
         self.valid[t] = valid
+        self.running_return[t] = running_return
         self.length += 1
 
     def rollout(self, n_steps: int | None = None) -> Rollout:
@@ -113,6 +116,7 @@ class RolloutBuffer:
             self.discount[:n],
             self.ended[:n],
             self.valid[:n],
+            self.running_return[:n],
             self.started,
             self.carry,
         )
@@ -121,7 +125,9 @@ class RolloutBuffer:
         """Returns everything kept, as named arrays ``(steps, n_envs, ...)``."""
         stored = {f"obs.{i}": store for i, store in enumerate(self.obs)}
         stored |= {f"next_obs.{i}": store for i, store in enumerate(self.next_obs)}
-        stored |= {name: getattr(self, name) for name in ("action", "reward", "discount", "ended", "valid")}
+        stored |= {
+            name: getattr(self, name) for name in ("action", "reward", "discount", "ended", "valid", "running_return")
+        }
         return {name: array[: self.length] for name, array in stored.items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
