@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -23,6 +23,8 @@ from rejeu.spaces import cast, flat_keys, leaves, plain, structure
 
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
+SUCCESS_KEYS = ("is_success", "success")
+"""Where an info says whether the goal was reached; the first that is there counts."""
 
 
 class Step(NamedTuple):
@@ -56,14 +58,47 @@ class VectorEnv(ABC):
     """The time limit, where it is known."""
     reward_threshold: float | None = None
     """The return at which the environment counts as solved, where it declares one."""
+    _obs: Any
+    """The observations last returned."""
 
     @abstractmethod
     def reset(self, seed: int | None = None) -> Any:
         """Starts an episode in every environment and returns the observations ``(n_envs, ...)``."""
 
+    def step(self, action: np.ndarray, active: np.ndarray | None = None) -> Step:
+        """Steps every environment, or only the ``active`` ones.
+
+        Those left out keep their observation, get the reward 0 and have not ended. A Gymnasium vector environment can only
+        be stepped as a whole, so there they move on unseen; on any backend, reset them before they are stepped again.
+
+        Args:
+            action: in the environment's own range, ``(n_envs, ...)``; the rows of those left out are ignored.
+            active: ``bool (n_envs,)``; None for all.
+
+        Raises:
+            ValueError: if ``active`` is no such array, or leaves out every environment.
+
+        >>> vector = make_vector("Pendulum-v1", 2, "gymnasium", seed=0)
+        >>> obs = vector.reset().copy()
+        >>> step = vector.step(np.ones((2, 1)), active=np.array([True, False]))
+        >>> (step.obs == obs).all(axis=1).tolist(), (step.reward == 0.0).tolist()
+        ([False, True], [False, True])
+        """
+        if active is None:
+            return self._step_all(action)
+        if not isinstance(active, np.ndarray) or active.dtype != bool or active.shape != (self.n_envs,):
+            raise ValueError(f"active={active!r} must be a bool array of shape ({self.n_envs},), or None for all")
+        if not active.any():
+            raise ValueError("active leaves out every environment, so there is nothing to step")
+        return self._step_all(action) if active.all() else self._step_some(action, active)
+
     @abstractmethod
-    def step(self, action: np.ndarray) -> Step:
-        """Steps every environment; ``action`` is in the environment's own range, ``(n_envs, ...)``."""
+    def _step_all(self, action: np.ndarray) -> Step:
+        """Steps every environment."""
+
+    @abstractmethod
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        """Steps those that are ``active``, which are neither none nor all."""
 
     @abstractmethod
     def reset_done(self, done: np.ndarray) -> Any:
@@ -178,15 +213,20 @@ class InProcess(VectorEnv):
             self._store(i, obs)
         return self._obs
 
-    def step(self, action: np.ndarray) -> Step:
-        reward = np.empty(self.n_envs, np.float32)
-        terminated = np.empty(self.n_envs, bool)
-        truncated = np.empty(self.n_envs, bool)
-        info = []
-        for i, env in enumerate(self.envs):
-            obs, reward[i], terminated[i], truncated[i], env_info = env.step(action[i])
+    def _step_all(self, action: np.ndarray) -> Step:
+        return self._step_each(range(self.n_envs), action)
+
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        return self._step_each(np.flatnonzero(active).tolist(), action)
+
+    def _step_each(self, which: Iterable[int], action: np.ndarray) -> Step:
+        reward = np.zeros(self.n_envs, np.float32)
+        terminated = np.zeros(self.n_envs, bool)
+        truncated = np.zeros(self.n_envs, bool)
+        info: list[dict[str, Any]] = [{}] * self.n_envs
+        for i in which:
+            obs, reward[i], terminated[i], truncated[i], info[i] = self.envs[i].step(action[i])
             self._store(i, obs)
-            info.append(env_info)
         return Step(self._obs, reward, terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
@@ -243,34 +283,71 @@ class GymnasiumVector(VectorEnv):
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
+        self._over = np.zeros(self.n_envs, bool)
+        """Which have ended and were not reset since; none where they reset themselves."""
+        self._strayed = np.zeros(self.n_envs, bool)
+        """Which have moved on unseen and were not reset since."""
 
     def reset(self, seed: int | None = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        return cast(self.observation_space, self._leaves, self.env.reset(seed=seed)[0])
+        self._obs = self._after_reset = cast(self.observation_space, self._leaves, self.env.reset(seed=seed)[0])
+        self._over, self._strayed = np.zeros((2, self.n_envs), bool)
+        return self._obs
 
-    def step(self, action: np.ndarray) -> Step:
+    def _step_all(self, action: np.ndarray) -> Step:
         obs, reward, terminated, truncated, info = self.env.step(action)
         obs = cast(self.observation_space, self._leaves, obs)
+        over = terminated | truncated
         if self._same_step:
             self._after_reset = obs
-            done = np.flatnonzero(terminated | truncated)
+            done = np.flatnonzero(over)
             if len(done):
                 obs = jax.tree.map(np.copy, obs)
                 for i in done.tolist():
                     _put(obs, i, plain(self.observation_space, info["final_obs"][i]))
+        else:
+            self._over = over
+        self._obs = obs
         return Step(obs, np.asarray(reward, np.float32), terminated, truncated, info)
 
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        rest = ~active
+        before = jax.tree.map(lambda leaf: leaf[rest], self._obs)
+        if (self._over & rest).any():
+            self._reset_masked(self._over & rest)
+        action = np.array(action)
+        action[rest] = action[np.argmax(active)]  # the rows of those left out may hold anything, yet are stepped
+        step = self._step_all(action)
+        self._strayed |= rest
+        self._obs = _replaced(step.obs, rest, before)
+        reward = np.where(active, step.reward, np.float32(0.0))
+        return Step(self._obs, reward, step.terminated & active, step.truncated & active, step.info)
+
     def reset_done(self, done: np.ndarray) -> Any:
-        if self._same_step:
-            return self._after_reset
-        return cast(
-            self.observation_space, self._leaves, self.env.reset(options={"reset_mask": np.asarray(done, bool)})[0]
-        )
+        done = np.asarray(done, bool)
+        if not self._same_step:
+            self._obs = self._reset_masked(done)
+        elif not (done & self._strayed).any():
+            self._obs = self._after_reset
+        elif done.all():
+            self._obs = self._after_reset = self.reset()
+        elif isinstance(self.env.unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
+            self._obs = self._after_reset = self._reset_masked(done & self._strayed)
+        else:
+            raise ValueError(
+                f"{type(self.env.unwrapped).__name__} resets by itself and was stepped while some environments were left "
+                "out, so those cannot begin anew one by one; reset all, or make it with autoreset_mode=DISABLED"
+            )
+        self._over, self._strayed = self._over & ~done, self._strayed & ~done
+        return self._obs
+
+    def _reset_masked(self, mask: np.ndarray) -> Any:
+        return cast(self.observation_space, self._leaves, self.env.reset(options={"reset_mask": mask})[0])
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
-        for key in ("is_success", "success"):
+        for key in SUCCESS_KEYS:
             if key in info and info.get(f"_{key}", np.ones(self.n_envs, bool))[env]:
                 return float(info[key][env])
         return float("nan")
@@ -301,7 +378,6 @@ class EnvPool(VectorEnv):
         self.max_episode_steps = int(self._pool.spec.config.max_episode_steps)
         self.reward_threshold = self._pool.spec.reward_threshold
         self._leaves = leaves(self.observation_space)
-        self._obs: Any = None
 
     def _make(self, seed: int | None) -> Any:
         import envpool
@@ -320,18 +396,29 @@ class EnvPool(VectorEnv):
         self._obs = cast(self.observation_space, self._leaves, self._pool.reset()[0])
         return self._obs
 
-    def step(self, action: np.ndarray) -> Step:
+    def _step_all(self, action: np.ndarray) -> Step:
         obs, reward, terminated, truncated, info = self._pool.step(action)
         self._obs = cast(self.observation_space, self._leaves, obs)
         return Step(self._obs, np.asarray(reward, np.float32), terminated, truncated, info)
 
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        ids = np.flatnonzero(active).astype(np.int32)
+        obs, reward, terminated, truncated, info = self._pool.step(np.asarray(action)[ids], ids)  # rows in order of ids
+        self._obs = _replaced(self._obs, ids, cast(self.observation_space, self._leaves, obs))
+
+        def spread(part: np.ndarray, dtype: Any) -> np.ndarray:
+            whole = np.zeros(self.n_envs, dtype)
+            whole[ids] = part
+            return whole
+
+        said = {key: spread(info[key], info[key].dtype) for key in SUCCESS_KEYS if key in info}
+        return Step(self._obs, spread(reward, np.float32), spread(terminated, bool), spread(truncated, bool), said)
+
     def reset_done(self, done: np.ndarray) -> Any:
         ended = np.flatnonzero(done).astype(np.int32)
         fresh = cast(self.observation_space, self._leaves, self._pool.reset(ended)[0])
-        obs = jax.tree.map(np.copy, self._obs)
-        jax.tree.map(lambda whole, part: whole.__setitem__(ended, part), obs, fresh)
-        self._obs = obs
-        return obs
+        self._obs = _replaced(self._obs, ended, fresh)
+        return self._obs
 
     def success(self, step: Step, env: int) -> float:
         value = step.info.get("is_success", step.info.get("success"))
@@ -380,6 +467,13 @@ def success_of(info: dict[str, Any]) -> float:
     """Returns 1.0 or 0.0 as an info dict says under ``is_success`` or ``success``, NaN if it says neither."""
     value = info.get("is_success", info.get("success"))
     return float("nan") if value is None else float(np.all(value))
+
+
+def _replaced(batch: Any, rows: np.ndarray, part: Any) -> Any:
+    """Returns a copy of a batch in which ``rows``, indices or a mask, are those of ``part``."""
+    batch = jax.tree.map(np.copy, batch)
+    jax.tree.map(lambda whole, new: whole.__setitem__(rows, new), batch, part)
+    return batch
 
 
 def _put(batch: Any, i: int, one: Any) -> None:
