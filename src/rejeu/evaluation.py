@@ -77,13 +77,14 @@ class Evaluation:
         return text
 
 
-def evaluate(policy: Callable[[Any], np.ndarray], env: VectorEnv, episodes: int) -> Evaluation:
+def evaluate(policy: Callable[[Any, np.ndarray], np.ndarray], env: VectorEnv, episodes: int) -> Evaluation:
     """Plays ``episodes`` whole episodes and returns what they came to.
 
     Every environment plays its own fixed share of the episodes, so that short ones are not counted more often.
 
     Args:
-        policy: maps observations ``(n_envs, ...)`` to actions in the algorithm's range.
+        policy: maps observations ``(n_envs, ...)``, and where an episode begins with one, ``bool (n_envs,)``, to actions in
+            the algorithm's range.
         env: reset at the beginning; left wherever the last episode ended.
         episodes: at least 1.
     """
@@ -93,9 +94,9 @@ def evaluate(policy: Callable[[Any], np.ndarray], env: VectorEnv, episodes: int)
     played = np.zeros(env.n_envs, int)
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
     rows: list[tuple[float, int, float]] = []
-    obs = env.reset()
+    obs, done = env.reset(), np.ones(env.n_envs, bool)
     while len(rows) < episodes:
-        step = env.step(scale_action(env.action_space, policy(obs)))
+        step = env.step(scale_action(env.action_space, policy(obs, done)))
         total += step.reward
         length += 1
         done = step.terminated | step.truncated
@@ -123,7 +124,7 @@ def evaluate_policy(
     """Plays whole episodes and returns mean and standard deviation of the return, as Stable-Baselines3 does.
 
     Args:
-        model: anything with ``predict(obs, deterministic=...) -> (action, state)``.
+        model: anything with ``predict(obs, state=..., episode_start=..., deterministic=...) -> (action, state)``.
         env: a Gymnasium environment, a vector environment, an id, or a function that makes an environment.
         n_eval_episodes: at least 1, spread evenly over the environments of a vector.
         deterministic: the policy's mode, or a sample.
@@ -138,8 +139,12 @@ def evaluate_policy(
     """
     vector = make_vector(env)
 
-    def policy(obs: Any) -> np.ndarray:
-        return model.predict(obs, deterministic=deterministic)[0]
+    memory: Any = None
+
+    def policy(obs: Any, began: np.ndarray) -> np.ndarray:
+        nonlocal memory
+        action, memory = model.predict(obs, state=memory, episode_start=began, deterministic=deterministic)
+        return action
 
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1")
@@ -148,9 +153,9 @@ def evaluate_policy(
     episode_counts = np.zeros(vector.n_envs, int)
     episode_rewards: list[float] = []
     episode_lengths: list[int] = []
-    observations = vector.reset()
+    observations, dones = vector.reset(), np.ones(vector.n_envs, bool)
     while len(episode_rewards) < n_eval_episodes:
-        actions = policy(observations)
+        actions = policy(observations, dones)
         step = vector.step(actions)
         rewards, dones, infos = step.reward, step.terminated | step.truncated, step.info
         current_rewards += rewards

@@ -375,20 +375,23 @@ class Agent(ABC):
         episode_start: Any = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
-        """Returns actions in the environment's own range, and ``state`` unchanged.
+        """Returns actions in the environment's own range, and what a policy with a memory remembers (None without).
 
         Args:
             observation: one observation of the environment's space, or a batch of them with a leading axis; the action
                 has a leading axis if and only if the observation has.
-            state: accepted for recurrent policies' sake.
-            episode_start: likewise.
+            state: what the last call returned, for a policy with a memory; None where episodes begin.
+            episode_start: where an episode begins with this observation, ``bool (batch,)``, so that what was remembered
+                is forgotten there; None for nowhere.
             deterministic: the policy's mode; False draws from the policy.
 
         Raises:
             ValueError: if the observation does not have the space's structure or shape.
         """
         batch, single = self._as_batch(observation)
-        action = self._act(batch, deterministic)
+        n = len(jax.tree.leaves(batch)[0])
+        ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
+        action, state = self._act(batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
         return (scaled[0] if single else scaled), state
 
@@ -416,17 +419,35 @@ class Agent(ABC):
                 )
         return jax.tree.unflatten(tree, [array[None] if single else array for array in arrays]), single
 
-    def _act(self, obs: Any, deterministic: bool) -> np.ndarray:
-        """Returns actions in the algorithm's range for a batch of cast observations."""
-        packed = self._run.state
+    def _act(self, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
+        """Returns actions in the algorithm's range for a batch of cast observations, and what the policy remembers.
+
+        ``memory`` None stands for episodes that have not begun, as ``ended`` does for each.
+        """
+        packed, n = self._run.state, len(ended)
+        has_memory = self._compiled.algorithm.recall is not None
+        if deterministic and not has_memory:
+            return np.asarray(self._compiled.exploit(packed, obs)), None
+        carry = memory if has_memory and memory is not None else self._compiled.initial_carry(n)
         if deterministic:
-            return np.asarray(self._compiled.exploit(packed, obs))
-        n = len(jax.tree.leaves(obs)[0])
+            action, carry = self._compiled.recall(packed, carry, obs, ended)
+            return np.asarray(action), carry
         clock = host.clock_of(self._run, 1.0)._replace(step=np.uint32(2**32 - 1 - self._n_predictions % 2**31))
         self._n_predictions += 1
-        carry = self._compiled.initial_carry(n)
-        action, _ = self._compiled.act(packed, carry, obs, np.ones(n, bool), self._run.key, clock)
-        return np.asarray(action)
+        ended = ended if has_memory else np.ones(n, bool)
+        action, carry = self._compiled.act(packed, carry, obs, ended, self._run.key, clock)
+        return np.asarray(action), carry if has_memory else None
+
+    def _player(self, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
+        """Returns the policy as :func:`rejeu.evaluation.evaluate` takes it; it remembers from call to call."""
+        memory: Any = None
+
+        def act(obs: Any, ended: np.ndarray) -> np.ndarray:
+            nonlocal memory
+            action, memory = self._act(obs, deterministic, memory, ended)
+            return action
+
+        return act
 
     def evaluate(
         self, episodes: int = 100, env: Any = None, deterministic: bool = True, seed: int | None = None
@@ -450,7 +471,7 @@ class Agent(ABC):
         else:
             vector = make_vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
         try:
-            return evaluate(lambda obs: self._act(obs, deterministic), vector, episodes)
+            return evaluate(self._player(deterministic), vector, episodes)
         finally:
             if own:
                 self._run.obs = self._run.action = None

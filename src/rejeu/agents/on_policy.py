@@ -1,4 +1,4 @@
-"""The agents that learn from the experience of their present policy: PPO and A2C."""
+"""The agents that learn from the experience of their present policy: PPO, RecurrentPPO and A2C."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from rejeu import spaces
 from rejeu.agents.base import Agent
-from rejeu.algorithms import a2c, ppo
+from rejeu.algorithms import a2c, ppo, recurrent_ppo
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.envs.vector import VectorEnv
 from rejeu.exploration.noise import Noise
@@ -40,8 +40,11 @@ class OnPolicyAgent(Agent):
         config = self.config
         action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
         structure = spaces.structure(env.observation_space)
+        n_steps = config.n_steps
+        if config.n_episodes is not None:
+            n_steps = config.n_episodes * (env.max_episode_steps or config.n_steps)
         return RolloutBuffer(
-            config.n_steps, env.n_envs, self._obs_leaves, structure, action.shape[1:], action.dtype, config.gamma
+            n_steps, env.n_envs, self._obs_leaves, structure, action.shape[1:], action.dtype, config.gamma
         )
 
     def _keep_buffer(self, env: VectorEnv) -> None:
@@ -58,3 +61,9 @@ class A2C(OnPolicyAgent):
     """Advantage actor-critic (Mnih et al. 2016), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
 
     algorithm: ClassVar[ModuleType] = a2c
+
+
+class RecurrentPPO(OnPolicyAgent):
+    """PPO with an LSTM or GRU between observation and hidden layers, for environments that hide part of their state."""
+
+    algorithm: ClassVar[ModuleType] = recurrent_ppo

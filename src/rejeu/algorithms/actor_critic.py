@@ -93,7 +93,7 @@ class OnPolicyConfig:
     """Steps of each environment between two updates. Raising it estimates the gradient better and updates more rarely."""
     n_episodes: int | None = None
     """Whole episodes of each environment between two updates, in place of ``n_steps``: who is done waits for the others.
-    None takes ``n_steps``."""
+    In an environment without a time limit ``n_steps`` bounds an episode's share. None takes ``n_steps``."""
     gamma: float = 0.99
     """Discount factor, in [0, 1]. Raising it looks further ahead."""
     gae_lambda: float = 0.95
@@ -359,11 +359,22 @@ def clipped(gradients: PyTree, most: float | None) -> tuple[PyTree, Array]:
     return jax.tree.map(lambda g: g * factor, gradients), norm
 
 
-def is_value(network: ActorCritic) -> ActorCritic:
-    """Returns a tree like ``network`` that says of each array whether it belongs to the value alone."""
+def is_value(network: Any) -> Any:
+    """Returns a tree like ``network``, an :class:`ActorCritic` or a module that holds one, of bools.
+
+    They say of each array whether it belongs to the value alone.
+    """
+    if not isinstance(network, ActorCritic):
+        mark = lambda node: is_value(node) if isinstance(node, ActorCritic) else False  # noqa: E731
+        return jax.tree.map(mark, network, is_leaf=lambda node: isinstance(node, ActorCritic))
+    parts = (network.value_encoder, network.value_torso, network.value_head)
     flags = jax.tree.map(lambda _: False, network)
-    parts = lambda n: (n.value_encoder, n.value_torso, n.value_head)  # noqa: E731
-    return eqx.tree_at(parts, flags, jax.tree.map(lambda _: True, parts(network)), is_leaf=lambda node: node is None)
+    return eqx.tree_at(
+        lambda n: (n.value_encoder, n.value_torso, n.value_head),
+        flags,
+        jax.tree.map(lambda _: True, parts),
+        is_leaf=lambda node: node is None,
+    )
 
 
 def explained_variance(predicted: Array, target: Array, valid: Array) -> Array:

@@ -21,6 +21,7 @@ Updates stop early where the policy has moved further than ``1.5 target_kl``, me
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -100,7 +101,8 @@ class Config(OnPolicyConfig):
 class State(eqx.Module):
     """Everything that PPO learns, every leaf an array."""
 
-    network: ActorCritic
+    network: Any
+    """Policy and value, an :class:`ActorCritic` or, with a memory, a ``RecurrentActorCritic``."""
     optimizer: PyTree
     key: Array
     n_updates: Array
@@ -156,17 +158,24 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             return chosen._replace(valid=first + jnp.arange(size) < n_valid)
 
         network, optimizer_state, n_steps, losses = epochs(
-            state.network, state.optimizer, minibatch, config.n_epochs * n_batches, optimizer, config, clock
+            loss, state.network, state.optimizer, minibatch, config.n_epochs * n_batches, optimizer, config, clock
         )
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
-        metrics = losses._asdict()
-        metrics["explained_variance"] = explained_variance(data.value, data.target, data.valid)
-        metrics["learning_rate"] = jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32)
-        if network.log_std is not None:
-            metrics["std"] = jnp.mean(jnp.exp(network.log_std))
-        return state, metrics
+        return state, metrics_of(network, losses, data.value, data.target, data.valid, config, clock)
 
     return Algorithm(init, lambda state: state.network, explore, exploit, update)
+
+
+def metrics_of(
+    network: Any, losses: Losses, value: Array, target: Array, valid: Array, config: Config, clock: Clock
+) -> Metrics:
+    """Returns what is reported of an update."""
+    metrics = losses._asdict()
+    metrics["explained_variance"] = explained_variance(value, target, valid)
+    metrics["learning_rate"] = jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32)
+    if network.log_std is not None:
+        metrics["std"] = jnp.mean(jnp.exp(network.log_std))
+    return metrics
 
 
 def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
@@ -176,20 +185,22 @@ def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
 
 
 def epochs(
-    network: ActorCritic,
+    loss: Callable[[Any, Any, Any, Clock], tuple[Array, Losses]],
+    network: Any,
     optimizer_state: PyTree,
-    minibatch: Any,
+    minibatch: Callable[[Array], Any],
     n_minibatches: Array,
     optimizer: optax.GradientTransformation,
     config: Config,
     clock: Clock,
-) -> tuple[ActorCritic, PyTree, Array, Losses]:
+) -> tuple[Any, PyTree, Array, Losses]:
     """Takes a gradient step on each minibatch, and returns network, optimizer, steps taken and mean losses.
 
     Args:
+        loss: of a network on a minibatch, and its parts.
         network: as it collected the rollout.
         optimizer_state: of ``optimizer``.
-        minibatch: ``minibatch(i)`` returns the i-th :class:`Samples` of all epochs.
+        minibatch: ``minibatch(i)`` returns the i-th of all epochs, as ``loss`` takes it.
         n_minibatches: of all epochs, ``int32[]``.
         optimizer: without a learning rate.
         config: the hyper-parameters.
@@ -197,13 +208,13 @@ def epochs(
     """
     value_flags = is_value(network)
 
-    def goes_on(carry: tuple[Array, Array, ActorCritic, PyTree, Losses]) -> Array:
+    def goes_on(carry: tuple[Array, Array, Any, PyTree, Losses]) -> Array:
         i, stopped, *_ = carry
         return (i < n_minibatches) & ~stopped
 
     def step(
-        carry: tuple[Array, Array, ActorCritic, PyTree, Losses],
-    ) -> tuple[Array, Array, ActorCritic, PyTree, Losses]:
+        carry: tuple[Array, Array, Any, PyTree, Losses],
+    ) -> tuple[Array, Array, Any, PyTree, Losses]:
         i, stopped, network, optimizer_state, sums = carry
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(network, minibatch(i), config, clock)
         after, after_state = descend(network, optimizer_state, gradients, value_flags, optimizer, config, clock)

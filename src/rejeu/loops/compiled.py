@@ -32,7 +32,7 @@ class Compiled:
         """The state, of shapes in place of arrays."""
         packing = Packing(self.shapes)
         self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
-        self._observe_packer = HostPacker()
+        self._recall_packer, self._observe_packer = HostPacker(), HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
 
         @jax.jit
@@ -50,6 +50,12 @@ class Compiled:
         @partial(jax.jit, static_argnums=2)
         def exploit(state: PackedState, vectors: list[Array], plan: Packing) -> Array:
             return algorithm.exploit(algorithm.actor(packing.unpack(state)), plan.unpack(vectors))
+
+        @partial(jax.jit, static_argnums=3)
+        def recall(state: PackedState, carry: PyTree, vectors: list[Array], plan: Packing) -> tuple[Array, PyTree]:
+            assert algorithm.recall is not None
+            obs, ended = plan.unpack(vectors)
+            return algorithm.recall(carry, algorithm.actor(packing.unpack(state)), obs, ended)
 
         @partial(jax.jit, donate_argnums=0, static_argnums=2)
         def observe(state: PackedState, vectors: list[Array], plan: Packing) -> PackedState:
@@ -85,7 +91,7 @@ class Compiled:
         self.observe = None if algorithm.observe is None else self._observe_packed
         """``observe(state, obs, running_return) -> state``, packed, whose predecessor is donated; None where the algorithm
         has no use for it (see :class:`rejeu.core.Algorithm`)."""
-        self._act, self._exploit, self._observe, self._update = act, exploit, observe, update
+        self._act, self._exploit, self._recall, self._observe, self._update = act, exploit, recall, observe, update
 
     def act(
         self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
@@ -95,6 +101,10 @@ class Compiled:
         ``ended``, ``bool (n_envs,)``, is where an episode has just begun.
         """
         return self._act(state, carry, key, *self._act_packer((obs, ended, clock), len(ended)))
+
+    def recall(self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any) -> tuple[Array, PyTree]:
+        """Returns the deterministic actions of a policy with a memory, and the memory after ``obs`` ``(batch, ...)``."""
+        return self._recall(state, carry, *self._recall_packer((obs, ended), len(ended)))
 
     def _observe_packed(self, state: PackedState, obs: PyTree, running_return: Any) -> PackedState:
         return self._observe(state, *self._observe_packer((obs, running_return), len(running_return)))

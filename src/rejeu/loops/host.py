@@ -75,6 +75,8 @@ class Run:
     """The present observations; None before the first reset."""
     action: np.ndarray | None = None
     """Chosen for ``obs``, not yet taken; in the algorithm's range."""
+    playing: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """How many more episodes each environment has to play before the next update, where rollouts are whole episodes."""
     ended: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     """Where the last turn ended an episode, ``(n_envs,)``."""
     owed: int = 0
@@ -117,22 +119,38 @@ def clock_of(run: Run, progress: float) -> Clock:
     return Clock(np.uint32(run.step), np.uint32(run.episode), np.float32(progress))
 
 
-def book(run: Run, step: Step, active: np.ndarray | None) -> list[Episode]:
+def counted(run: Run, stepped: int, last: int | None) -> int | None:
+    """Returns how many of the ``stepped`` environments' next steps still count, None if all of them do.
+
+    A run takes exactly as many steps as it was asked for: where the number of environments does not divide what remains
+    until the step ``last`` (None: no end), the first so many count.
+    """
+    return None if last is None or last - run.step >= stepped else last - run.step
+
+
+def book(run: Run, step: Step, counts: np.ndarray | None, stepped: np.ndarray | None = None) -> list[Episode]:
     """Adds a step to the running episodes and returns those that ended.
 
-    Where only some environments are ``active``, the step of the others is not kept and their episodes are given up.
+    Args:
+        run: mutated.
+        step: what the environments said.
+        counts: of which environments the step is kept, ``bool (n_envs,)``, None for all. The episodes of those that were
+            stepped and do not count are given up.
+        stepped: which environments were stepped, likewise.
     """
     run.ended = step.terminated | step.truncated
-    if active is not None:
-        run.ended[len(active) :] = True
-    counted = slice(None) if active is None else active
-    run.episode_return[counted] += step.reward[counted]
-    run.episode_length[counted] += 1
+    if counts is None:
+        run.episode_return += step.reward
+        run.episode_length += 1
+    else:
+        run.ended |= ~counts if stepped is None else stepped & ~counts
+        run.episode_return[counts] += step.reward[counts]
+        run.episode_length[counts] += 1
     if not run.ended.any():
         return []
     episodes = []
     for env in np.flatnonzero(run.ended).tolist():
-        if active is None or env in active:
+        if counts is None or counts[env]:
             run.episode += 1
             episodes.append(
                 Episode(

@@ -25,7 +25,7 @@ from jax import Array
 from rejeu.config import OffPolicyConfig
 from rejeu.core import Clock
 from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, restart
+from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, restart
 from rejeu.spaces import action_scaler, random_action
 
 
@@ -54,7 +54,8 @@ def off_policy(
     if run.action is None:
         run.action = np.asarray(choose_or_draw(run, compiled, config, clock_of(run, 0.0)))
     while last is None or run.step < last:
-        active = None if last is None or last - run.step >= n_envs else np.arange(last - run.step)
+        remaining = counted(run, n_envs, last)
+        active = None if remaining is None else np.arange(remaining)
         t0 = time.perf_counter()
         step = env.step(scale(run.action))
         t1 = time.perf_counter()
@@ -65,7 +66,7 @@ def off_policy(
         taken = n_envs if active is None else len(active)
         run.step += taken
         run.seconds["total"] = t1 - began
-        episodes = book(run, step, active)
+        episodes = book(run, step, None if active is None else np.arange(n_envs) < taken)
         t2 = time.perf_counter()
         if run.ended.any():
             run.obs = env.reset_done(run.ended)

@@ -17,8 +17,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.core import PyTree
+from rejeu.envs.vector import Step
 from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, restart
+from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, restart
 from rejeu.spaces import action_scaler
 
 
@@ -44,34 +46,67 @@ def on_policy(
     began = time.perf_counter() - run.seconds["total"]
     if run.obs is None:
         restart(run)
-        rollout.begin(run.carry, run.ended)
+        begin(run, config)
     while last is None or run.step < last:
-        active = None if last is None or last - run.step >= n_envs else np.arange(last - run.step)
         t0 = time.perf_counter()
-        clock = clock_of(run, progress(run.step - first))
-        run.action = np.asarray(choose(run, compiled, clock))
+        run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
         rollout.observe(run.obs)
         t1 = time.perf_counter()
-        step = env.step(scale(run.action))
+        stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
+        step = env.step(scale(run.action), stepped)
         t2 = time.perf_counter()
         check_rewards(step, env, run.step)
-        valid = True if active is None else np.arange(n_envs) < len(active)
+        counts = which_count(run, stepped, last)
         run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
+        valid = True if counts is None else counts
         rollout.add(run.action, step.reward, step.terminated, step.truncated, step.obs, run.running_return, valid)
-        run.step += n_envs if active is None else len(active)
+        run.step += n_envs if counts is None else int(counts.sum())
         run.seconds["total"] = t2 - began
-        episodes = book(run, step, active)
+        episodes = book(run, step, counts, stepped)
+        if config.n_episodes is not None:
+            run.playing -= run.ended
+        is_done = rollout.full or run.step == last or (config.n_episodes is not None and not run.playing.any())
         t3 = time.perf_counter()
-        run.obs = env.reset_done(run.ended) if run.ended.any() else step.obs
+        run.obs = renewed(run, step, config, is_done)
         t4 = time.perf_counter()
-        if rollout.full or run.step == last:
+        if is_done:
             clock = clock_of(run, progress(run.step - first))
-            run.state, run.metrics, _ = compiled.update(run.state, rollout.rollout(), clock)
             run.n_updates += config.gradient_steps(rollout.size())
-            rollout.begin(run.carry, run.ended)
+            run.state, run.metrics, _ = compiled.update(run.state, rollout.rollout(), clock)
+            begin(run, config)
         t5 = time.perf_counter()
         run.seconds["env"] += (t2 - t1) + (t4 - t3)
         run.seconds["replay"] += t3 - t2
         run.seconds["update"] += (t1 - t0) + (t5 - t4)
         run.seconds["total"] = t5 - began
         yield Progress(run.step, episodes, run.metrics)
+
+
+def begin(run: Run, config: OnPolicyConfig) -> None:
+    """Begins a rollout where the environments stand."""
+    run.replay.begin(run.carry, run.ended)
+    run.playing = np.full(run.env.n_envs, config.n_episodes or 0)
+
+
+def which_count(run: Run, stepped: np.ndarray | None, last: int | None) -> np.ndarray | None:
+    """Returns of which environments the step is kept, ``bool (n_envs,)``; None for all."""
+    n_envs = run.env.n_envs
+    remaining = counted(run, n_envs if stepped is None else int(stepped.sum()), last)
+    if remaining is None:
+        return stepped
+    among = np.ones(n_envs, bool) if stepped is None else stepped
+    return among & (np.cumsum(among) <= remaining)
+
+
+def renewed(run: Run, step: Step, config: OnPolicyConfig, is_done: bool) -> PyTree:
+    """Returns the observations to act on next, episodes begun anew where they ended.
+
+    Where rollouts are whole episodes, an environment that has played its share waits, and all begin anew together.
+    """
+    if config.n_episodes is None:
+        return run.env.reset_done(run.ended) if run.ended.any() else step.obs
+    if is_done:
+        run.ended = np.ones(run.env.n_envs, bool)
+        return run.env.reset_done(run.ended)
+    renew = run.ended & (run.playing > 0)
+    return run.env.reset_done(renew) if renew.any() else step.obs

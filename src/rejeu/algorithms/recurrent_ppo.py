@@ -1,0 +1,330 @@
+"""PPO with a memory: a recurrent cell between the observation and the hidden layers.
+
+For environments that do not show all of their state. The policy's memory is begun anew with every episode. Learning
+unrolls the cell over the whole rollout of each environment, from what it remembered at its beginning, and differentiates
+through all of it; a minibatch is a share of the environments with all their steps, so ``n_steps`` is also the length over
+which the gradient remembers. Losses and advantages are PPO's (see :mod:`rejeu.algorithms.ppo`); the value of a successor
+is read with the memory that the step left.
+
+Cells: LSTM (Hochreiter and Schmidhuber 1997, with the forget gate of Gers et al. 2000) and GRU (Cho et al. 2014, arXiv
+1406.1078), in the form of PyTorch's documentation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms import ppo
+from rejeu.algorithms.actor_critic import (
+    HIDDEN_GAIN,
+    ActionKind,
+    ActorCritic,
+    ActorCriticConfig,
+    Distribution,
+    Samples,
+    action_kind,
+    check_flag,
+    orthogonal,
+    unmasked,
+)
+from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
+from rejeu.config import nested, whole
+from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
+from rejeu.exploration.explorer import renew
+from rejeu.networks import Encoder
+from rejeu.randomness import nth
+from rejeu.replay.rollout import advantages
+from rejeu.spaces import Leaf, check_action, leaves
+
+
+@dataclass(frozen=True)
+class RecurrentConfig(ActorCriticConfig):
+    """The shape of policy and value networks with a memory."""
+
+    cell: Literal["lstm", "gru"] = "lstm"
+    """Which recurrent cell remembers."""
+    lstm_hidden_size: int = 256
+    """Numbers that it remembers; of an LSTM twice as many. Raising it remembers more and is slower."""
+    shared_lstm: bool = False
+    """Policy and value read the same memory; otherwise each has its own."""
+
+    def __post_init__(self) -> None:
+        ActorCriticConfig.__post_init__(self)
+        if self.cell not in ("lstm", "gru"):
+            raise ValueError(f"cell={self.cell!r} must be 'lstm' or 'gru'")
+        object.__setattr__(self, "lstm_hidden_size", whole("lstm_hidden_size", self.lstm_hidden_size, least=1))
+        check_flag("shared_lstm", self.shared_lstm)
+        if self.share_layers and not self.shared_lstm:
+            raise ValueError("share_layers=True needs shared_lstm=True: layers cannot share what reads two memories")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(ppo.Config):
+    """Hyper-parameters of recurrent PPO; the defaults are those of Stable-Baselines3's contributions."""
+
+    n_steps: int = 128
+    """Steps of each environment between two updates, and the length over which gradients remember."""
+    batch_size: int = 128
+    """Steps per gradient step, rounded to whole environments with all their steps. Raising it gives a steadier, dearer
+    step."""
+    policy_kwargs: RecurrentConfig = dataclasses.field(default_factory=RecurrentConfig)
+    """Shape of the networks: ``lstm_hidden_size``, ``cell`` (``"lstm"`` or ``"gru"``), ``shared_lstm``, and what PPO
+    takes."""
+
+    name: ClassVar[str] = "RecurrentPPO"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "policy_kwargs", nested("policy_kwargs", RecurrentConfig, self.policy_kwargs))
+        ppo.Config.__post_init__(self)
+        if self.n_episodes is not None:
+            raise ValueError(
+                "n_episodes: a recurrent policy learns from rollouts of equal length; give n_steps and leave it out"
+            )
+
+    def steps_per_gradient(self, n_envs: int) -> int:
+        """Returns how many steps of ``n_envs`` environments one gradient is taken on."""
+        return self.n_steps * envs_per_batch(self, self.n_steps, n_envs)
+
+
+def envs_per_batch(config: Config, n_steps: int, n_envs: int) -> int:
+    """Returns how many environments with all their steps make a minibatch."""
+    return min(max(config.batch_size // n_steps, 1), n_envs)
+
+
+class Cell(eqx.Module):
+    """A recurrent cell: an LSTM or a GRU."""
+
+    inputs: Array
+    """``(n_inputs, n_gates * size)``."""
+    recurrent: Array
+    """``(size, n_gates * size)``."""
+    bias: Array
+    """``(n_gates * size,)``."""
+    recurrent_bias: Array
+    """``(n_gates * size,)``."""
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, key: Array, n_inputs: int, size: int, kind: str) -> None:
+        """Draws everything uniformly within ``1 / sqrt(size)`` of 0, PyTorch's default."""
+        width = (4 if kind == "lstm" else 3) * size
+        bound = 1.0 / math.sqrt(size)
+        shapes = ((n_inputs, width), (size, width), (width,), (width,))
+        drawn = [
+            jax.random.uniform(k, shape, jnp.float32, -bound, bound)
+            for k, shape in zip(jax.random.split(key, 4), shapes, strict=True)
+        ]
+        self.inputs, self.recurrent, self.bias, self.recurrent_bias = drawn
+        self.kind = kind
+
+    @property
+    def size(self) -> int:
+        """Numbers that come out."""
+        return self.recurrent.shape[0]
+
+    def empty(self, n: int) -> tuple[Array, ...]:
+        """Returns the memory of ``n`` episodes that have not begun, ``(n, size)`` each."""
+        return tuple(jnp.zeros((n, self.size), jnp.float32) for _ in range(2 if self.kind == "lstm" else 1))
+
+    def project(self, x: Array) -> Array:
+        """Returns what the inputs ``(..., n_inputs)`` bring to the gates; of many steps at once."""
+        return x @ self.inputs + self.bias.reshape(*[1] * (x.ndim - 1), -1)
+
+    def step(self, memory: tuple[Array, ...], projected: Array) -> tuple[Array, ...]:
+        """Returns the memory after one step, ``(n, size)`` each; the first of it is what comes out."""
+        recurrent = memory[0] @ self.recurrent + self.recurrent_bias[None]
+        if self.kind == "lstm":
+            i, f, g, o = jnp.split(projected + recurrent, 4, axis=-1)
+            cell = jax.nn.sigmoid(f) * memory[1] + jax.nn.sigmoid(i) * jnp.tanh(g)
+            return jax.nn.sigmoid(o) * jnp.tanh(cell), cell
+        reset, update, new = jnp.split(projected, 3, axis=-1)
+        r, z, n = jnp.split(recurrent, 3, axis=-1)
+        keep = jax.nn.sigmoid(update + z)
+        return ((1.0 - keep) * jnp.tanh(new + jax.nn.sigmoid(reset + r) * n) + keep * memory[0],)
+
+
+Memory = tuple[tuple[Array, ...], ...]
+"""Of the policy's cell, and of the value's where it has its own."""
+
+
+class RecurrentActorCritic(eqx.Module):
+    """Observation and memory to a distribution over actions and to a value."""
+
+    encoder: Encoder
+    cells: tuple[Cell, ...]
+    """The policy's, and the value's where it has its own."""
+    readers: ActorCritic
+    """Policy and value, which read what comes out of the cells."""
+
+    def __init__(self, key: Array, leaves: tuple[Leaf, ...], action: ActionKind, shape: RecurrentConfig) -> None:
+        """Draws the weights."""
+        encoder_key, cell_key, reader_key = jax.random.split(key, 3)
+        encoder = Encoder(leaves, encoder_key)
+        self.encoder = orthogonal(encoder, encoder_key, HIDDEN_GAIN) if shape.ortho_init else encoder
+        size = shape.lstm_hidden_size
+        n_cells = 1 if shape.shared_lstm else 2
+        keys = jax.random.split(cell_key, n_cells)
+        self.cells = tuple(Cell(keys[i], self.encoder.n_features, size, shape.cell) for i in range(n_cells))
+        remembered = Leaf("", "continuous", (size,), "float32")
+        self.readers = ActorCritic(reader_key, (remembered,), action, shape)
+
+    @property
+    def log_std(self) -> Array | None:
+        """The policy's log standard deviation where it does not depend on the observation."""
+        return self.readers.log_std
+
+    def empty(self, n: int) -> Memory:
+        """Returns the memory of ``n`` episodes that have not begun."""
+        return tuple(cell.empty(n) for cell in self.cells)
+
+    def remember(self, memory: Memory, obs: PyTree, ended: Array) -> Memory:
+        """Returns the memory after observations ``(n, ...)``; begun anew where ``ended``, ``bool (n,)``."""
+        features = self.encoder(unmasked(obs)[0])
+        memory = renew(ended, self.empty(ended.shape[0]), memory)
+        return tuple(cell.step(m, cell.project(features)) for cell, m in zip(self.cells, memory, strict=True))
+
+    def unroll(self, memory: Memory, obs: PyTree, started: Array) -> Memory:
+        """Returns the memory after each observation, ``(steps, n, size)`` each.
+
+        Args:
+            memory: before the first.
+            obs: ``(steps, n, ...)``.
+            started: where an episode begins with an observation, ``bool (steps, n)``.
+        """
+        features = self.features(obs, started.shape)
+        after = []
+        for cell, first in zip(self.cells, memory, strict=True):
+            fresh = cell.empty(started.shape[1])
+
+            def step(
+                memory: tuple[Array, ...], inputs: tuple[Array, Array], cell: Cell = cell, fresh: Any = fresh
+            ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+                projected, began = inputs
+                memory = cell.step(renew(began, fresh, memory), projected)
+                return memory, memory
+
+            after.append(jax.lax.scan(step, first, (cell.project(features), started))[1])
+        return tuple(after)
+
+    def features(self, obs: PyTree, shape: tuple[int, ...]) -> Array:
+        """Returns the features of observations ``(steps, n, ...)``, ``(steps, n, n_features)``."""
+        flat = jax.tree.map(lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), unmasked(obs)[0])
+        return self.encoder(flat).reshape(*shape, -1)
+
+    def policy(self, memory: Memory, mask: Array | None = None) -> Distribution:
+        """Returns the distribution of actions with memories ``(n, size)``."""
+        read = memory[0][0]
+        return self.readers.policy(read if mask is None else Masked(read, mask))
+
+    def value(self, memory: Memory) -> Array:
+        """Returns the values with memories ``(n, size)``, ``(n,)``."""
+        return self.readers.value(memory[-1][0])
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns recurrent PPO for these spaces.
+
+    Raises:
+        ValueError: if no policy can act in the action space.
+    """
+    check_action(action_space, config.name)
+    obs_leaves, kind = leaves(observation_space), action_kind(action_space)
+    optimizer = optax.scale_by_adam(eps=ADAM_EPSILON)
+
+    def init(key: Array) -> State:
+        network_key, update_key = jax.random.split(key)
+        network: Any = RecurrentActorCritic(network_key, obs_leaves, kind, config.policy_kwargs)
+        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+
+    def begin(actor: RecurrentActorCritic, n_envs: int) -> Memory:
+        size, n_parts = config.policy_kwargs.lstm_hidden_size, 2 if config.policy_kwargs.cell == "lstm" else 1
+        n_cells = 1 if config.policy_kwargs.shared_lstm else 2
+        return tuple(tuple(jnp.zeros((n_envs, size), jnp.float32) for _ in range(n_parts)) for _ in range(n_cells))
+
+    def act(
+        memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array, key: Array, clock: Clock
+    ) -> tuple[Array, Memory]:
+        memory = actor.remember(memory, obs, ended)
+        return actor.policy(memory, unmasked(obs)[1]).sample(key), memory
+
+    def recall(memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array) -> tuple[Array, Memory]:
+        memory = actor.remember(memory, obs, ended)
+        return actor.policy(memory, unmasked(obs)[1]).mode(), memory
+
+    def explore(actor: RecurrentActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
+        ended = jnp.ones((jax.tree.leaves(obs)[0].shape[0],), bool)
+        return act(begin(actor, ended.shape[0]), actor, obs, ended, key, clock)[0]
+
+    def exploit(actor: RecurrentActorCritic, obs: PyTree) -> Array:
+        ended = jnp.ones((jax.tree.leaves(obs)[0].shape[0],), bool)
+        return recall(begin(actor, ended.shape[0]), actor, obs, ended)[0]
+
+    def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
+        n_steps, n_envs = rollout.reward.shape
+        data, started = samples(state.network, rollout, config.gae_lambda)
+        size = envs_per_batch(config, n_steps, n_envs)
+        n_batches = -(-n_envs // size)
+        orders = shuffled(nth(state.key, state.n_rollouts), jnp.ones((n_envs,), bool), config.n_epochs, -n_envs % size)
+
+        def minibatch(i: Array) -> tuple[Samples, Array, Memory]:
+            first = (i % n_batches) * size
+            index = jax.lax.dynamic_slice(orders, (i // n_batches, first), (1, size))[0]
+            exists = first + jnp.arange(size) < n_envs
+            chosen = jax.tree.map(lambda x: x[:, index], data)
+            memory = jax.tree.map(lambda x: x[index], rollout.carry)
+            return chosen._replace(valid=chosen.valid & exists[None]), started[:, index], memory
+
+        network, optimizer_state, n_taken, losses = epochs(
+            loss,
+            state.network,
+            state.optimizer,
+            minibatch,
+            jnp.int32(config.n_epochs * n_batches),
+            optimizer,
+            config,
+            clock,
+        )
+        state = State(network, optimizer_state, state.key, state.n_updates + n_taken, state.n_rollouts + 1)
+        return state, ppo.metrics_of(network, losses, data.value, data.target, data.valid, config, clock)
+
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, Explorer(begin, act), recall)
+
+
+def samples(network: RecurrentActorCritic, rollout: Rollout, gae_lambda: float) -> tuple[Samples, Array]:
+    """Returns the steps of a rollout, leaves ``(steps, n_envs, ...)``, and where episodes began with one."""
+    shape = rollout.reward.shape
+    started = jnp.concatenate([rollout.started[None], rollout.ended[:-1]])
+    after = network.unroll(rollout.carry, rollout.obs, started)
+    flat = lambda tree: jax.tree.map(lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), tree)  # noqa: E731
+    mask = unmasked(rollout.obs)[1]
+    distribution = network.policy(flat(after), None if mask is None else flat(mask))
+    value = network.value(flat(after)).reshape(shape)
+    never = jnp.zeros((shape[0] * shape[1],), bool)
+    next_value = network.value(network.remember(flat(after), flat(rollout.next_obs), never)).reshape(shape)
+    last = jnp.concatenate([~rollout.valid[1:], jnp.ones_like(rollout.valid[:1])])
+    advantage = advantages(rollout.reward, value, next_value, rollout.discount, rollout.ended | last, gae_lambda)
+    log_prob = distribution.log_prob(flat(rollout.action)).reshape(shape)
+    data = Samples(rollout.obs, rollout.action, log_prob, value, advantage, advantage + value, rollout.valid)
+    return data, started
+
+
+def loss(
+    network: RecurrentActorCritic, minibatch: tuple[Samples, Array, Memory], config: Config, clock: Clock
+) -> tuple[Array, Losses]:
+    """Returns PPO's loss of environments with all their steps, and its parts."""
+    batch, started, memory = minibatch
+    shape = started.shape
+    flat = lambda tree: jax.tree.map(lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), tree)  # noqa: E731
+    after = flat(network.unroll(memory, batch.obs, started))
+    mask = unmasked(batch.obs)[1]
+    distribution = network.policy(after, None if mask is None else flat(mask))
+    return loss_of(distribution, network.value(after), flat(batch._replace(obs=())), config, clock)
