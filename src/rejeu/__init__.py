@@ -6,7 +6,7 @@
 100
 """
 
-from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, RecurrentPPO, load
+from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
 from rejeu.envs.monitor import Monitor
 from rejeu.envs.vector import make_vector
 from rejeu.errors import CheckpointError, MissingExtra
@@ -37,6 +37,7 @@ __all__ = [
     "GoalSelectionStrategy",
     "HerReplayBuffer",
     "Linear",
+    "MaskablePPO",
     "MissingExtra",
     "Monitor",
     "NormalActionNoise",

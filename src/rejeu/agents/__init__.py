@@ -8,12 +8,12 @@ from typing import Any
 from rejeu import checkpoint
 from rejeu.agents.base import Agent, Callback, whole_seed
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ
-from rejeu.agents.on_policy import A2C, PPO, RecurrentPPO
+from rejeu.agents.on_policy import A2C, PPO, MaskablePPO, RecurrentPPO
 from rejeu.errors import CheckpointError
 
-AGENTS: dict[str, type[Agent]] = {
-    agent.algorithm.Config.name: agent for agent in (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO)
-}
+KINDS = (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO)
+
+AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
 """Every agent by the name of its algorithm."""
 
 
@@ -39,6 +39,7 @@ __all__ = [
     "Agent",
     "Callback",
     "CrossQ",
+    "MaskablePPO",
     "RecurrentPPO",
     "load",
     "whole_seed",

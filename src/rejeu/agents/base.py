@@ -22,7 +22,7 @@ import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, spaces, summary
 from rejeu.envs.auto_reset import AutoResetView
-from rejeu.envs.vector import VectorEnv, make_vector
+from rejeu.envs.vector import Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
 from rejeu.exploration import explorer as exploration
@@ -113,7 +113,7 @@ class Agent(ABC):
         self._n_predictions = 0
         self._own_env = isinstance(env, str)
         compilation.enable_cache()
-        vector = make_vector(env, 1, seed=self.seed)
+        vector = self._vector(env, 1, seed=self.seed)
         self._check_policy(policy, vector.observation_space)
         self._build(vector.observation_space, vector.action_space, vector.n_envs)
         self._start(vector)
@@ -142,6 +142,10 @@ class Agent(ABC):
     def _start(self, env: VectorEnv) -> None:
         """Begins a run on ``env`` with a fresh state and an empty buffer."""
         self._run: Run = host.initial_run(env, self._make_buffer(env), self._compiled, self._learn_from(0), self.seed)
+
+    @abstractmethod
+    def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+        """Returns environments as this agent needs them, from what :func:`make_vector` takes."""
 
     @abstractmethod
     def _noise(self) -> Noise | None:
@@ -374,6 +378,7 @@ class Agent(ABC):
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = False,
+        action_masks: Any = None,
     ) -> tuple[np.ndarray, Any]:
         """Returns actions in the environment's own range, and what a policy with a memory remembers (None without).
 
@@ -384,16 +389,23 @@ class Agent(ABC):
             episode_start: where an episode begins with this observation, ``bool (batch,)``, so that what was remembered
                 is forgotten there; None for nowhere.
             deterministic: the policy's mode; False draws from the policy.
+            action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, for agents that take masks; None
+                allows all.
 
         Raises:
-            ValueError: if the observation does not have the space's structure or shape.
+            ValueError: if the observation or the mask does not have the space's structure or shape.
         """
         batch, single = self._as_batch(observation)
+        batch = self._with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
         action, state = self._act(batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
         return (scaled[0] if single else scaled), state
+
+    @abstractmethod
+    def _with_masks(self, obs: Any, masks: Any) -> Any:
+        """Returns a batch of observations as the algorithm takes it, with the given masks where it takes any."""
 
     def _as_batch(self, observation: Any) -> tuple[Any, bool]:
         expected = spaces.structure(self.observation_space)
@@ -467,9 +479,9 @@ class Agent(ABC):
         if own:
             vector = self._run.env
         elif env is None:
-            vector = make_vector(self._run.env.env_id, min(episodes, 16), self._run.env.backend, seed)
+            vector = self._vector(self._run.env.env_id, min(episodes, 16), self._run.env.backend, seed)
         else:
-            vector = make_vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
+            vector = self._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
         try:
             return evaluate(self._player(deterministic), vector, episodes)
         finally:
@@ -496,7 +508,7 @@ class Agent(ABC):
         Raises:
             ValueError: if the spaces differ.
         """
-        vector = make_vector(env, 1, seed=self.seed)
+        vector = self._vector(env, 1, seed=self.seed)
         self._check_spaces(vector, "the new environment")
         self._own_env = isinstance(env, str)
         run = self._run
@@ -620,7 +632,7 @@ class Agent(ABC):
         except (TypeError, ValueError, MemoryError, OverflowError) as error:
             raise CheckpointError(f"{path}: {error}") from None
         state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
-        vector = None if env is None else make_vector(env, 1, seed=seed)
+        vector = None if env is None else agent._vector(env, 1, seed=seed)
         if vector is not None:
             agent._check_spaces(vector, "the given environment")
         return agent._resume(vector, state, counters, rng)
@@ -664,6 +676,12 @@ class Agent(ABC):
             parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
         cls.__doc__ = "\n".join([f"{(cls.__doc__ or '').strip()}", "", *lines])
         cls.__signature__ = inspect.Signature(parameters[1:])  # type: ignore[attr-defined]
+
+
+def refuse_masks(masks: Any, name: str) -> None:
+    """Raises ``TypeError`` if masks are given to an agent that takes none."""
+    if masks is not None:
+        raise TypeError(f"{name}.predict takes no action_masks; use MaskablePPO")
 
 
 def whole_seed(seed: Any) -> int:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from rejeu import checkpoint, spaces
-from rejeu.agents.base import Agent
+from rejeu.agents.base import Agent, refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.config import OffPolicyConfig
-from rejeu.envs.vector import VectorEnv
+from rejeu.envs.vector import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise
 from rejeu.loops.host import Progress
@@ -62,6 +62,13 @@ class OffPolicyAgent(Agent):
             raise CheckpointError(f"{path}: {error}") from None
         self._run.learn_from = self.config.learning_starts
         self._run.obs = self._run.action = None
+
+    def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+        return make_vector(env, n_envs, backend, seed)
+
+    def _with_masks(self, obs: Any, masks: Any) -> Any:
+        refuse_masks(masks, self.name)
+        return obs
 
     def _noise(self) -> Noise | None:
         return self.config.action_noise

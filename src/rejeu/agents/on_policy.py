@@ -1,18 +1,21 @@
-"""The agents that learn from the experience of their present policy: PPO, RecurrentPPO and A2C."""
+"""The agents that learn from the experience of their present policy: PPO, RecurrentPPO, MaskablePPO and A2C."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from rejeu import spaces
-from rejeu.agents.base import Agent
-from rejeu.algorithms import a2c, ppo, recurrent_ppo
+from rejeu.agents.base import Agent, refuse_masks
+from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
 from rejeu.algorithms.actor_critic import OnPolicyConfig
-from rejeu.envs.vector import VectorEnv
+from rejeu.core import Masked
+from rejeu.envs.masks import make_masked, mask_leaf, n_choices
+from rejeu.envs.vector import Backend, VectorEnv, make_vector
 from rejeu.exploration.noise import Noise
 from rejeu.loops.host import Progress
 from rejeu.loops.on_policy import on_policy
@@ -23,6 +26,21 @@ class OnPolicyAgent(Agent):
     """What the agents share that learn from rollouts of their present policy. Abstract."""
 
     config: OnPolicyConfig
+    takes_masks: ClassVar[bool] = False
+    """Whether it asks the environment which actions are allowed."""
+
+    def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+        return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
+
+    def _with_masks(self, obs: Any, masks: Any) -> Any:
+        if not self.takes_masks:
+            refuse_masks(masks, self.name)
+            return obs
+        n, size = len(jax.tree.leaves(obs)[0]), n_choices(self.action_space, self.name)
+        mask = np.ones((n, size), bool) if masks is None else np.asarray(masks, bool)
+        if mask.size != n * size:
+            raise ValueError(f"action_masks has shape {mask.shape}, expected {(n, size)}")
+        return Masked(obs, mask.reshape(n, size))
 
     def _noise(self) -> Noise | None:
         return None
@@ -39,13 +57,14 @@ class OnPolicyAgent(Agent):
     def _make_buffer(self, env: VectorEnv) -> RolloutBuffer:
         config = self.config
         action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
-        structure = spaces.structure(env.observation_space)
+        structure, obs_leaves = spaces.structure(env.observation_space), self._obs_leaves
+        if self.takes_masks:
+            structure = jax.tree.structure(Masked(jax.tree.unflatten(structure, obs_leaves), 0))
+            obs_leaves = (*obs_leaves, mask_leaf(env.action_space, env.env_id))
         n_steps = config.n_steps
         if config.n_episodes is not None:
             n_steps = config.n_episodes * (env.max_episode_steps or config.n_steps)
-        return RolloutBuffer(
-            n_steps, env.n_envs, self._obs_leaves, structure, action.shape[1:], action.dtype, config.gamma
-        )
+        return RolloutBuffer(n_steps, env.n_envs, obs_leaves, structure, action.shape[1:], action.dtype, config.gamma)
 
     def _keep_buffer(self, env: VectorEnv) -> None:
         """Nothing is kept: what was collected elsewhere is forgotten when the next rollout begins."""
@@ -67,3 +86,10 @@ class RecurrentPPO(OnPolicyAgent):
     """PPO with an LSTM or GRU between observation and hidden layers, for environments that hide part of their state."""
 
     algorithm: ClassVar[ModuleType] = recurrent_ppo
+
+
+class MaskablePPO(OnPolicyAgent):
+    """PPO in environments that allow only some actions at a time, as they say themselves (Huang and Ontanon 2022)."""
+
+    algorithm: ClassVar[ModuleType] = maskable_ppo
+    takes_masks: ClassVar[bool] = True

@@ -1,0 +1,178 @@
+"""Action masks: which actions an environment allows, carried beside its observations.
+
+An environment says so in ``info["action_mask"]``, at reset and at every step, or by a method ``action_masks()``. The
+mask is an array of bools or of zeros and ones: one for each action of a Discrete space, one for each possibility of every
+choice of a MultiDiscrete space in a row, one for each bit of a MultiBinary space that may be 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from rejeu.core import Masked
+from rejeu.envs.registry import maker
+from rejeu.envs.vector import Backend, InProcess, Step, VectorEnv, make_vector
+from rejeu.errors import BadEnvironmentError
+from rejeu.replay.hindsight import GoalFunctions
+from rejeu.spaces import Leaf
+
+OBSERVATION, MASK = "observation", "action_mask"
+"""Keys under which :class:`MaskInObservation` puts the two."""
+
+
+def n_choices(space: spaces.Space, env_id: str) -> int:
+    """Returns the length of a mask for an action space.
+
+    Raises:
+        ValueError: for Box actions, which cannot be masked.
+    """
+    if isinstance(space, spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, spaces.MultiDiscrete):
+        return int(space.nvec.sum())
+    if isinstance(space, spaces.MultiBinary):
+        return int(np.prod(space.shape, dtype=int))
+    raise ValueError(f"masks need Discrete, MultiDiscrete or MultiBinary actions; {env_id} has {space}: use PPO")
+
+
+class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment whose observations hold the mask: a Dict of ``observation`` and ``action_mask``."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self._n = n_choices(env.action_space, describe(env))
+        self.observation_space = spaces.Dict({OBSERVATION: env.observation_space, MASK: spaces.MultiBinary(self._n)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        return {OBSERVATION: obs, MASK: self._mask(info)}, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return {OBSERVATION: obs, MASK: self._mask(info)}, reward, terminated, truncated, info
+
+    def _mask(self, info: dict[str, Any]) -> np.ndarray:
+        if MASK in info:
+            given = info[MASK]
+        else:
+            try:
+                given = self.env.get_wrapper_attr("action_masks")()
+            except AttributeError:
+                raise BadEnvironmentError(
+                    f'{describe(self.env)} says nowhere which actions are allowed; put info["action_mask"] into what '
+                    "reset and step return, or add a method action_masks()"
+                ) from None
+        mask = (
+            np.concatenate([np.asarray(part).ravel() for part in given]) if isinstance(given, list | tuple) else given
+        )
+        mask = np.asarray(mask).ravel().astype(np.int8)
+        if mask.shape != (self._n,):
+            raise BadEnvironmentError(
+                f"{describe(self.env)} gave a mask of {mask.size} entries, expected {self._n} for {self.action_space}"
+            )
+        self._check_some_allowed(mask)
+        return mask
+
+    def _check_some_allowed(self, mask: np.ndarray) -> None:
+        space = self.action_space
+        if isinstance(space, spaces.MultiBinary):
+            return
+        sizes = space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else [self._n]
+        if not all(part.any() for part in np.split(mask, np.cumsum(sizes)[:-1])):
+            raise BadEnvironmentError(f"{describe(self.env)} allows no action: its mask is {mask.tolist()}")
+
+
+@dataclass(frozen=True)
+class MaskedMaker:
+    """Makes an environment with its mask in the observation; can be sent to another process."""
+
+    make: Callable[[], gym.Env]
+
+    def __call__(self) -> gym.Env:
+        """Returns a new environment."""
+        return MaskInObservation(self.make())
+
+
+class MaskedVector(VectorEnv):
+    """A vector of environments whose observations are :class:`rejeu.core.Masked`."""
+
+    def __init__(self, inner: VectorEnv) -> None:
+        """Wraps a vector of :class:`MaskInObservation` environments."""
+        space = inner.observation_space
+        assert isinstance(space, spaces.Dict)
+        self.inner = inner
+        self.n_envs, self.backend, self.env_id = inner.n_envs, inner.backend, inner.env_id
+        self.observation_space, self.action_space = space[OBSERVATION], inner.action_space
+        self.max_episode_steps, self.reward_threshold = inner.max_episode_steps, inner.reward_threshold
+
+    def reset(self, seed: int | None = None) -> Masked:
+        return masked(self.inner.reset(seed))
+
+    def _step_all(self, action: np.ndarray) -> Step:
+        return self._shown(self.inner.step(action))
+
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        return self._shown(self.inner.step(action, active))
+
+    def _shown(self, step: Step) -> Step:
+        return step._replace(obs=masked(step.obs))
+
+    def reset_done(self, done: np.ndarray) -> Masked:
+        return masked(self.inner.reset_done(done))
+
+    def success(self, step: Step, env: int) -> float:
+        return self.inner.success(step, env)
+
+    def goals(self) -> GoalFunctions | None:
+        return None
+
+    def close(self) -> None:
+        self.inner.close()
+
+
+def masked(obs: dict[str, Any]) -> Masked:
+    """Returns what :class:`MaskInObservation` shows as an observation with its mask, ``bool (n_envs, n)``."""
+    return Masked(obs[OBSERVATION], obs[MASK].astype(bool))
+
+
+def mask_leaf(action_space: spaces.Space, env_id: str) -> Leaf:
+    """Returns the mask as one more array of an observation."""
+    return Leaf(MASK, "binary", (n_choices(action_space, env_id),), "bool")
+
+
+def make_masked(env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> MaskedVector:
+    """Returns ``n_envs`` environments with their masks as one; arguments as for :func:`make_vector`.
+
+    Raises:
+        TypeError: for a vector environment whose single environments cannot be reached.
+    """
+    behind = getattr(env, "vector", None)
+    env = behind if isinstance(behind, VectorEnv) else env
+    if isinstance(env, MaskedVector):
+        return env
+    if isinstance(env, InProcess):
+        return MaskedVector(InProcess([MaskInObservation(one) for one in env.envs], seed))
+    if isinstance(env, VectorEnv | gym.vector.VectorEnv):
+        raise TypeError(
+            f"the masks of {type(env).__name__} cannot be reached; give the id, the environment, or a function that makes "
+            "one, or rejeu.make_vector(function, n_envs, 'gymnasium')"
+        )
+    if isinstance(env, str):
+        env = maker(env)
+    if isinstance(env, gym.Env):
+        return MaskedVector(make_vector(MaskInObservation(env), n_envs, seed=seed))
+    if not callable(env):
+        raise TypeError(f"env must be an id, an environment or a function that makes one, got {type(env).__name__}")
+    chosen: Backend = "gymnasium" if backend in ("auto", "envpool") else backend
+    return MaskedVector(make_vector(MaskedMaker(env), n_envs, chosen, seed))
+
+
+def describe(env: gym.Env) -> str:
+    """Returns the id of an environment, or its class name."""
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
