@@ -30,6 +30,7 @@ from rejeu.algorithms.actor_critic import (
     check_flag,
     entropy_of,
     explained_variance,
+    explorer_of,
     is_value,
     masked_mean,
     samples,
@@ -105,7 +106,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     )
 
     def init(key: Array) -> State:
-        network = ActorCritic(key, obs_leaves, kind, config.policy_kwargs)
+        network = ActorCritic(key, obs_leaves, kind, config.policy_kwargs, config.use_sde)
         return State(network, optimizer.init(network), jnp.int32(0))
 
     def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
@@ -128,7 +129,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             metrics["std"] = jnp.mean(jnp.exp(network.log_std))
         return State(network, optimizer_state, state.n_updates + 1), metrics
 
-    return Algorithm(init, lambda state: state.network, explore, exploit, update)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer_of(config, kind))
 
 
 def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:

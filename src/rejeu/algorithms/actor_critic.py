@@ -23,7 +23,7 @@ from jax import Array
 
 from rejeu import running_stats, schedules
 from rejeu.config import nested, number, whole
-from rejeu.core import Masked, PyTree, Rollout
+from rejeu.core import Clock, Explorer, Masked, PyTree, Rollout
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
 from rejeu.networks import Convolution, Encoder, Linear, PolicyConfig, Torso, make_torso
 from rejeu.replay.rollout import advantages
@@ -108,6 +108,10 @@ class OnPolicyConfig:
     critic_learning_rate: float | Schedule | None = None
     """Gives the value an optimizer of its own, with this step size and a gradient norm of its own. None has one
     optimizer for both. Needs ``share_layers=False``, and of images ``share_features_extractor=False``."""
+    use_sde: bool = False
+    """Explore by noise that depends on the state and stays for many steps (gSDE): smooth motion. Box actions only."""
+    sde_sample_freq: int = -1
+    """Steps after which that noise is drawn anew; -1: with every episode. Raising it explores more slowly."""
     normalize_advantage: bool = True
     """Scale the advantages of every batch to mean 0 and standard deviation 1."""
     normalize: NormalizationConfig | None = None
@@ -137,12 +141,20 @@ class OnPolicyConfig:
         if self.max_grad_norm is not None:
             put("max_grad_norm", number("max_grad_norm", self.max_grad_norm, above=0))
         check_flag("normalize_advantage", self.normalize_advantage)
+        check_flag("use_sde", self.use_sde)
+        put("sde_sample_freq", whole("sde_sample_freq", self.sde_sample_freq, least=-1))
+        if self.sde_sample_freq == 0:
+            raise ValueError("sde_sample_freq=0 would draw no noise; use 1 or more, or -1 for once an episode")
         put("normalize", running_stats.parse(self.normalize))
         put("policy_kwargs", nested("policy_kwargs", ActorCriticConfig, self.policy_kwargs))
         if self.critic_learning_rate is not None and self.policy_kwargs.share_layers:
             raise ValueError(
                 "critic_learning_rate gives the value an optimizer of its own, which share_layers=True forbids; leave "
                 "one of them out"
+            )
+        if self.use_sde and (self.policy_kwargs.state_dependent_std or not self.policy_kwargs.learn_std):
+            raise ValueError(
+                "use_sde=True has a standard deviation of its own; leave state_dependent_std and learn_std out"
             )
 
     def steps_per_gradient(self, n_envs: int) -> int:
@@ -197,7 +209,7 @@ class ActorCritic(eqx.Module):
     torso: Torso
     head: Linear
     log_std: Array | None
-    """``(action_dim,)``; None where it depends on the observation or there is none."""
+    """``(action_dim,)``, with gSDE ``(width, action_dim)``; None where the head gives it or there is none."""
     value_encoder: Encoder | None
     """None where the policy's is shared."""
     value_torso: Torso | None
@@ -206,7 +218,14 @@ class ActorCritic(eqx.Module):
     action: ActionKind = eqx.field(static=True)
     shape: ActorCriticConfig = eqx.field(static=True)
 
-    def __init__(self, key: Array, leaves: tuple[Leaf, ...], action: ActionKind, shape: ActorCriticConfig) -> None:
+    def __init__(
+        self,
+        key: Array,
+        leaves: tuple[Leaf, ...],
+        action: ActionKind,
+        shape: ActorCriticConfig,
+        use_sde: bool = False,
+    ) -> None:
         """Draws the weights."""
         keys = jax.random.split(key, 6)
         widths, value_widths = shape.actor_widths(HIDDEN_LAYERS), shape.critic_widths(HIDDEN_LAYERS)
@@ -233,13 +252,18 @@ class ActorCritic(eqx.Module):
         self.encoder, self.torso, self.head = encoder, torso, head
         self.value_encoder, self.value_torso, self.value_head = value_encoder, value_torso, value_head
         has_log_std = action.kind == "box" and not std
-        self.log_std = jnp.full((action.n_outputs,), shape.log_std_init, jnp.float32) if has_log_std else None
+        std_shape = (n_hidden, action.n_outputs) if use_sde else (action.n_outputs,)
+        self.log_std = jnp.full(std_shape, shape.log_std_init, jnp.float32) if has_log_std else None
         self.action, self.shape = action, shape
 
     def policy(self, obs: PyTree) -> Distribution:
         """Returns the distribution of actions at observations ``(batch, ...)``, which may be :class:`Masked`."""
         obs, mask = unmasked(obs)
-        return self.distribution(self.torso(self.encoder(obs)), mask)
+        return self.distribution(self.hidden(obs), mask)
+
+    def hidden(self, obs: PyTree) -> Array:
+        """Returns the policy's last hidden layer at observations ``(batch, ...)``."""
+        return self.torso(self.encoder(obs))
 
     def value(self, obs: PyTree) -> Array:
         """Returns the values of observations ``(batch, ...)``, ``(batch,)``."""
@@ -265,7 +289,7 @@ class ActorCritic(eqx.Module):
                 outputs, log_std = jnp.split(outputs, 2, axis=-1)
                 log_std = jnp.clip(log_std, *LOG_STD_RANGE)
             else:
-                log_std = self.log_std[None]
+                log_std = self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden)
                 if not self.shape.learn_std:
                     log_std = jax.lax.stop_gradient(log_std)
             return (TanhNormal if self.shape.squash_output else Normal)(outputs, log_std)
@@ -277,6 +301,61 @@ class ActorCritic(eqx.Module):
             return Categorical(outputs)
         ends = np.cumsum(self.action.sizes)[:-1].tolist()
         return MultiCategorical(tuple(Categorical(part) for part in jnp.split(outputs, ends, axis=-1)))
+
+
+SDE_EPSILON = 1e-6
+"""Added to the variance of state-dependent noise, which is 0 where the hidden layer is."""
+
+
+def sde_log_std(log_std: Array, hidden: Array) -> Array:
+    """Returns the log standard deviation of state-dependent noise at hidden layers ``(batch, width)``.
+
+    The noise is ``hidden @ E`` with a matrix ``E`` of independent normals of standard deviations ``exp(log_std)`` (Raffin et
+    al. 2020, "Smooth Exploration for Robotic Reinforcement Learning", arXiv 2005.05719, equation 8). No gradient reaches
+    the hidden layer this way.
+    """
+    variance = jnp.square(jax.lax.stop_gradient(hidden)) @ jnp.exp(2.0 * log_std)
+    return 0.5 * jnp.log(variance + SDE_EPSILON)
+
+
+def sde_explorer(n_steps: int) -> Explorer:
+    """Returns exploration by state-dependent noise (gSDE), whose matrix is drawn anew every ``n_steps``, or -1: episode.
+
+    The carry is each environment's matrix ``(n_envs, width, action_dim)`` and its age in steps ``int32 (n_envs,)``.
+    """
+
+    def init(actor: ActorCritic, n_envs: int) -> tuple[Array, Array]:
+        assert actor.log_std is not None
+        return jnp.zeros((n_envs, *actor.log_std.shape), jnp.float32), jnp.zeros((n_envs,), jnp.int32)
+
+    def act(
+        carry: tuple[Array, Array], actor: ActorCritic, obs: PyTree, ended: Array, key: Array, clock: Clock
+    ) -> tuple[Array, tuple[Array, Array]]:
+        matrix, age = carry
+        assert actor.log_std is not None
+        due = ended if n_steps == -1 else ended | (age % n_steps == 0)
+        fresh = jnp.exp(actor.log_std)[None] * jax.random.normal(key, matrix.shape, matrix.dtype)
+        matrix = jnp.where(due[:, None, None], fresh, matrix)
+        hidden = actor.hidden(obs)
+        mean = actor.distribution(hidden, None).mean  # type: ignore[union-attr]
+        action = mean + jnp.einsum("nh,nhd->nd", hidden, matrix)
+        age = jnp.where(ended, 0, age) + 1
+        return jnp.tanh(action) if actor.shape.squash_output else action, (matrix, age)
+
+    return Explorer(init, act)
+
+
+def explorer_of(config: OnPolicyConfig, kind: ActionKind) -> Explorer | None:
+    """Returns how the policy explores where that takes more than drawing from its distribution, else None.
+
+    Raises:
+        ValueError: for state-dependent noise on actions that are no numbers.
+    """
+    if not config.use_sde:
+        return None
+    if kind.kind != "box":
+        raise ValueError("use_sde=True needs Box actions: there is no noise to add to choices; leave it out")
+    return sde_explorer(config.sde_sample_freq)
 
 
 def unmasked(obs: PyTree) -> tuple[PyTree, Array | None]:

@@ -41,6 +41,7 @@ from rejeu.algorithms.actor_critic import (
     clipped,
     entropy_of,
     explained_variance,
+    explorer_of,
     is_value,
     masked_mean,
     samples,
@@ -134,7 +135,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
-        network = ActorCritic(network_key, obs_leaves, kind, config.policy_kwargs)
+        network = ActorCritic(network_key, obs_leaves, kind, config.policy_kwargs, config.use_sde)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
     def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
@@ -163,7 +164,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
         return state, metrics_of(network, losses, data.value, data.target, data.valid, config, clock)
 
-    return Algorithm(init, lambda state: state.network, explore, exploit, update)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer_of(config, kind))
 
 
 def metrics_of(

@@ -86,6 +86,8 @@ class Config(ppo.Config):
     def __post_init__(self) -> None:
         object.__setattr__(self, "policy_kwargs", nested("policy_kwargs", RecurrentConfig, self.policy_kwargs))
         ppo.Config.__post_init__(self)
+        if self.use_sde:
+            raise ValueError("use_sde: state-dependent noise is not for policies with a memory; leave it out")
         if self.n_episodes is not None:
             raise ValueError(
                 "n_episodes: a recurrent policy learns from rollouts of equal length; give n_steps and leave it out"
