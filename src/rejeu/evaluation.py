@@ -22,7 +22,8 @@ class Evaluation:
     lengths: np.ndarray = field(repr=False)
     """Steps of each episode, ``(n,)``."""
     successes: np.ndarray = field(repr=False)
-    """1 or 0 for each episode, NaN where the environment does not say, ``(n,)``."""
+    """1 or 0 for each episode, ``(n,)``: what the environment says, else whether the return reached the threshold; NaN
+    where there is neither."""
 
     @property
     def mean_return(self) -> float:
@@ -52,7 +53,7 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float:
-        """Share of the episodes that succeeded, NaN if the environment does not say."""
+        """Share of the episodes that succeeded, NaN where it is unknown."""
         return float(np.mean(self.successes))
 
     @property
@@ -77,7 +78,12 @@ class Evaluation:
         return text
 
 
-def evaluate(policy: Callable[[Any, np.ndarray], np.ndarray], env: VectorEnv, episodes: int) -> Evaluation:
+def evaluate(
+    policy: Callable[[Any, np.ndarray], np.ndarray],
+    env: VectorEnv,
+    episodes: int,
+    success_threshold: float | None = None,
+) -> Evaluation:
     """Plays ``episodes`` whole episodes and returns what they came to.
 
     Every environment plays its own fixed share of the episodes, so that short ones are not counted more often.
@@ -87,6 +93,8 @@ def evaluate(policy: Callable[[Any, np.ndarray], np.ndarray], env: VectorEnv, ep
             the algorithm's range.
         env: reset at the beginning; left wherever the last episode ended.
         episodes: at least 1.
+        success_threshold: return from which on an episode counts as a success where the environment does not say; None
+            takes the environment's reward threshold.
     """
     if episodes < 1:
         raise ValueError(f"episodes={episodes} must be at least 1")
@@ -102,7 +110,7 @@ def evaluate(policy: Callable[[Any, np.ndarray], np.ndarray], env: VectorEnv, ep
         done = step.terminated | step.truncated
         for i in np.flatnonzero(done).tolist():
             if played[i] < share[i]:
-                rows.append((total[i], length[i], env.success(step, i)))
+                rows.append((total[i], length[i], env.judge(step, i, float(total[i]), success_threshold)))
                 played[i] += 1
             total[i] = length[i] = 0
         obs = env.reset_done(done) if done.any() and len(rows) < episodes else step.obs

@@ -48,6 +48,8 @@ AGENT_ARGUMENTS = {
     "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
     "tensorboard_log": "Folder for TensorBoard logs, None for none.",
     "stats_window_size": "Episodes over which reported means are taken.",
+    "success_threshold": "Return from which on an episode counts as a success where the environment does not say; None: "
+    "the environment's own reward threshold, if it has one.",
     "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
 }
 
@@ -86,6 +88,7 @@ class Agent(ABC):
         verbose: int = 0,
         tensorboard_log: str | Path | None = None,
         stats_window_size: int = 100,
+        success_threshold: float | None = None,
         device: str = "auto",
         **hyperparameters: Any,
     ) -> None:
@@ -99,6 +102,9 @@ class Agent(ABC):
         self.verbose = verbose
         self.tensorboard_log = tensorboard_log
         self.stats_window_size = configs.whole("stats_window_size", stats_window_size, least=1)
+        self.success_threshold = (
+            None if success_threshold is None else configs.number("success_threshold", success_threshold)
+        )
         self.history = History()
         self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=self.stats_window_size)
         """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
@@ -285,6 +291,7 @@ class Agent(ABC):
             return min(max(by_steps, by_episodes, by_time), 1.0)
 
         self.interrupted = False
+        self._run.success_threshold = self.success_threshold
         try:
             with Interrupt() as interrupt:
                 for turn in self._turns(n_steps, progress):
@@ -462,7 +469,12 @@ class Agent(ABC):
         return act
 
     def evaluate(
-        self, episodes: int = 100, env: Any = None, deterministic: bool = True, seed: int | None = None
+        self,
+        episodes: int = 100,
+        env: Any = None,
+        deterministic: bool = True,
+        seed: int | None = None,
+        success_threshold: float | None = None,
     ) -> Evaluation:
         """Plays whole episodes and returns their returns, lengths, successes and 95 % intervals.
 
@@ -472,7 +484,10 @@ class Agent(ABC):
                 else the agent's own, whose running episodes are then given up.
             deterministic: the policy's mode; False draws from the policy.
             seed: of the environments; None draws one.
+            success_threshold: return from which on an episode counts as a success where the environment does not say;
+                None takes the agent's own.
         """
+        threshold = self.success_threshold if success_threshold is None else success_threshold
         if env is None and self._run.env is None:
             raise ValueError("this agent has no environment; give one: evaluate(env=...)")
         own = env is None and not self._own_env
@@ -483,7 +498,7 @@ class Agent(ABC):
         else:
             vector = self._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
         try:
-            return evaluate(self._player(deterministic), vector, episodes)
+            return evaluate(self._player(deterministic), vector, episodes, threshold)
         finally:
             if own:
                 self._run.obs = self._run.action = None
@@ -569,6 +584,7 @@ class Agent(ABC):
             "env_id": run.env.env_id if run.env is not None else None,
             "seed": self.seed,
             "stats_window_size": self.stats_window_size,
+            "success_threshold": self.success_threshold,
             "counters": {
                 "step": run.step,
                 "steps_before": self._steps_before,
@@ -606,6 +622,8 @@ class Agent(ABC):
             counters = {key: configs.whole(key, header["counters"][key], 0, 2**32 - 1) for key in COUNTERS}
             rng = {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")}
             seed = whole_seed(own.pop("seed", header["seed"]))
+            threshold = own.pop("success_threshold", header.get("success_threshold"))
+            threshold = None if threshold is None else configs.number("success_threshold", threshold)
             window = configs.whole("stats_window_size", own.pop("stats_window_size", header["stats_window_size"]), 1)
             policy = own.pop("policy", header["policy"])
             cls._check_policy(policy, observation_space)
@@ -620,7 +638,7 @@ class Agent(ABC):
         agent.config, agent.policy, agent.seed = config, policy, seed
         agent.verbose = own.pop("verbose", 0)
         agent.tensorboard_log = own.pop("tensorboard_log", None)
-        agent.stats_window_size = window
+        agent.stats_window_size, agent.success_threshold = window, threshold
         agent.history = History()
         agent.ep_info_buffer, agent.ep_success_buffer = deque(maxlen=window), deque(maxlen=window)
         agent.interrupted, agent.steps_per_second = False, math.nan

@@ -24,6 +24,8 @@ class Evaluate:
     """auto, envpool, gymnasium or gymnasium-async; gymnasium is the environment's own package."""
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Of the environments; one is drawn if none is given."""
+    success_threshold: Annotated[float | None, arg(metavar="RETURN", help_behavior_hint="")] = None
+    """Return from which on an episode counts as a success; by default as in training."""
     which: Which = "best"
     """Of a folder: the model that evaluated best in training, or the last."""
 
@@ -41,7 +43,7 @@ def run(arguments: Evaluate) -> int:
     env = make_vector(env_id, min(episodes, 16), arguments.backend, arguments.seed)  # type: ignore[arg-type]
     try:
         print(f"{env_id} on {env.backend}, {model}", flush=True)
-        print(agent.evaluate(episodes, env=env), flush=True)
+        print(agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold), flush=True)
     finally:
         env.close()
     return 0

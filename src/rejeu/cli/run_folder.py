@@ -85,6 +85,8 @@ class RunConfig:
     """Environment steps to take, None where ``minutes`` ended the run."""
     minutes: float | None
     """Minutes of training, None where ``steps`` ended the run."""
+    success_threshold: float | None
+    """Return from which on an episode counts as a success where the environment does not say; None for its own."""
     evaluate_every: int
     evaluate_episodes: int
 

@@ -56,6 +56,8 @@ class Train:
     """Hyper-parameters, dotted where nested: policy_kwargs.net_arch=[64,64] train_freq=[1,"episode"]."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Run folder, new or empty; by default one under runs, named after the run and the time."""
+    success_threshold: Annotated[float | None, arg(metavar="RETURN", help_behavior_hint="")] = None
+    """Return from which on an episode counts as a success; by default what the environment says or declares."""
     evaluate_every: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Environment steps between two evaluations; by default the preset's, else 5000."""
     evaluate_episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -98,6 +100,8 @@ def check(arguments: Train) -> None:
             whole(f"--{name.replace('_', '-')}", getattr(arguments, name), least=1)
     if arguments.minutes is not None:
         number("--minutes", arguments.minutes, above=0)
+    if arguments.success_threshold is not None:
+        number("--success-threshold", arguments.success_threshold)
     if arguments.seed is not None:
         whole_seed(arguments.seed)
     run_folder.check_free(arguments.out)
@@ -182,6 +186,7 @@ def plan(arguments: Train, preset: Preset | None, algorithm: str, env: VectorEnv
         backend=env.backend,
         steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
         minutes=arguments.minutes,
+        success_threshold=arguments.success_threshold,
         evaluate_every=arguments.evaluate_every or base.evaluate_every,
         evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
     )
@@ -191,7 +196,9 @@ def make_agent(config: RunConfig, env: VectorEnv) -> Agent:
     """Returns the agent that a configuration describes."""
     from rejeu import AGENTS
 
-    return AGENTS[config.algorithm](config.policy, env, seed=config.seed, **config.hyperparameters)
+    return AGENTS[config.algorithm](
+        config.policy, env, seed=config.seed, success_threshold=config.success_threshold, **config.hyperparameters
+    )
 
 
 def make_evaluation_env(config: RunConfig) -> VectorEnv:

@@ -6,6 +6,7 @@ environments stay ended until :meth:`VectorEnv.reset_done` is called.
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -107,6 +108,16 @@ class VectorEnv(ABC):
     @abstractmethod
     def success(self, step: Step, env: int) -> float:
         """Returns 1.0 or 0.0 for whether environment ``env`` reached its goal in ``step``, NaN if it does not say."""
+
+    def judge(self, step: Step, env: int, episode_return: float, threshold: float | None) -> float:
+        """Returns 1.0 or 0.0 for whether the episode that ``step`` ended in environment ``env`` succeeded.
+
+        Where the environment does not say so itself, an episode succeeds whose return is at least ``threshold``, or the
+        environment's own reward threshold if that is None; NaN where there is neither.
+        """
+        own = self.success(step, env)
+        threshold = self.reward_threshold if threshold is None else threshold
+        return own if threshold is None or not math.isnan(own) else float(episode_return >= threshold)
 
     @abstractmethod
     def goals(self) -> GoalFunctions | None:

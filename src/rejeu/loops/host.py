@@ -66,6 +66,8 @@ class Run:
     """What exploration remembers, per environment."""
     learn_from: int
     """The step from which on gradients are taken."""
+    success_threshold: float | None = None
+    """Return from which on an episode counts as a success; see :meth:`VectorEnv.judge`."""
     seed: int | None = None
     """Handed to the environments at their first reset."""
     step: int = 0
@@ -158,7 +160,7 @@ def book(run: Run, step: Step, counts: np.ndarray | None, stepped: np.ndarray | 
                     env,
                     float(run.episode_return[env]),
                     int(run.episode_length[env]),
-                    run.env.success(step, env),
+                    run.env.judge(step, env, float(run.episode_return[env]), run.success_threshold),
                     run.seconds["total"],
                 )
             )
