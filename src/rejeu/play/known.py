@@ -1,0 +1,93 @@
+"""Environments whose keys are known, and short names for some of them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from rejeu.play import keys
+from rejeu.play.keys import KeyMap
+
+SHORT_NAMES = {"car": "CarRacing-v3", "mountain": "MountainCar-v0", "lunar": "LunarLander-v3"}
+"""What else may be said for an id, in any case of letters."""
+
+KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
+    "CartPole-v1": {
+        "a": (0, "left"),
+        "d": (1, "right"),
+        # There is no action that does nothing: in turn, the two pushes cancel within 0.04 seconds.
+        "none": ([0, 1], ""),
+    },
+    "MountainCar-v0": {"a": (0, "left"), "d": (2, "right"), "none": (1, "")},
+    "MountainCarContinuous-v0": {"a": ([-1.0], "left"), "d": ([1.0], "right")},
+    # Positive torques turn against the clock.
+    "Pendulum-v1": {"a": ([2.0], "anticlockwise"), "d": ([-2.0], "clockwise")},
+    # Gymnasium names the side engines by the side they are on; the keys by where they push the lander.
+    "LunarLander-v3": {"a": (1, "left"), "d": (3, "right"), "w": (2, "main engine"), "none": (0, "")},
+    "LunarLanderContinuous-v3": {
+        "a": ([0.0, -1.0], "left"),
+        "d": ([0.0, 1.0], "right"),
+        "w": ([1.0, 0.0], "main engine"),
+    },
+    # Full brakes lock the wheels.
+    "CarRacing-v3": {
+        "a": ([-1.0, 0.0, 0.0], "left"),
+        "d": ([1.0, 0.0, 0.0], "right"),
+        "w": ([0.0, 1.0, 0.0], "gas"),
+        "s": ([0.0, 0.0, 0.8], "brake"),
+    },
+    # Acceleration and steering; y points down on the screen, so that a positive angle is to the driver's right.
+    "parking-v0": {
+        "a": ([0.0, -1.0], "left"),
+        "d": ([0.0, 1.0], "right"),
+        "w": ([1.0, 0.0], "forward"),
+        "s": ([-1.0, 0.0], "backward"),
+    },
+    "rejeu/Ball-v0": {
+        "a": ([-2.0, 0.0], "left"),
+        "d": ([2.0, 0.0], "right"),
+        "w": ([0.0, 2.0], "up"),
+        "s": ([0.0, -2.0], "down"),
+    },
+}
+"""By id: the action of each key, and what it does."""
+
+
+def full_name(name: str) -> str:
+    """Returns the id that a short name stands for, or what was given.
+
+    Raises:
+        ValueError: if it is neither an id nor a short name, but nearly a short name.
+
+    >>> full_name("Mountain"), full_name("CartPole-v1")
+    ('MountainCar-v0', 'CartPole-v1')
+    """
+    if name.lower() not in SHORT_NAMES and name not in gym.registry:
+        near = difflib.get_close_matches(name.lower(), SHORT_NAMES, n=1, cutoff=0.7)
+        if near:
+            raise ValueError(f"no environment is called {name!r}; did you mean {near[0].capitalize()}?")
+    return SHORT_NAMES.get(name.lower(), name)
+
+
+def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None) -> KeyMap:
+    """Returns the keys of an environment: those known for it, else some by its action space, changed by ``own``.
+
+    Raises:
+        ValueError: if the actions cannot be played by hand or ``own`` does not fit them.
+
+    >>> [binding.label for binding in keys_for("MountainCar-v0", gym.spaces.Discrete(3)).bindings]
+    ['left', 'right']
+    """
+    own = dict(own or {})
+    labels: dict[str, str] = {}
+    if env_id in KNOWN:
+        actions = {key: action for key, (action, _) in KNOWN[env_id].items()}
+        labels = {key: label for key, (_, label) in KNOWN[env_id].items()}
+    elif own and isinstance(space, gym.spaces.Box) and space.low.size > len(keys.AXIS_KEYS):
+        actions = {}
+    else:
+        actions, labels = keys.default_actions(space), keys.default_labels(space)
+    return keys.bind(space, {**actions, **own}, {key: label for key, label in labels.items() if key not in own})
