@@ -11,12 +11,13 @@ from typing import Any
 
 import tyro
 
-from rejeu.cli import evaluate, list as listing, record, train
+from rejeu.cli import evaluate, list as listing, play, record, train
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
     "evaluate": (evaluate.Evaluate, evaluate.run),
     "record": (record.Record, record.run),
+    "play": (play.Play, play.run),
     "list": (listing.List, listing.run),
 }
 """Each command's arguments, and the function that takes them and returns the exit status."""

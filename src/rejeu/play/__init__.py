@@ -1,1 +1,140 @@
-"""Environments played by hand: ``keys.py`` says which action the keys held stand for, ``known.py`` for which environment."""
+"""Environments played by hand in a window, alone or beside an agent.
+
+``keys.py`` says which action the keys held stand for, ``game.py`` what happens step by step, ``window.py`` shows it and
+listens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.agents import Agent
+from rejeu.config import number, whole
+from rejeu.envs.registry import make_env
+from rejeu.play.game import Act, Game, Pace, Player
+from rejeu.play.keys import KeyMap
+from rejeu.play.known import full_name, keys_for
+from rejeu.play.window import Window
+from rejeu.video import DEFAULT_FPS
+
+__all__ = ["Game", "Player", "play"]
+
+REST_SECONDS = 1.5
+"""How long the end of a round stays to be seen."""
+
+
+def play(
+    env: str,
+    *,
+    keys: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    fps: float | None = None,
+    episodes: int | None = None,
+    against: Any = None,
+) -> Game:
+    """Opens a window in which a person plays, and returns the game as it stood when the window was closed.
+
+    Args:
+        env: an id, or Car, Mountain or Lunar.
+        keys: actions by keys, on top of those known for the environment; see :mod:`rejeu.play.keys`.
+        seed: of the first start; each further one has the next seed. None draws one.
+        fps: steps a second; None: the environment's own, 30 if it declares none.
+        episodes: close after so many; None leaves that to the player.
+        against: an agent, anything with ``predict(obs, deterministic=True)``, that plays the same starts beside.
+
+    Raises:
+        MissingExtra: if pygame-ce is not installed.
+        ValueError: for an unknown environment, one without pictures, or actions that cannot be played by hand.
+        OSError: if there is no screen.
+    """
+    env_id = full_name(env)
+    seed, episodes = _check(seed, fps, episodes)
+    with ExitStack() as stack:
+        playing = make_drawing(env_id)
+        stack.callback(playing.close)
+        keys_of_env = keys_for(env_id, playing.action_space, keys)
+        fps = natural_fps(playing) if fps is None else fps
+        by_hand = Player("you", playing, lambda obs, held, step: keys_of_env.action(held, step))
+        players = [by_hand]
+        if against is not None:
+            rival = make_drawing(env_id)
+            stack.callback(rival.close)
+            players.append(Player(_name(against), rival, _policy(against)))
+        game = Game(players, seed, keys_of_env.names, episodes, rest=round(REST_SECONDS * fps))
+        _run(Window(f"rejeu play {env_id}"), game, keys_of_env, fps)
+    return game
+
+
+def turn(window: Window, game: Game) -> None:
+    """Does what the events since the last call ask for, lets one step's time go by, and shows the game."""
+    for event in window.events():
+        if event.kind == "press":
+            game.press(event.key)
+        elif event.kind == "release":
+            game.release(event.key)
+        elif event.kind == "leave":
+            game.release_all()
+        else:
+            game.closed = True
+    game.tick()
+    window.draw(game)
+
+
+def make_drawing(env_id: str) -> gym.Env:
+    """Makes an environment that draws to arrays.
+
+    Raises:
+        ValueError: if none is called so, or it cannot draw.
+        MissingExtra: if a package that it needs is not installed.
+    """
+    plain = make_env(env_id)  # first, because gymnasium.make only warns of a render mode that an environment lacks
+    modes = plain.metadata.get("render_modes") or []
+    plain.close()
+    if "rgb_array" not in modes:
+        raise ValueError(f"{env_id} cannot be shown: it has the render modes {[*modes]}, which lack 'rgb_array'")
+    return make_env(env_id, render_mode="rgb_array")
+
+
+def natural_fps(env: gym.Env) -> float:
+    """Returns the steps a second that an environment declares, or 30."""
+    return float(env.metadata.get("render_fps") or DEFAULT_FPS)
+
+
+def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:
+    with window:
+        game.begin()
+        for player in game.players:
+            player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action; not while somebody plays
+        window.open(game, keys)
+        pace = Pace(fps)
+        while not game.closed:
+            turn(window, game)
+            pace.wait()
+
+
+def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[int, int | None]:
+    """Returns the seed, drawn if there is none, and the number of episodes.
+
+    Raises:
+        ValueError: for a bad number.
+    """
+    if fps is not None:
+        number("fps", fps, above=0)
+    if episodes is not None:
+        whole("episodes", episodes, least=1)
+    if seed is None:
+        return int(np.random.default_rng().integers(10_000)), episodes
+    return whole("seed", seed, least=0), episodes
+
+
+def _policy(agent: Any) -> Act:
+    return lambda obs, held, step: agent.predict(obs, deterministic=True)[0]
+
+
+def _name(agent: Any) -> str:
+    return agent.name if isinstance(agent, Agent) else type(agent).__name__

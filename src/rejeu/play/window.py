@@ -1,0 +1,235 @@
+"""The window of a game: what the environments look like, side by side, with scores above and keys below."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from rejeu.errors import MissingExtra
+from rejeu.play.game import Game, Player
+from rejeu.play.keys import KeyMap, spellings
+
+Colour = tuple[int, int, int]
+
+PAPER, INK, FAINT, LINE = (246, 246, 243), (52, 58, 70), (128, 134, 145), (214, 217, 222)
+BLUE, GREEN, WHITE = (40, 104, 190), (38, 150, 96), (255, 255, 255)
+MARGIN, HEADER, LEGEND_ROW = 14, 62, 26
+"""Pixels around and between the pictures, above each, and of a row of the legend."""
+LEAST_HEIGHT, MOST_WIDTH = 360, 720
+"""Pictures much lower than this are enlarged, by a whole number, until they are as high or would get too wide."""
+SHARE_OF_SCREEN = 0.9
+"""Of the screen, at most, that the window opens on."""
+UNSEEN = ("dummy", "offscreen")
+"""SDL's drivers without a screen; they are used where they are asked for by SDL_VIDEODRIVER, as by the tests."""
+HELP = (("r", "restart"), ("p", "pause"), ("q", "quit"))
+
+
+class Event(NamedTuple):
+    """Something that a person did."""
+
+    kind: str
+    """``press``, ``release``, ``leave`` (the keyboard went to another window) or ``close``."""
+    key: str = ""
+    """SDL's name of the key, in lower case."""
+
+
+class Window:
+    """One window on the screen. Mutable; as a context manager it is closed at the end.
+
+    It opens in two steps, because environments draw with the same library: where there is no screen, that must be found
+    out before the first of them draws, and how large the window is depends on what they draw.
+
+    Raises:
+        MissingExtra: if pygame-ce is not installed.
+        OSError: if there is no screen.
+    """
+
+    def __init__(self, title: str) -> None:
+        try:
+            import pygame
+        except ImportError:
+            raise MissingExtra("playing", "pygame-ce", "play") from None
+        self.pygame: Any = pygame
+        self.title = title
+        try:
+            pygame.display.init()
+            driver = pygame.display.get_driver()
+        except pygame.error as error:
+            driver = str(error)
+        # SDL falls back on drivers that draw into memory, where nobody would ever close the window.
+        if not pygame.display.get_init() or (driver in UNSEEN and os.environ.get("SDL_VIDEODRIVER") != driver):
+            pygame.display.quit()
+            raise OSError(
+                f"no window can be opened here: SDL finds no screen ({driver}); rejeu record RUN films without a screen"
+            )
+        pygame.font.init()
+        self.canvas: Any = None
+        """What is shown, at its natural size."""
+        self._screen: Any = None
+        self._legend: list[tuple[str, str, frozenset[str]]] = []
+        self._sizes: list[tuple[int, int]] = []
+
+    def open(self, game: Game, keys: KeyMap | None) -> None:
+        """Opens the window at a size that holds the game's pictures, with the keys' meanings if there are any."""
+        pygame = self.pygame
+        self._fonts = {size: pygame.font.Font(None, size) for size in (20, 22, 24, 34)}
+        self._legend = [] if keys is None else legend(keys)
+        self._sizes = [picture_size(player.frame) for player in game.players]
+        width = sum(size[0] for size in self._sizes) + MARGIN * (len(self._sizes) + 1)
+        self._rows = self._arrange(width)
+        height = HEADER + max(size[1] for size in self._sizes) + LEGEND_ROW * len(self._rows) + MARGIN
+        self.canvas = pygame.Surface((width, height))
+        screen_width, screen_height = pygame.display.get_desktop_sizes()[0]
+        fit = min(1.0, SHARE_OF_SCREEN * screen_width / width, SHARE_OF_SCREEN * screen_height / height)
+        self._screen = pygame.display.set_mode((round(width * fit), round(height * fit)), pygame.RESIZABLE)
+        pygame.display.set_caption(self.title)
+        pygame.key.stop_text_input()  # else an input method may keep letters to itself
+
+    def events(self) -> list[Event]:
+        """Returns what happened since the last call, oldest first."""
+        pygame = self.pygame
+        found = []
+        for event in pygame.event.get():
+            if event.type in (pygame.KEYDOWN, pygame.KEYUP):
+                kind = "press" if event.type == pygame.KEYDOWN else "release"
+                found.append(Event(kind, pygame.key.name(event.key).lower()))
+            elif event.type == pygame.WINDOWFOCUSLOST:
+                found.append(Event("leave"))
+            elif event.type == pygame.QUIT:
+                found.append(Event("close"))
+        return found
+
+    def draw(self, game: Game) -> None:
+        """Shows the game as it stands."""
+        self.canvas.fill(PAPER)
+        left = MARGIN
+        for player, size in zip(game.players, self._sizes, strict=True):
+            self._draw_header(player, left, size[0], by_hand=bool(game.bound))
+            self._draw_picture(player.frame, (left, HEADER), size)
+            text = message(game, player)
+            if text:
+                self._draw_message(text, left + size[0] / 2, HEADER + 0.2 * size[1], player.success == 1.0)
+            left += size[0] + MARGIN
+        self._draw_legend(game)
+        self._present()
+
+    def close(self) -> None:
+        """Closes the window."""
+        self._screen = None
+        self.pygame.display.quit()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _present(self) -> None:
+        if self._screen.get_size() == self.canvas.get_size():
+            self._screen.blit(self.canvas, (0, 0))
+        else:
+            width, height = self.canvas.get_size()
+            fit = min(self._screen.get_width() / width, self._screen.get_height() / height)
+            size = max(round(width * fit), 1), max(round(height * fit), 1)
+            corner = (self._screen.get_width() - size[0]) // 2, (self._screen.get_height() - size[1]) // 2
+            self._screen.fill(PAPER)
+            self._screen.blit(self.pygame.transform.smoothscale(self.canvas, size), corner)
+        self.pygame.display.flip()
+
+    def _draw_header(self, player: Player, left: int, width: int, by_hand: bool) -> None:
+        self._write(player.name, (left, 12), 24, INK)
+        best = f"best {number(player.best)}"
+        mean = f"mean {number(player.mean)} of {len(player.scores)}"
+        self._write(best if by_hand else f"{mean}   {best}", (left + width, 14), 22, FAINT, right=True)
+        self._write(f"score {number(player.score)}", (left, 37), 24, BLUE)
+        self._write(f"step {player.steps}", (left + width, 38), 22, FAINT, right=True)
+
+    def _draw_picture(self, frame: np.ndarray, corner: tuple[int, int], size: tuple[int, int]) -> None:
+        height, width = frame.shape[:2]
+        picture = self.pygame.image.frombuffer(np.ascontiguousarray(frame).tobytes(), (width, height), "RGB")
+        if (width, height) != size:
+            picture = self.pygame.transform.scale(picture, size)
+        self.canvas.blit(picture, corner)
+        self.pygame.draw.rect(self.canvas, LINE, (corner[0] - 1, corner[1] - 1, size[0] + 2, size[1] + 2), 1)
+
+    def _draw_message(self, text: str, x: float, y: float, success: bool) -> None:
+        drawn = self._fonts[34].render(text, True, WHITE)
+        width, height = drawn.get_width() + 36, drawn.get_height() + 22
+        plate = self.pygame.Surface((width, height), self.pygame.SRCALPHA)
+        colour = GREEN if success else INK
+        self.pygame.draw.rect(plate, (*colour, 215), plate.get_rect(), border_radius=8)
+        plate.blit(drawn, (18, 12))
+        self.canvas.blit(plate, (round(x - width / 2), round(y - height / 2)))
+
+    def _arrange(self, width: int) -> list[list[tuple[str, str, frozenset[str], int]]]:
+        """Returns the legend in rows that fit, each entry with its left edge; the window's own keys come last."""
+        entries = [*self._legend, *((key, label, frozenset[str]()) for key, label in HELP)]
+        rows: list[list[tuple[str, str, frozenset[str], int]]] = [[]]
+        left = MARGIN
+        for key, label, names in entries:
+            wide = self._fonts[22].size(key)[0] + self._fonts[20].size(label)[0] + 32
+            if left + wide > width and rows[-1]:
+                rows.append([])
+                left = MARGIN
+            rows[-1].append((key, label, names, left))
+            left += wide
+        return rows
+
+    def _draw_legend(self, game: Game) -> None:
+        top = self.canvas.get_height() - LEGEND_ROW * len(self._rows) - 2
+        for row, entries in enumerate(self._rows):
+            y = top + LEGEND_ROW * row
+            for key, label, names, left in entries:
+                wide = self._fonts[22].size(key)[0] + 12
+                plate = (left, y, wide, LEGEND_ROW - 6)
+                down = bool(names & game.held)
+                self.pygame.draw.rect(self.canvas, BLUE if down else WHITE, plate, border_radius=4)
+                self.pygame.draw.rect(self.canvas, BLUE if down else LINE, plate, 1, border_radius=4)
+                self._write(key, (left + 6, y + 3), 22, WHITE if down else INK)
+                self._write(label, (left + wide + 6, y + 4), 20, FAINT)
+
+    def _write(self, text: str, corner: tuple[int, int], size: int, colour: Colour, right: bool = False) -> None:
+        drawn = self._fonts[size].render(text, True, colour)
+        self.canvas.blit(drawn, (corner[0] - drawn.get_width() if right else corner[0], corner[1]))
+
+
+def legend(keys: KeyMap) -> list[tuple[str, str, frozenset[str]]]:
+    """Returns what is shown of each binding: its keys, what they do, and the names of the keys that do it."""
+    return [
+        ("+".join(sorted(binding.keys)), binding.label, spellings(binding, keys.bindings)) for binding in keys.bindings
+    ]
+
+
+def message(game: Game, player: Player) -> str:
+    """Returns what is written over a player's picture, empty for nothing."""
+    if player.over and player.steps:
+        outcome = {1.0: "done", 0.0: "missed"}.get(player.success, "over")
+        return f"{outcome}: {number(player.score)}"
+    if game.paused:
+        return "paused"
+    return "press a key to begin" if game.phase == "ready" else ""
+
+
+def picture_size(frame: np.ndarray) -> tuple[int, int]:
+    """Returns the width and height at which a picture is shown: its own, or whole times that if it is small.
+
+    >>> [picture_size(np.zeros((*size, 3), np.uint8)) for size in ((400, 600), (100, 80), (150, 600))]
+    [(600, 400), (320, 400), (600, 150)]
+    """
+    height, width = frame.shape[:2]
+    times = max(min(math.ceil(LEAST_HEIGHT / height), MOST_WIDTH // width), 1) if height < 0.75 * LEAST_HEIGHT else 1
+    return width * times, height * times
+
+
+def number(value: float) -> str:
+    """Returns a score as it is shown: whole, or with one digit; a dash if there is none.
+
+    >>> number(200.0), number(-13.27), number(float("nan"))
+    ('200', '-13.3', '-')
+    """
+    if math.isnan(value):
+        return "-"
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.1f}"

@@ -1,0 +1,127 @@
+"""Environments, an agent and scripted key presses for the tests of playing by hand."""
+
+from __future__ import annotations
+
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from rejeu import play as play_package
+from rejeu.cli import main
+from rejeu.play.game import Pace
+
+pygame = pytest.importorskip("pygame")
+
+
+class Lever(gym.Env):
+    """Episodes of 5 steps, each rewarded with its action; a success is to gain 5. The picture of step t is grey 40 t."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    observation_space = gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.actions, self.seeds, self.frames = [], [], 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seeds.append(seed)
+        self.time, self.gain = 0, 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.actions.append(int(action))
+        self.time += 1
+        self.gain += int(action)
+        done = self.time == 5
+        return self.observe(), float(action), done, False, {"is_success": self.gain >= 5} if done else {}
+
+    def observe(self):
+        return self.np_random.integers(0, 256, (40, 40, 3), np.uint8)
+
+    def render(self):
+        return np.full((300, 400, 3), 40 * self.time, np.uint8)
+
+
+class Dark(Lever):
+    metadata = {"render_modes": ["ansi"]}
+
+
+class Switches(Lever):
+    action_space = gym.spaces.MultiBinary(3)
+
+
+class Steps(Lever):
+    action_space = gym.spaces.Discrete(4)
+
+
+for kind in (Lever, Dark, Switches, Steps):
+    gym.register(f"rejeu-play-test/{kind.__name__}-v0", f"{__name__}:{kind.__name__}")
+gym.register("rejeu-play-test/Class-v0", Lever)
+LEVER = "rejeu-play-test/Lever-v0"
+
+
+def perform(script, run, *arguments, **settings):
+    """Runs something that opens a window, with a script that goes on before each turn; its end closes the window."""
+    scripts, real = [], play_package.turn
+
+    def turn(window, game):
+        scripts.append(scripts[0] if scripts else script(window, game))
+        if next(scripts[0], "end") == "end":
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+        real(window, game)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(play_package, "turn", turn)
+        patch.setattr(Pace, "wait", lambda self: None)
+        return run(*arguments, **settings)
+
+
+def down(*names):
+    for name in names:
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.key.key_code(name)))
+
+
+def up(*names):
+    for name in names:
+        pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.key.key_code(name)))
+
+
+def tap(*names):
+    down(*names)
+    up(*names)
+
+
+def lever(game):
+    return game.players[0].env.unwrapped
+
+
+def hold(names, steps, read, found):
+    """A script: holds some keys for some steps, then notes what ``read`` gives of the environment."""
+
+    def script(window, game):
+        down(*(names or ["p"]))
+        for _ in range(steps):
+            yield
+        found.append(read(game.players[0].env.unwrapped))
+
+    return script
+
+
+class Pull:
+    """An agent that always takes action 2."""
+
+    def predict(self, obs, deterministic=False):
+        assert deterministic
+        return np.int64(2), None
+
+
+def error_of(capsys, *argv):
+    """The line that a command prints when it fails."""
+    assert main([*argv]) == 2
+    text = capsys.readouterr().err
+    assert re.fullmatch(r"rejeu: error: [^\n]+\n", text)
+    return text

@@ -1,0 +1,477 @@
+"""Playing by hand, in a window on SDL's dummy driver, with key events in SDL's own queue."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu import play as play_package
+from rejeu.cli import main
+from rejeu.envs.registry import make_env
+from rejeu.play import Game, play
+from rejeu.play.game import Pace
+from rejeu.play.window import Window
+from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
+
+
+def box2d(env_id):
+    """Skips the test of a Box2D environment where that is not installed; importing it warns, and crashes on errors."""
+    if env_id.startswith(("Lunar", "Car")) and "Pole" not in env_id:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pytest.importorskip("Box2D")
+
+
+EFFECTS = [
+    ("CartPole-v1", "d", "velocity", lambda e: e.state[1], +1),
+    ("CartPole-v1", "left", "velocity", lambda e: e.state[1], -1),
+    ("MountainCar-v0", "d", "velocity", lambda e: e.state[1], +1),
+    ("MountainCar-v0", "a", "velocity", lambda e: e.state[1], -1),
+    ("MountainCarContinuous-v0", "right", "velocity", lambda e: e.state[1], +1),
+    ("MountainCarContinuous-v0", "a", "velocity", lambda e: e.state[1], -1),
+    ("Pendulum-v1", "a", "anticlockwise speed", lambda e: e.state[1], +1),
+    ("Pendulum-v1", "d", "anticlockwise speed", lambda e: e.state[1], -1),
+    ("Acrobot-v1", "d", "speed of the joint", lambda e: e.state[3], +1),
+    ("LunarLander-v3", "a", "speed to the right", lambda e: e.lander.linearVelocity.x, -1),
+    ("LunarLander-v3", "d", "speed to the right", lambda e: e.lander.linearVelocity.x, +1),
+    ("LunarLander-v3", "w", "speed upwards", lambda e: e.lander.linearVelocity.y, +1),
+    ("LunarLander-v3", "w+a", "speed upwards", lambda e: e.lander.linearVelocity.y, +1),
+    ("LunarLander-v3", "w+a", "speed to the right", lambda e: e.lander.linearVelocity.x, -1),
+    ("LunarLanderContinuous-v3", "w+a", "speed upwards", lambda e: e.lander.linearVelocity.y, +1),
+    ("LunarLanderContinuous-v3", "w+a", "speed to the right", lambda e: e.lander.linearVelocity.x, -1),
+    ("LunarLanderContinuous-v3", "up+right", "speed to the right", lambda e: e.lander.linearVelocity.x, +1),
+    ("CarRacing-v3", "w", "speed", lambda e: e.car.hull.linearVelocity.length, +1),
+    ("CarRacing-v3", "w+d", "angle against the clock", lambda e: e.car.hull.angle, -1),
+    ("CarRacing-v3", "w+a", "angle against the clock", lambda e: e.car.hull.angle, +1),
+    ("parking-v0", "w", "speed", lambda e: e.vehicle.speed, +1),
+    ("parking-v0", "s", "speed", lambda e: e.vehicle.speed, -1),
+    ("parking-v0", "w+d", "heading by the clock", lambda e: e.vehicle.heading, +1),
+    ("parking-v0", "w+a", "heading by the clock", lambda e: e.vehicle.heading, -1),
+    ("rejeu/Ball-v0", "d", "x", lambda e: e.position[0], +1),
+    ("rejeu/Ball-v0", "w+a", "x", lambda e: e.position[0], -1),
+    ("rejeu/Ball-v0", "w+a", "y", lambda e: e.position[1], +1),
+]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "keys", "what", "read", "sign"), EFFECTS, ids=lambda v: v if isinstance(v, str) else ""
+)
+def test_keys_held_move_the_environment_as_they_say(env_id, keys, what, read, sign):
+    box2d(env_id)
+    steps = 12 if env_id == "CarRacing-v3" else 4
+    found = []
+    perform(hold(keys.split("+"), steps, read, found), play, env_id, seed=0)
+    perform(hold([], steps, read, found), play, env_id, seed=0)  # the same start with nothing held
+    assert np.sign(found[0] - found[1]) == sign, what
+
+
+def test_the_brake_slows_the_car_down():
+    box2d("CarRacing-v3")
+    speeds = []
+
+    def script(brake):
+        def script(window, game):
+            down("w")
+            for _ in range(25):
+                yield
+            up("w")
+            down(*brake)
+            for _ in range(15):
+                yield
+            speeds.append(game.players[0].env.unwrapped.car.hull.linearVelocity.length)
+
+        return script
+
+    perform(script(["s"]), play, "Car", seed=0)
+    perform(script([]), play, "Car", seed=0)
+    assert speeds[0] < 0.8 * speeds[1]
+
+
+def test_a_game_begins_with_the_first_key_that_means_something():
+    def script(window, game):
+        tap("x")
+        yield
+        yield
+        assert (game.phase, lever(game).actions) == ("ready", [])
+        down("d")
+        yield
+        assert (game.phase, lever(game).actions) == ("running", [2])
+
+    perform(script, play, LEVER)
+
+
+def test_keys_act_from_the_moment_they_go_down_until_they_go_up():
+    def script(window, game):
+        down("d")
+        yield
+        yield
+        down("a")  # cancels d
+        yield
+        up("d")
+        yield
+        up("a")
+        yield
+        assert lever(game).actions == [2, 2, 1, 0, 1]
+
+    perform(script, play, LEVER)
+
+
+def test_a_tap_shorter_than_a_step_counts_for_one():
+    def script(window, game):
+        tap("d")
+        yield
+        yield
+        yield
+        assert lever(game).actions == [2, 1, 1]
+
+    perform(script, play, LEVER)
+
+
+def test_keys_are_let_go_when_another_window_takes_the_keyboard():
+    def script(window, game):
+        down("d")
+        yield
+        pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
+        yield
+        assert lever(game).actions == [2, 1]
+
+    perform(script, play, LEVER)
+
+
+def test_actions_that_have_none_for_nothing_wait_for_a_key():
+    def script(window, game):
+        tap("w")
+        yield
+        yield
+        yield
+        assert lever(game).actions == [3]
+        tap("1")
+        yield
+        yield
+        assert lever(game).actions == [3, 1]
+
+    perform(script, play, "rejeu-play-test/Steps-v0")
+
+
+@pytest.mark.parametrize("key", ["p", "space"])
+def test_pause_stops_the_game_and_lets_it_go_on(key):
+    def script(window, game):
+        down("d")
+        yield
+        yield
+        tap(key)
+        yield
+        yield
+        yield
+        assert game.paused
+        assert len(lever(game).actions) == 2
+        tap(key)
+        yield
+        yield
+        assert len(lever(game).actions) == 4
+
+    perform(script, play, LEVER)
+
+
+def test_a_space_bar_that_is_bound_does_not_pause():
+    def script(window, game):
+        down("space")
+        yield
+        assert not game.paused
+        assert lever(game).actions == [2]
+
+    perform(script, play, LEVER, keys={"space": 2})
+
+
+def test_restart_begins_the_same_start_anew_and_the_episode_does_not_count():
+    def script(window, game):
+        down("d")
+        yield
+        yield
+        assert game.players[0].score == 4
+        up("d")
+        tap("r")
+        yield
+        player = game.players[0]
+        assert (player.score, player.steps, player.scores, game.phase) == (0, 0, [], "ready")
+        assert lever(game).seeds == [7, 7]
+
+    perform(script, play, LEVER, seed=7)
+
+
+def test_scores_are_summed_the_best_is_kept_and_each_round_has_the_next_seed():
+    def script(window, game):
+        player = game.players[0]
+        for key, score, best in (("d", 10, 10), ("a", 0, 10), ("a", 0, 10)):
+            down(key)
+            while game.phase != "over":
+                yield
+            assert (player.score, player.best, player.steps) == (score, best, 5)
+            up(key)
+            while game.phase == "over":
+                yield
+        assert lever(game).seeds == [3, 4, 5, 6]
+        assert player.mean == pytest.approx(10 / 3)
+
+    perform(script, play, LEVER, seed=3)
+
+
+def test_the_end_of_a_round_stays_for_a_second_and_a_half():
+    def script(window, game):
+        down("d")
+        while game.phase != "over":
+            yield
+        up("d")
+        turns = 0
+        while game.phase == "over":
+            yield
+            turns += 1
+        assert turns == 30  # at 20 steps a second
+
+    perform(script, play, LEVER)
+
+
+@pytest.mark.parametrize("key", ["q", "escape"])
+def test_keys_close_the_window(key):
+    def script(window, game):
+        tap(key)
+        yield
+        yield
+        raise AssertionError("the window is still open")
+
+    assert perform(script, play, LEVER).closed
+
+
+def test_episodes_close_the_game_and_the_scores_are_printed(capsys):
+    def script(window, game):
+        down("d")
+        while True:
+            yield
+
+    assert perform(script, main, ["play", LEVER, "--episodes", "2", "--seed", "1"]) == 0
+    assert capsys.readouterr().out.endswith("you: 2 episodes, mean 10.00, best 10.00\n")
+
+
+def test_own_keys_are_given_on_the_command_line():
+    def script(window, game):
+        tap("j")
+        yield
+        assert lever(game).actions == [2]
+
+    assert perform(script, main, ["play", LEVER, "--keys", "j=2", "none=1"]) == 0
+
+
+def test_the_rate_is_the_environments_own_or_what_is_asked_for(monkeypatch):
+    rates = []
+    monkeypatch.setattr(play_package, "Pace", lambda rate: rates.append(rate) or Pace(rate))
+    perform(lambda window, game: iter(()), play, LEVER)
+    perform(lambda window, game: iter(()), play, LEVER, fps=7)
+    assert rates == [20, 7]
+
+
+class Clock:
+    """Time that goes by only while somebody sleeps or works."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+    def go(self, seconds):
+        self.now += seconds
+
+
+def test_the_pace_does_not_drift_whatever_the_work_takes():
+    clock = Clock()
+    pace = Pace(10, clock, clock.go)
+    moments = []
+    for work in (0.01, 0.09, 0.0, 0.15, 0.02, 0.05):  # the fourth takes longer than a period, the next makes up for it
+        clock.go(work)
+        pace.wait()
+        moments.append(clock.now - 100)
+    np.testing.assert_allclose(moments, [0.1, 0.2, 0.3, 0.45, 0.5, 0.6])
+
+
+def test_after_a_long_delay_the_pace_goes_on_from_there():
+    clock = Clock()
+    pace = Pace(10, clock, clock.go)
+    clock.go(5)
+    moments = []
+    for _ in range(3):
+        pace.wait()
+        moments.append(clock.now - 105)
+    np.testing.assert_allclose(moments, [0, 0.1, 0.2], atol=1e-9)
+
+
+def test_a_real_clock_keeps_the_rate():
+    pace, began = Pace(200), time.perf_counter()
+    for _ in range(40):
+        pace.wait()
+    assert 0.199 <= time.perf_counter() - began < 0.4
+
+
+def test_the_window_shows_both_pictures_side_by_side_and_the_keys_held():
+    def script(window, game):
+        down("d")
+        yield
+        yield
+        shown = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)
+        grey = (shown == 80).all(2)  # what the lever looks like after two steps
+        columns = np.flatnonzero(grey.sum(0) > 250)
+        assert len(columns) == 800
+        assert len(np.flatnonzero(np.diff(columns) > 1)) == 1
+        legend = shown[-30:]
+        held = (legend == (40, 104, 190)).all(2).sum()
+        up("d")
+        yield
+        yield
+        shown = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)
+        assert held > 100 > (shown[-30:] == (40, 104, 190)).all(2).sum()
+
+    perform(script, play, LEVER, against=Pull())
+
+
+def test_a_smaller_window_shows_everything_smaller():
+    def script(window, game):
+        tap("d")
+        yield
+        window._screen = pygame.display.set_mode((207, 300))
+        yield
+        yield
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        grey = (abs(shown.astype(int) - 40 * game.players[0].steps) < 3).all(2)
+        assert 190 <= (grey.sum(0) > 60).sum() <= 200
+
+    perform(script, play, LEVER)
+
+
+def test_a_rival_plays_the_same_starts_at_the_same_pace():
+    def script(window, game):
+        you, rival = game.players
+        for seed in (11, 12):
+            assert game.phase == "ready"
+            np.testing.assert_array_equal(you.obs, rival.obs)
+            assert rival.env.unwrapped.seeds[-1] == you.env.unwrapped.seeds[-1] == seed
+            assert rival.steps == 0
+            down("a")
+            yield
+            assert (you.steps, rival.steps) == (1, 1)
+            while game.phase != "over":
+                yield
+            assert (you.score, rival.score) == (0, 10)
+            up("a")
+            while game.phase == "over":
+                yield
+        assert (you.scores, rival.scores) == ([0, 0], [10, 10])
+
+    perform(script, play, LEVER, seed=11, against=Pull())
+
+
+def test_a_round_is_over_when_both_are():
+    def script(window, game):
+        you, rival = game.players
+        down("d")
+        while not you.over:
+            yield
+        assert not rival.over
+        steps = you.steps
+        while game.phase != "over":
+            yield
+        assert rival.over
+        assert you.steps == steps
+
+    class Balance:
+        """Pushes the cart under its pole."""
+
+        def predict(self, obs, deterministic=False):
+            return np.int64(obs[2] + obs[3] > 0), None
+
+    perform(script, play, "CartPole-v1", seed=0, against=Balance())
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A model file of an untrained agent for CartPole."""
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", seed=0, policy_kwargs={"net_arch": [8]})
+    return agent.save(tmp_path_factory.mktemp("model") / "cart")
+
+
+def test_the_agent_of_a_model_file_plays_as_it_predicts(model, capsys):
+    agent, env = rejeu.load(model), make_env("CartPole-v1")
+    obs, expected, done = env.reset(seed=5)[0], 0.0, False
+    while not done:
+        obs, reward, terminated, truncated, _ = env.step(agent.predict(obs, deterministic=True)[0])
+        expected, done = expected + reward, terminated or truncated
+    games = []
+
+    def script(window, game):
+        games.append(game)
+        down("a")
+        while True:
+            yield
+
+    argv = ["play", "CartPole-v1", "--against", str(model), "--seed", "5", "--episodes", "1"]
+    assert perform(script, main, argv) == 0
+    assert games[0].players[1].scores == [expected]
+    assert re.search(rf"you: 1 episode, .*\nDQN: 1 episode, mean {expected:.2f}, ", capsys.readouterr().out)
+
+
+def test_an_agent_of_another_environment_is_refused(model, capsys):
+    assert "plays CartPole-v1, not MountainCar-v0" in error_of(capsys, "play", "Mountain", "--against", str(model))
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["play", "Lunr"], "did you mean Lunar?"),
+        (["play", "MountanCar-v0"], "did you mean MountainCar-v0"),
+        (
+            ["play", "rejeu-play-test/Dark-v0"],
+            "cannot be shown: it has the render modes ['ansi'], which lack 'rgb_array'",
+        ),
+        (["play", "rejeu-play-test/Switches-v0"], "MultiBinary(3) cannot be played by hand"),
+        (["play", LEVER, "--keys", "a"], "--keys 'a' must be keys=action"),
+        (["play", LEVER, "--keys", "a=5"], "a=5 must be a whole number from 0 to 2"),
+        (["play", LEVER, "--keys", "q=1"], "'q' cannot be bound"),
+        (["play", LEVER, "--fps", "0"], "fps=0"),
+        (["play", LEVER, "--episodes", "0"], "episodes=0"),
+        (["play", LEVER, "--seed", "-1"], "seed=-1"),
+        (["play", LEVER, "--against", "no-such-run"], "no run folder or model file no-such-run"),
+    ],
+)
+def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, argv, message):
+    assert message in error_of(capsys, *argv)
+
+
+def test_a_window_without_pygame_names_the_extra(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    assert "playing needs pygame-ce, which is not installed; run: pip install 'rejeu[play]'" in error_of(
+        capsys, "play", LEVER
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a screen")
+@pytest.mark.parametrize("driver", ["x11", None])
+def test_without_a_screen_there_is_an_error_and_no_hidden_window(capsys, monkeypatch, driver):
+    pygame.quit()
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    if driver is not None:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert "no window can be opened here" in error_of(capsys, "play", LEVER)
+
+
+def test_environments_are_closed_and_the_window_is_gone_after_a_game():
+    game = perform(lambda window, game: iter(()), play, "CartPole-v1")
+    assert isinstance(game, Game)
+    assert not pygame.display.get_init() or pygame.display.get_surface() is None
+    with Window("again") as window:
+        assert window.title == "again"
