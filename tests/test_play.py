@@ -1,4 +1,4 @@
-"""Playing by hand, in a window on SDL's dummy driver, with key events in SDL's own queue."""
+"""Playing by hand and watching, in a window on SDL's dummy driver, with key events in SDL's own queue."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import rejeu
 from rejeu import play as play_package
 from rejeu.cli import main
 from rejeu.envs.registry import make_env
-from rejeu.play import Game, play
+from rejeu.play import Game, play, watch
 from rejeu.play.game import Pace
 from rejeu.play.window import Window
 from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
@@ -427,6 +427,40 @@ def test_an_agent_of_another_environment_is_refused(model, capsys):
     assert "plays CartPole-v1, not MountainCar-v0" in error_of(capsys, "play", "Mountain", "--against", str(model))
 
 
+def test_watch_shows_an_agent_without_waiting_and_prints_its_mean(model, capsys):
+    scores = []
+
+    def script(window, game):
+        assert game.phase == "running"
+        assert not game.bound
+        scores.append(game.players[0].scores)
+        while True:
+            yield
+
+    assert perform(script, main, ["watch", str(model), "--episodes", "3", "--seed", "5"]) == 0
+    mean, best = np.mean(scores[0]), max(scores[0])
+    assert capsys.readouterr().out.endswith(f"DQN: 3 episodes, mean {mean:.2f}, best {best:.2f}\n")
+
+
+def test_watch_can_be_paused_begun_anew_and_closed():
+    def script(window, game):
+        yield
+        yield
+        tap("p")
+        yield
+        yield
+        assert game.players[0].steps == 2
+        tap("r")
+        yield
+        assert (game.players[0].steps, game.players[0].env.unwrapped.seeds) == (1, [4, 4])
+        tap("q")
+        yield
+        yield
+        raise AssertionError("the window is still open")
+
+    perform(script, watch, Pull(), LEVER, seed=4)
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
@@ -444,6 +478,7 @@ def test_an_agent_of_another_environment_is_refused(model, capsys):
         (["play", LEVER, "--episodes", "0"], "episodes=0"),
         (["play", LEVER, "--seed", "-1"], "seed=-1"),
         (["play", LEVER, "--against", "no-such-run"], "no run folder or model file no-such-run"),
+        (["watch", "no-such-run"], "no run folder or model file no-such-run"),
     ],
 )
 def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, argv, message):

@@ -11,13 +11,14 @@ from typing import Any
 
 import tyro
 
-from rejeu.cli import evaluate, list as listing, play, record, train
+from rejeu.cli import evaluate, list as listing, play, record, train, watch
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
     "evaluate": (evaluate.Evaluate, evaluate.run),
     "record": (record.Record, record.run),
     "play": (play.Play, play.run),
+    "watch": (watch.Watch, watch.run),
     "list": (listing.List, listing.run),
 }
 """Each command's arguments, and the function that takes them and returns the exit status."""

@@ -1,4 +1,4 @@
-"""Environments played by hand in a window, alone or beside an agent.
+"""Environments played by hand, and agents watched at play, in a window.
 
 ``keys.py`` says which action the keys held stand for, ``game.py`` what happens step by step, ``window.py`` shows it and
 listens.
@@ -22,7 +22,7 @@ from rejeu.play.known import full_name, keys_for
 from rejeu.play.window import Window
 from rejeu.video import DEFAULT_FPS
 
-__all__ = ["Game", "Player", "play"]
+__all__ = ["Game", "Player", "play", "watch"]
 
 REST_SECONDS = 1.5
 """How long the end of a round stays to be seen."""
@@ -67,6 +67,40 @@ def play(
             players.append(Player(_name(against), rival, _policy(against)))
         game = Game(players, seed, keys_of_env.names, episodes, rest=round(REST_SECONDS * fps))
         _run(Window(f"rejeu play {env_id}"), game, keys_of_env, fps)
+    return game
+
+
+def watch(
+    agent: Any,
+    env: str,
+    *,
+    seed: int | None = None,
+    fps: float | None = None,
+    episodes: int | None = None,
+) -> Game:
+    """Opens a window in which an agent plays, and returns the game as it stood when the window was closed.
+
+    Args:
+        agent: anything with ``predict(obs, deterministic=True)``.
+        env: an id, or Car, Mountain or Lunar.
+        seed: of the first episode; each further one has the next seed. None draws one.
+        fps: steps a second; None: the environment's own, 30 if it declares none.
+        episodes: close after so many; None leaves that to who watches.
+
+    Raises:
+        MissingExtra: if pygame-ce is not installed.
+        ValueError: for an unknown environment or one without pictures.
+        OSError: if there is no screen.
+    """
+    env_id = full_name(env)
+    seed, episodes = _check(seed, fps, episodes)
+    with ExitStack() as stack:
+        playing = make_drawing(env_id)
+        stack.callback(playing.close)
+        fps = natural_fps(playing) if fps is None else fps
+        player = Player(_name(agent), playing, _policy(agent))
+        game = Game([player], seed, episodes=episodes, rest=round(REST_SECONDS * fps))
+        _run(Window(f"rejeu watch {env_id}"), game, None, fps)
     return game
 
 
