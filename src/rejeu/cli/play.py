@@ -34,6 +34,8 @@ class Play:
     """Steps a second; by default the environment's own."""
     episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Close after so many; by default when you do."""
+    record: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """New or empty folder for a Minari dataset and a video of what you play."""
     against: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
     """Folder of a run, or a .safetensors file, whose agent plays the same starts beside you."""
     which: Which = "best"
@@ -60,9 +62,13 @@ def run(arguments: Play) -> int:
         seed=arguments.seed,
         fps=arguments.fps,
         episodes=arguments.episodes,
+        record=arguments.record,
         against=agent,
     )
     print(scores(game), flush=True)
+    recording = game.players[0].recording
+    if recording is not None:
+        print(recording, flush=True)
     return 0
 
 

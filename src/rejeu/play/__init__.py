@@ -1,13 +1,14 @@
 """Environments played by hand, and agents watched at play, in a window.
 
 ``keys.py`` says which action the keys held stand for, ``game.py`` what happens step by step, ``window.py`` shows it and
-listens.
+listens, ``recording.py`` keeps it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ from rejeu.envs.registry import make_env
 from rejeu.play.game import Act, Game, Pace, Player
 from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for
+from rejeu.play.recording import Recording
 from rejeu.play.window import Window
 from rejeu.video import DEFAULT_FPS
 
@@ -35,6 +37,7 @@ def play(
     seed: int | None = None,
     fps: float | None = None,
     episodes: int | None = None,
+    record: str | Path | None = None,
     against: Any = None,
 ) -> Game:
     """Opens a window in which a person plays, and returns the game as it stood when the window was closed.
@@ -45,10 +48,11 @@ def play(
         seed: of the first start; each further one has the next seed. None draws one.
         fps: steps a second; None: the environment's own, 30 if it declares none.
         episodes: close after so many; None leaves that to the player.
+        record: folder, new or empty, for a Minari dataset and a video of what is played.
         against: an agent, anything with ``predict(obs, deterministic=True)``, that plays the same starts beside.
 
     Raises:
-        MissingExtra: if pygame-ce is not installed.
+        MissingExtra: if pygame-ce, or what a recording needs, is not installed.
         ValueError: for an unknown environment, one without pictures, or actions that cannot be played by hand.
         OSError: if there is no screen.
     """
@@ -65,6 +69,9 @@ def play(
             rival = make_drawing(env_id)
             stack.callback(rival.close)
             players.append(Player(_name(against), rival, _policy(against)))
+        if record is not None:
+            by_hand.recording = Recording(record, env_id, fps)
+            stack.callback(by_hand.recording.close)
         game = Game(players, seed, keys_of_env.names, episodes, rest=round(REST_SECONDS * fps))
         _run(Window(f"rejeu play {env_id}"), game, keys_of_env, fps)
     return game

@@ -13,6 +13,7 @@ import numpy as np
 
 from rejeu.envs.vector import success_of
 from rejeu.play.keys import CONTROLS
+from rejeu.play.recording import Recording
 from rejeu.video import rgb_frame
 
 Act = Callable[[Any, frozenset[str], int], Any]
@@ -30,6 +31,8 @@ class Player:
     env: gym.Env
     """Made with ``render_mode="rgb_array"``."""
     act: Act
+    recording: Recording | None = None
+    """What keeps a copy of everything played."""
     obs: Any = None
     frame: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
     """What the environment looks like, ``uint8 (height, width, 3)``."""
@@ -58,6 +61,8 @@ class Player:
         self.obs, _ = self.env.reset(seed=seed)
         self.frame = rgb_frame(self.env)
         self.score, self.steps, self.over, self.success = 0.0, 0, False, math.nan
+        if self.recording is not None:
+            self.recording.begin(self.obs, seed, self.frame)
 
     def step(self, action: Any) -> None:
         """Takes a step."""
@@ -66,6 +71,8 @@ class Player:
         self.score += float(reward)
         self.steps += 1
         self.over = bool(terminated or truncated)
+        if self.recording is not None:
+            self.recording.step(self.obs, action, float(reward), bool(terminated), bool(truncated), self.frame)
         if self.over:
             self.success = success_of(info)
             self.scores.append(self.score)

@@ -1,0 +1,163 @@
+"""What was played, kept: a Minari dataset and a video in one folder."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.envs.registry import make_env
+from rejeu.errors import MissingExtra
+from rejeu.video import HOLD_SECONDS, VideoFile, ffmpeg
+
+VIDEO_NAME = "video.mp4"
+
+
+class Recording:
+    """A folder that is itself a Minari path, with one dataset, and the video of the same episodes. Mutable.
+
+    The dataset is complete after every episode, and says how the environment is made unless it was registered by a class
+    rather than by its name. An episode that was given up ends in a truncation; one without a single
+    step is left out. In the video every episode gives the frame after its reset and one frame a step, and its last frame
+    stays for half a second.
+
+    Args:
+        folder: new or empty; made with the first episode.
+        env_id: of the environment; the dataset is called after it.
+        fps: frames per second of the video.
+
+    Raises:
+        MissingExtra: if Minari or imageio-ffmpeg is not installed.
+        FileExistsError: if the folder holds something.
+    """
+
+    def __init__(self, folder: str | Path, env_id: str, fps: float) -> None:
+        try:
+            import h5py  # noqa: F401 - Minari's files
+            import minari
+            from minari.data_collector.episode_buffer import EpisodeBuffer
+        except ImportError:
+            raise MissingExtra("recording what is played", "minari[hdf5]", "play") from None
+        ffmpeg()
+        self._minari, self._buffer_type = minari, EpisodeBuffer
+        self.folder = Path(folder).absolute()
+        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+            raise FileExistsError(f"{folder} exists and is not an empty folder; name another, or remove it first")
+        self.dataset_id = re.sub(r"[^\w/-]", "-", env_id) + "/human-v0"
+        self.episodes = 0
+        """Episodes kept."""
+        # Made without a render mode: the dataset says how the environment is made again.
+        self._env = make_env(env_id)
+        self._dataset: Any = None
+        self._video = VideoFile(self.folder / VIDEO_NAME, fps)
+        self._buffer: Any = None
+        self._frame = np.zeros(0, np.uint8)
+
+    def __str__(self) -> str:
+        if not self.episodes:
+            return f"{self.folder}: nothing was played, nothing is recorded"
+        return (
+            f"{self.folder}: {self.episodes} episodes in {VIDEO_NAME} and for MINARI_DATASETS_PATH={self.folder}, "
+            f"minari.load_dataset({self.dataset_id!r})"
+        )
+
+    def begin(self, obs: Any, seed: int, frame: np.ndarray) -> None:
+        """Begins an episode; one under way is given up."""
+        self._end()
+        self._buffer = self._buffer_type(seed=seed, observations=copy.deepcopy(obs))
+        self._frame = frame
+
+    def step(self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, frame: np.ndarray) -> None:
+        """Adds a step."""
+        if not len(self._buffer):
+            self._video.write(self._frame)
+        self._video.write(frame)
+        self._frame = frame
+        self._buffer = self._buffer.add_step_data(
+            {
+                "observation": copy.deepcopy(obs),
+                "action": copy.deepcopy(action),
+                "reward": reward,
+                "terminated": terminated,
+                "truncated": truncated,
+                "info": {},
+            }
+        )
+        if terminated or truncated:
+            self._end()
+
+    def close(self) -> None:
+        """Completes dataset and video; what was never played leaves nothing behind."""
+        try:
+            self._end()
+        except BaseException:
+            self._video.discard()
+            raise
+        finally:
+            self._env.close()
+        if self._video.n_frames:
+            self._video.close()
+
+    def _end(self) -> None:
+        buffer, self._buffer = self._buffer, None
+        if buffer is None or not len(buffer):
+            return
+        if not buffer.terminations[-1]:
+            buffer.truncations[-1] = True
+        if self._dataset is None:
+            self._dataset = self._create(buffer)
+        else:
+            self._dataset.update_dataset_from_buffer([buffer])
+        self.episodes += 1
+        for _ in range(round(HOLD_SECONDS * self._video.fps)):
+            self._video.write(self._frame)
+
+    def _create(self, buffer: Any) -> Any:
+        described = self._env if can_be_written(self._env) else None
+        with minari_path(self.folder), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that nobody is named as the author, and the like
+            return self._minari.create_dataset_from_buffers(
+                self.dataset_id,
+                [buffer],
+                env=described,
+                eval_env=described,
+                observation_space=self._env.observation_space,
+                action_space=self._env.action_space,
+                algorithm_name="human",
+                description="Played by hand with rejeu play",
+                data_format="hdf5",
+                jpeg_encoding=False,  # observations as they were, to the last bit
+            )
+
+
+def can_be_written(env: gym.Env) -> bool:
+    """Returns whether a dataset can say how the environment is made: not if it was registered with a class itself."""
+    if env.spec is None:
+        return False
+    try:
+        env.spec.to_json()
+    except (ValueError, TypeError):
+        return False
+    return True
+
+
+@contextmanager
+def minari_path(folder: Path) -> Iterator[None]:
+    """Lets Minari look for its datasets in a folder rather than in the user's home; the setting is put back."""
+    before = os.environ.get("MINARI_DATASETS_PATH")
+    os.environ["MINARI_DATASETS_PATH"] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["MINARI_DATASETS_PATH"]
+        else:
+            os.environ["MINARI_DATASETS_PATH"] = before
