@@ -6,5 +6,12 @@ from rejeu.envs.vector import VectorEnv, make_vector
 
 if "rejeu/Ball-v0" not in gym.registry:
     gym.register("rejeu/Ball-v0", "rejeu.envs.ball:Ball", max_episode_steps=500)
+if "rejeu/CartPoleNoVelocity-v0" not in gym.registry:
+    gym.register(
+        "rejeu/CartPoleNoVelocity-v0",
+        "rejeu.envs.partial:cart_pole_without_velocities",
+        max_episode_steps=500,
+        reward_threshold=475.0,
+    )
 
 __all__ = ["VectorEnv", "make_vector"]

@@ -6,13 +6,13 @@
 
 from __future__ import annotations
 
-from rejeu.presets import ball, classic_control, parking, robotics
+from rejeu.presets import ball, box2d, classic_control, parking, robotics
 from rejeu.presets.preset import Preset
 
-ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *ball.PRESETS, *robotics.PRESETS)
+ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PRESETS, *ball.PRESETS, *robotics.PRESETS)
 """Every preset; of several for one environment the first is the best."""
 
-ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN"}
+ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "MultiBinary": "PPO"}
 """The algorithm to begin with in an environment without a preset, by the class of its action space."""
 
 
