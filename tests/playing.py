@@ -114,7 +114,7 @@ def hold(names, steps, read, found):
 class Pull:
     """An agent that always takes action 2."""
 
-    def predict(self, obs, deterministic=False):
+    def predict(self, obs, state=None, episode_start=None, deterministic=False):
         assert deterministic
         return np.int64(2), None
 

@@ -20,13 +20,13 @@ class Still:
         self.action = action
         self.deterministic = None
 
-    def predict(self, obs, deterministic=False):
+    def predict(self, obs, state=None, episode_start=None, deterministic=False):
         self.deterministic = deterministic
         leaf = obs["observation"] if isinstance(obs, dict) else obs
         return np.full((len(leaf), 1), self.action, np.float32), None
 
 
-def still(obs):
+def still(obs, began):
     return np.zeros((len(obs), 1), np.float32)
 
 
@@ -55,7 +55,7 @@ def test_exactly_as_many_episodes_are_played_as_asked_for(n_envs):
 
 def test_success_comes_from_the_last_step():
     result = evaluate(
-        lambda obs: np.clip(obs["desired_goal"] - obs["achieved_goal"], -1, 1),
+        lambda obs, began: np.clip(obs["desired_goal"] - obs["achieved_goal"], -1, 1),
         InProcess([Reach(stops=True) for _ in range(2)], seed=0),
         10,
     )

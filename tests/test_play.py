@@ -390,7 +390,7 @@ def test_a_round_is_over_when_both_are():
     class Balance:
         """Pushes the cart under its pole."""
 
-        def predict(self, obs, deterministic=False):
+        def predict(self, obs, state=None, episode_start=None, deterministic=False):
             return np.int64(obs[2] + obs[3] > 0), None
 
     perform(script, play, "CartPole-v1", seed=0, against=Balance())

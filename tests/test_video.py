@@ -57,7 +57,7 @@ class Still:
     def __init__(self):
         self.asked = []
 
-    def predict(self, obs, deterministic=False):
+    def predict(self, obs, state=None, episode_start=None, deterministic=False):
         self.asked.append(deterministic)
         return np.zeros(1, np.float32), None
 
@@ -155,7 +155,7 @@ def test_parking_is_drawn_and_plays_at_15_frames_a_second(tmp_path):
 
 
 class StillCar:
-    def predict(self, obs, deterministic=False):
+    def predict(self, obs, state=None, episode_start=None, deterministic=False):
         return np.array([1.0, 0.5], np.float32), None
 
 

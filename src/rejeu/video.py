@@ -46,7 +46,7 @@ def record_video(
     that is already there is replaced only once the new one is complete.
 
     Args:
-        agent: anything with ``predict(obs, deterministic=True) -> (action, state)``.
+        agent: anything with ``predict(obs, state, deterministic=True) -> (action, state)``.
         path: of the file; ``.mp4`` is added to a path without a suffix, missing folders are made.
         env: an id; an environment made with ``render_mode="rgb_array"``, which is left open; a function that makes one;
             or None: a new environment like the agent's own.
@@ -78,10 +78,10 @@ def record_video(
         with VideoFile(path, natural_fps(playing) if fps is None else fps) as video:
             for _ in range(episodes):
                 obs, _ = playing.reset(seed=seed)
-                seed, done = None, False
+                seed, done, memory = None, False, None
                 video.write(rgb_frame(playing))
                 while not done and steps_left:
-                    action, _ = agent.predict(obs, deterministic=True)
+                    action, memory = agent.predict(obs, memory, deterministic=True)
                     obs, _, terminated, truncated, _ = playing.step(action)
                     frame = rgb_frame(playing)
                     video.write(frame)

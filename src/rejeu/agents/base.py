@@ -387,7 +387,7 @@ class Agent(ABC):
         deterministic: bool = False,
         action_masks: Any = None,
     ) -> tuple[np.ndarray, Any]:
-        """Returns actions in the environment's own range, and what a policy with a memory remembers (None without).
+        """Returns actions in the environment's own range, and what a policy with a memory remembers (without, ``state``).
 
         Args:
             observation: one observation of the environment's space, or a batch of them with a leading axis; the action
@@ -406,9 +406,9 @@ class Agent(ABC):
         batch = self._with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
-        action, state = self._act(batch, deterministic, state, ended)
+        action, memory = self._act(batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
-        return (scaled[0] if single else scaled), state
+        return (scaled[0] if single else scaled), state if memory is None else memory
 
     @abstractmethod
     def _with_masks(self, obs: Any, masks: Any) -> Any:

@@ -49,7 +49,7 @@ def play(
         fps: steps a second; None: the environment's own, 30 if it declares none.
         episodes: close after so many; None leaves that to the player.
         record: folder, new or empty, for a Minari dataset and a video of what is played.
-        against: an agent, anything with ``predict(obs, deterministic=True)``, that plays the same starts beside.
+        against: an agent, anything with ``predict(obs, state, deterministic=True)``, that plays the same starts beside.
 
     Raises:
         MissingExtra: if pygame-ce, or what a recording needs, is not installed.
@@ -88,7 +88,7 @@ def watch(
     """Opens a window in which an agent plays, and returns the game as it stood when the window was closed.
 
     Args:
-        agent: anything with ``predict(obs, deterministic=True)``.
+        agent: anything with ``predict(obs, state, deterministic=True)``.
         env: an id, or Car, Mountain or Lunar.
         seed: of the first episode; each further one has the next seed. None draws one.
         fps: steps a second; None: the environment's own, 30 if it declares none.
@@ -174,7 +174,14 @@ def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[i
 
 
 def _policy(agent: Any) -> Act:
-    return lambda obs, held, step: agent.predict(obs, deterministic=True)[0]
+    memory: Any = None
+
+    def act(obs: Any, held: Any, step: int) -> Any:
+        nonlocal memory
+        action, memory = agent.predict(obs, None if step == 0 else memory, deterministic=True)
+        return action
+
+    return act
 
 
 def _name(agent: Any) -> str:
