@@ -11,10 +11,12 @@ from rich.console import Console
 
 import rejeu
 from rejeu import callbacks
-from rejeu.callbacks import Checkpoint, Evaluate, ProgressBar, better, crossed, stop_on_return, stop_on_success
+from rejeu.callbacks import Checkpoint, Evaluate, Film, ProgressBar, better, crossed, stop_on_return, stop_on_success
 from rejeu.evaluation import Evaluation
 from rejeu.history import History
 from rejeu.loops.host import Episode, Progress
+from tests.environments import Counter
+from tests.helpers import small_sac
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "buffer_size": 1000, "learning_starts": 10_000}
 
@@ -242,3 +244,38 @@ def test_an_agent_that_improves_and_then_cracks_is_restored_to_its_best():
     agent.restore_best()
     assert score() == pytest.approx(best, abs=1e-6)
     assert agent.best.step == evaluate.best.step <= 700
+
+
+def test_films_fall_due_by_steps_and_training_goes_on_as_if_nothing_was_filmed(tmp_path):
+    env = lambda: Pictured(Counter((5,)))  # noqa: E731
+    film = Film(tmp_path / "films", 20, env=env)
+    filmed, other = small_sac(Counter((5,))), small_sac(Counter((5,)))
+    filmed.learn(45, film)
+    other.learn(45)
+    assert [path.name for path in film.paths] == ["step_20.mp4", "step_40.mp4"]
+    assert all(path.stat().st_size > 0 for path in film.paths)
+    for name, array in other.get_parameters().items():
+        np.testing.assert_array_equal(array, filmed.get_parameters()[name])
+
+
+def test_films_fall_due_by_episodes(tmp_path):
+    film = Film(tmp_path, every_episodes=3, env=lambda: Pictured(Counter((5,))))
+    small_sac(Counter((5,))).learn(40, film)  # 8 episodes of 5 steps
+    assert [path.name for path in film.paths] == ["step_15.mp4", "step_30.mp4"]
+
+
+@pytest.mark.parametrize("settings", [{}, {"every": 5, "every_episodes": 2}])
+def test_a_film_needs_one_frequency(settings, tmp_path):
+    with pytest.raises(ValueError, match="give one of every="):
+        Film(tmp_path, **settings)
+
+
+class Pictured(gym.Wrapper):
+    """An environment that can be filmed."""
+
+    @property
+    def render_mode(self):
+        return "rgb_array"
+
+    def render(self):
+        return np.zeros((32, 32, 3), np.uint8)

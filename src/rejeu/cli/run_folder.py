@@ -59,6 +59,11 @@ class RunFolder:
         return self.path / "curve.png"
 
     @property
+    def films(self) -> Path:
+        """Folder of films of the policy while it learnt."""
+        return self.path / "films"
+
+    @property
     def video(self) -> Path:
         """A few episodes of the best model."""
         return self.path / "video.mp4"
@@ -87,6 +92,8 @@ class RunConfig:
     """Minutes of training, None where ``steps`` ended the run."""
     success_threshold: float | None
     """Return from which on an episode counts as a success where the environment does not say; None for its own."""
+    film_every: int | None
+    """Environment steps between two films of the policy, None for none."""
     evaluate_every: int
     evaluate_episodes: int
 

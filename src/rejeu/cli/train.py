@@ -58,6 +58,8 @@ class Train:
     """Run folder, new or empty; by default one under runs, named after the run and the time."""
     success_threshold: Annotated[float | None, arg(metavar="RETURN", help_behavior_hint="")] = None
     """Return from which on an episode counts as a success; by default what the environment says or declares."""
+    film_every: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Film an episode of the policy every so many environment steps, into the folder films."""
     evaluate_every: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Environment steps between two evaluations; by default the preset's, else 5000."""
     evaluate_episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -95,7 +97,7 @@ def check(arguments: Train) -> None:
 
     if arguments.steps is not None and arguments.minutes is not None:
         raise ValueError("--steps and --minutes exclude each other; give one of them")
-    for name in ("steps", "envs", "evaluate_every", "evaluate_episodes"):
+    for name in ("steps", "envs", "film_every", "evaluate_every", "evaluate_episodes"):
         if getattr(arguments, name) is not None:
             whole(f"--{name.replace('_', '-')}", getattr(arguments, name), least=1)
     if arguments.minutes is not None:
@@ -187,6 +189,7 @@ def plan(arguments: Train, preset: Preset | None, algorithm: str, env: VectorEnv
         steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
         minutes=arguments.minutes,
         success_threshold=arguments.success_threshold,
+        film_every=arguments.film_every,
         evaluate_every=arguments.evaluate_every or base.evaluate_every,
         evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
     )
@@ -215,17 +218,18 @@ def make_evaluation_env(config: RunConfig) -> VectorEnv:
 def train(agent: Agent, config: RunConfig, evaluation_env: VectorEnv, folder: RunFolder) -> Evaluate:
     """Trains, evaluates and saves; whatever ends it, the tables hold all that happened. Returns the evaluations."""
     from rejeu import errors
-    from rejeu.callbacks import Evaluate
+    from rejeu.callbacks import Evaluate, Film
     from rejeu.logging import CsvFile
 
     metrics, table = CsvFile(folder.metrics), CsvFile(folder.evaluations)
     evaluate = Evaluate(
         evaluation_env, config.evaluate_every, config.evaluate_episodes, folder.best, report=reporter(agent, table)
     )
+    films = [] if config.film_every is None else [Film(folder.films, config.film_every, max_steps=VIDEO_STEPS)]
     try:
         agent.learn(
             config.steps,
-            evaluate,
+            [evaluate, *films],
             log_interval=4 * config.n_envs,
             progress_bar=True,
             minutes=config.minutes,
@@ -310,6 +314,8 @@ def header(config: RunConfig, folder: RunFolder) -> str:
 def summary(agent: Agent, evaluate: Evaluate, folder: RunFolder, seconds: float, compile_seconds: float) -> str:
     """Returns what a run says at its end."""
     lines = ["", "stopped by Ctrl-C; everything is saved"] if agent.interrupted else [""]
+    if agent.ep_info_buffer:
+        lines.append(f"training      last {len(agent.ep_info_buffer)} episodes: {training(agent)}")
     if evaluate.best is not None:
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
     files = ", ".join(sorted(path.name for path in folder.path.iterdir()))
@@ -322,3 +328,12 @@ def summary(agent: Agent, evaluate: Evaluate, folder: RunFolder, seconds: float,
             f"try it        rejeu evaluate {folder.path} --backend gymnasium",
         ]
     )
+
+
+def training(agent: Agent) -> str:
+    """Returns what the last episodes of training came to: return, length and, where it is known, success."""
+    import numpy as np
+
+    returns, lengths = ([episode[key] for episode in agent.ep_info_buffer] for key in ("r", "l"))
+    text = f"return {np.mean(returns):.2f} ± {np.std(returns):.2f}, length {np.mean(lengths):.1f}"
+    return f"success {np.mean(agent.ep_success_buffer):.1%}, {text}" if agent.ep_success_buffer else text
