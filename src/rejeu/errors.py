@@ -16,3 +16,7 @@ class CheckpointError(ValueError):
 
 class BadEnvironmentError(RuntimeError):
     """An environment returned something that nothing can be learnt from."""
+
+
+class WorkerError(RuntimeError):
+    """A worker process failed; the message holds the traceback from there, where there is one."""

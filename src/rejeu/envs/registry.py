@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from rejeu.errors import MissingExtra
 
@@ -79,16 +80,19 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 
 def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
-    """Returns a function that makes the environment; it can be sent to a worker process."""
-    return _Maker(env_id, kwargs)
+    """Returns a function that makes the environment; it can be sent to a worker process, with what is registered here."""
+    return _Maker(env_id, kwargs, gym.registry.get(env_id))
 
 
 @dataclass(frozen=True)
 class _Maker:
     env_id: str
     kwargs: dict[str, Any]
+    spec: EnvSpec | None
 
     def __call__(self) -> gym.Env:
+        if self.spec is not None:
+            gym.registry.setdefault(self.env_id, self.spec)
         return make_env(self.env_id, **self.kwargs)
 
 

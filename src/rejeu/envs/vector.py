@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from rejeu.envs import goals as goals_module
+from rejeu.envs import goals as goals_module, workers
 from rejeu.envs.registry import make_env, maker, provider, register, unknown_environment
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, flat_keys, leaves, plain, structure
@@ -41,6 +41,17 @@ class Step(NamedTuple):
     """Whether a time limit ended the episode, ``bool (n_envs,)``."""
     info: Any
     """The backend's own info; read it with :meth:`VectorEnv.success`."""
+
+
+class Description(NamedTuple):
+    """What an environment is registered as."""
+
+    env_id: str
+    """The id, or the name of its class if it has none."""
+    max_episode_steps: int | None
+    """The time limit, where it is known."""
+    reward_threshold: float | None
+    """The return at which it counts as solved, where it declares one."""
 
 
 class VectorEnv(ABC):
@@ -150,7 +161,8 @@ def make_vector(
     Raises:
         ValueError: for an unknown id or backend, with the nearest known.
         MissingExtra: if a package is not installed.
-        TypeError: if ``env`` is none of the above.
+        TypeError: if ``env`` is none of the above, or a function that cannot be sent to a worker process.
+        WorkerError: if a worker process cannot be started.
 
     >>> make_vector("Pendulum-v1", n_envs=4, backend="gymnasium").n_envs
     4
@@ -176,7 +188,8 @@ def make_vector(
         return InProcess(env.envs, seed)
     if callable(env):
         if backend == "gymnasium-async":
-            return GymnasiumVector(AsyncVectorEnv([env] * n_envs, autoreset_mode=AutoresetMode.DISABLED), seed, env)
+            one = env()
+            return GymnasiumVector(workers.start(env, one, n_envs), seed, env, describe_spec(one))
         return InProcess([env() for _ in range(n_envs)], seed)
     if not isinstance(env, str):
         raise TypeError(
@@ -271,7 +284,11 @@ class GymnasiumVector(VectorEnv):
     """A Gymnasium vector environment, with whatever auto-reset it came with undone."""
 
     def __init__(
-        self, env: gym.vector.VectorEnv, seed: int | None = None, make_one: Callable[[], gym.Env] | None = None
+        self,
+        env: gym.vector.VectorEnv,
+        seed: int | None = None,
+        make_one: Callable[[], gym.Env] | None = None,
+        description: Description | None = None,
     ) -> None:
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         unwrapped = env.unwrapped
@@ -280,6 +297,11 @@ class GymnasiumVector(VectorEnv):
                 f"{type(unwrapped).__name__} resets by itself at the next step, which cannot be undone; make it with "
                 "autoreset_mode=AutoresetMode.DISABLED or SAME_STEP"
             )
+        if mode == AutoresetMode.NEXT_STEP and isinstance(unwrapped, AsyncVectorEnv) and not unwrapped.shared_memory:
+            raise ValueError(
+                "an AsyncVectorEnv without shared memory that resets by itself at the next step resets twice when it is "
+                "reset by hand; make it with autoreset_mode=AutoresetMode.DISABLED"
+            )
         self.env = env
         self._same_step = mode == AutoresetMode.SAME_STEP
         self._make_one = make_one
@@ -287,10 +309,9 @@ class GymnasiumVector(VectorEnv):
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
         self.backend = "gymnasium-async" if isinstance(unwrapped, AsyncVectorEnv) else "gymnasium"
-        spec = env.spec
-        self.env_id = spec.id if spec is not None else type(unwrapped).__name__
-        self.max_episode_steps = spec.max_episode_steps if spec is not None else None
-        self.reward_threshold = spec.reward_threshold if spec is not None else None
+        if description is None and env.spec is None and isinstance(unwrapped, gym.vector.SyncVectorEnv):
+            description = describe_spec(unwrapped.envs[0])
+        self.env_id, self.max_episode_steps, self.reward_threshold = description or describe_spec(env)
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
@@ -302,12 +323,17 @@ class GymnasiumVector(VectorEnv):
     def reset(self, seed: int | None = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        self._obs = self._after_reset = cast(self.observation_space, self._leaves, self.env.reset(seed=seed)[0])
+        self._obs = self._after_reset = self._reset(seed=seed)
         self._over, self._strayed = np.zeros((2, self.n_envs), bool)
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
-        obs, reward, terminated, truncated, info = self.env.step(action)
+        try:
+            obs, reward, terminated, truncated, info = self.env.step(action)
+        except (EOFError, ConnectionError) as error:
+            self._blame_worker(error)
+            raise
+        workers.check_answer(info)
         obs = cast(self.observation_space, self._leaves, obs)
         over = terminated | truncated
         if self._same_step:
@@ -326,7 +352,7 @@ class GymnasiumVector(VectorEnv):
         rest = ~active
         before = jax.tree.map(lambda leaf: leaf[rest], self._obs)
         if (self._over & rest).any():
-            self._reset_masked(self._over & rest)
+            self._reset(options={"reset_mask": self._over & rest})
         action = np.array(action)
         action[rest] = action[np.argmax(active)]  # the rows of those left out may hold anything, yet are stepped
         step = self._step_all(action)
@@ -338,13 +364,13 @@ class GymnasiumVector(VectorEnv):
     def reset_done(self, done: np.ndarray) -> Any:
         done = np.asarray(done, bool)
         if not self._same_step:
-            self._obs = self._reset_masked(done)
+            self._obs = self._reset(options={"reset_mask": done})
         elif not (done & self._strayed).any():
             self._obs = self._after_reset
         elif done.all():
             self._obs = self._after_reset = self.reset()
         elif isinstance(self.env.unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
-            self._obs = self._after_reset = self._reset_masked(done & self._strayed)
+            self._obs = self._after_reset = self._reset(options={"reset_mask": done & self._strayed})
         else:
             raise ValueError(
                 f"{type(self.env.unwrapped).__name__} resets by itself and was stepped while some environments were left "
@@ -353,8 +379,18 @@ class GymnasiumVector(VectorEnv):
         self._over, self._strayed = self._over & ~done, self._strayed & ~done
         return self._obs
 
-    def _reset_masked(self, mask: np.ndarray) -> Any:
-        return cast(self.observation_space, self._leaves, self.env.reset(options={"reset_mask": mask})[0])
+    def _reset(self, **arguments: Any) -> Any:
+        try:
+            obs, info = self.env.reset(**arguments)
+        except (EOFError, ConnectionError) as error:
+            self._blame_worker(error)
+            raise
+        workers.check_answer(info)
+        return cast(self.observation_space, self._leaves, obs)
+
+    def _blame_worker(self, error: Exception) -> None:
+        if isinstance(self.env.unwrapped, AsyncVectorEnv):
+            raise workers.ended(self.env.unwrapped) from error
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
@@ -467,11 +503,11 @@ def envpool_knows(env_id: str) -> bool:
     return not needs_package_for_goals or register(env_id)
 
 
-def describe_spec(env: gym.Env) -> tuple[str, int | None, float | None]:
-    """Returns id, time limit and reward threshold of a Gymnasium environment."""
+def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
+    """Returns id, time limit and reward threshold of a Gymnasium environment or vector environment."""
     if env.spec is None:
-        return type(env.unwrapped).__name__, None, None
-    return env.spec.id, env.spec.max_episode_steps, env.spec.reward_threshold
+        return Description(type(env.unwrapped).__name__, None, None)
+    return Description(env.spec.id, env.spec.max_episode_steps, env.spec.reward_threshold)
 
 
 def success_of(info: dict[str, Any]) -> float:
