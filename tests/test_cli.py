@@ -120,7 +120,7 @@ def test_the_best_model_is_that_of_the_best_evaluation(run):
 def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert train(tmp_path / "run", "--seed", "1", steps=60) == 0
     text = capsys.readouterr().out
-    assert "Pendulum-v1, 1 at once on envpool" in text
+    assert "environment   Pendulum-v1, 1 at once\nbackend       envpool\n" in text
     assert "SAC, preset, seed 1" in text
     assert "60/60 steps" in text
     assert "95 % interval" in text

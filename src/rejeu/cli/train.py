@@ -49,7 +49,7 @@ class Train:
     envs: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Environments stepped at once; by default the preset's, else 1."""
     backend: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
-    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto: EnvPool where it knows ENV."""
+    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto: the fastest, measured once."""
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Seeds everything; one is drawn if none is given."""
     assignments: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
@@ -70,6 +70,7 @@ def run(arguments: Train) -> int:
     """Trains and returns the exit status: 0, or 130 after Ctrl-C."""
     began = time.perf_counter()
     from rejeu import compilation, presets
+    from rejeu.envs.measuring import sentence
 
     compiled_before = compilation.seconds()
     check(arguments)
@@ -82,7 +83,7 @@ def run(arguments: Train) -> int:
         with closing(make_evaluation_env(config)) as evaluation_env:
             folder = run_folder.create(arguments.out, config.env, config.algorithm, seed)
             run_folder.write_config(folder, config)
-            say(header(config, folder))
+            say(header(config, sentence(env), folder))
             evaluate = train(agent, config, evaluation_env, folder)
         picture(agent, evaluate, config, folder)
         seconds, compile_seconds = time.perf_counter() - began, compilation.seconds() - compiled_before
@@ -296,14 +297,15 @@ def picture(agent: Agent, evaluate: Evaluate, config: RunConfig, folder: RunFold
         say(f"no video: {' '.join(str(error).split())}")
 
 
-def header(config: RunConfig, folder: RunFolder) -> str:
-    """Returns what a run says of itself before it begins."""
+def header(config: RunConfig, backend: str, folder: RunFolder) -> str:
+    """Returns what a run says of itself before it begins; ``backend`` says what steps the environments, and why."""
     what = "preset" if config.preset else "default hyper-parameters"
     span = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
     every = f"evaluated on {config.evaluate_episodes} episodes every {config.evaluate_every:,} steps"
     return "\n".join(
         [
-            f"environment   {config.env}, {config.n_envs} at once on {config.backend}",
+            f"environment   {config.env}, {config.n_envs} at once",
+            f"backend       {backend}",
             f"algorithm     {config.algorithm}, {what}, seed {config.seed}",
             f"training      {span}, {every}",
             f"run folder    {folder.path}",

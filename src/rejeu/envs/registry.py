@@ -91,8 +91,8 @@ class _Maker:
     spec: EnvSpec | None
 
     def __call__(self) -> gym.Env:
-        if self.spec is not None:
-            gym.registry.setdefault(self.env_id, self.spec)
+        if self.spec is not None and not register(self.env_id):
+            gym.registry[self.env_id] = self.spec
         return make_env(self.env_id, **self.kwargs)
 
 

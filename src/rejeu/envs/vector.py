@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -17,7 +18,7 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from rejeu.envs import goals as goals_module, workers
+from rejeu.envs import goals as goals_module, measuring, workers
 from rejeu.envs.registry import make_env, maker, provider, register, unknown_environment
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, flat_keys, leaves, plain, structure
@@ -64,6 +65,10 @@ class VectorEnv(ABC):
     """Of one environment."""
     backend: str
     """Which backend steps them."""
+    measured: Mapping[str, float] = MappingProxyType({})
+    """Steps per second of each backend, over all environments, by which ``"auto"`` chose this one; empty if it had not to."""
+    passed_over: Mapping[str, str] = MappingProxyType({})
+    """Why ``"auto"`` could not measure a backend."""
     env_id: str
     """The id they are registered under, or the class name of what was given."""
     max_episode_steps: int | None = None
@@ -153,8 +158,9 @@ def make_vector(
             environment, whose automatic resets are undone.
         n_envs: how many; ignored for vector environments.
         backend: ``"envpool"`` (C++ threads), ``"gymnasium"`` (in this process), ``"gymnasium-async"`` (one worker process
-            each), or ``"auto"``: EnvPool for ids that it knows unless ``env_kwargs`` are given, Gymnasium otherwise. The
-            choice is in the result's ``backend``.
+            each), or ``"auto"``: for an id the fastest, as measured when it was first asked for on this machine (see
+            :mod:`rejeu.envs.measuring`); for a function, this process. The result's ``backend`` says which it is, its
+            ``measured`` what it was chosen by.
         seed: seeds the environments, each differently, at their first reset. None draws one.
         env_kwargs: handed to ``gymnasium.make``.
 
@@ -197,7 +203,16 @@ def make_vector(
             f"{type(env).__name__}"
         )
     if backend == "auto":
-        backend = "envpool" if not env_kwargs and envpool_knows(env) else "gymnasium"
+        choice = measuring.choose(
+            lambda backend, n: make_vector(env, n, backend, 0, **env_kwargs),  # type: ignore[arg-type]
+            env,
+            n_envs,
+            env_kwargs,
+            lambda: not env_kwargs and envpool_knows(env),
+        )
+        vector = make_vector(env, n_envs, choice.backend, seed, **env_kwargs)  # type: ignore[arg-type]
+        vector.measured, vector.passed_over = choice.measured, choice.passed_over
+        return vector
     if backend == "envpool":
         if env_kwargs:
             raise ValueError(f"the envpool backend takes no environment arguments, got {env_kwargs}; use 'gymnasium'")
