@@ -435,10 +435,10 @@ class EnvPool(VectorEnv):
         self.env_id = env_id
         self.n_envs = n_envs
         self._pool = self._make(seed)
-        self.observation_space = self._pool.observation_space
+        self.observation_space = _bounded_rightly(self._pool.observation_space)
         self.action_space = self._pool.action_space
         self.max_episode_steps = int(self._pool.spec.config.max_episode_steps)
-        self.reward_threshold = self._pool.spec.reward_threshold
+        self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
         self._leaves = leaves(self.observation_space)
 
     def _make(self, seed: int | None) -> Any:
@@ -522,13 +522,35 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
     """Returns id, time limit and reward threshold of a Gymnasium environment or vector environment."""
     if env.spec is None:
         return Description(type(env.unwrapped).__name__, None, None)
-    return Description(env.spec.id, env.spec.max_episode_steps, env.spec.reward_threshold)
+    limit = env.spec.max_episode_steps
+    if limit is None and env.spec.id.startswith("parking-"):  # which ends its episodes itself, after so many seconds
+        config = env.unwrapped.config  # type: ignore[union-attr]
+        limit = round(config["duration"] * config["policy_frequency"])
+    return Description(env.spec.id, limit, env.spec.reward_threshold)
+
+
+def reward_threshold(env_id: str, declared: float | None) -> float | None:
+    """Returns the return at which Gymnasium counts an environment as solved, ``declared`` for one it does not know."""
+    if env_id in gym.registry:
+        return gym.registry[env_id].reward_threshold
+    return None if provider(env_id) is not None else declared
 
 
 def success_of(info: dict[str, Any]) -> float:
     """Returns 1.0 or 0.0 as an info dict says under ``is_success`` or ``success``, NaN if it says neither."""
     value = info.get("is_success", info.get("success"))
     return float("nan") if value is None else float(np.all(value))
+
+
+def _bounded_rightly(space: gym.Space) -> gym.Space:
+    """Returns a space in which what EnvPool bounds by the least positive and the greatest float is unbounded."""
+    if isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({key: _bounded_rightly(part) for key, part in space.spaces.items()})
+    if isinstance(space, gym.spaces.Box) and space.dtype.kind == "f":
+        limits = np.finfo(space.dtype)
+        if (space.low == limits.tiny).all() and (space.high == limits.max).all():
+            return gym.spaces.Box(-np.inf, np.inf, space.shape, space.dtype.type)
+    return space
 
 
 def _replaced(batch: Any, rows: np.ndarray, part: Any) -> Any:

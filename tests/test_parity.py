@@ -1,0 +1,412 @@
+"""EnvPool's environments are Gymnasium's: the same spaces, limits, rewards and ends, for all that have presets.
+
+Where the dynamics are deterministic, EnvPool's episodes are replayed in Gymnasium: put where EnvPool's began, and given the
+same actions, it must go the same way. Where an episode began at random is then compared as a distribution. LunarLander has
+random ground and engines whose thrust scatters, so there rewards are computed from what is seen, free fall is compared by
+step, and the rest as distributions: with the standard errors of both sides, and seeds that make each result repeatable.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+import warnings
+from collections import Counter
+from typing import Any, NamedTuple
+
+import envpool
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from rejeu import presets, spaces
+from rejeu.envs.vector import make_vector
+
+LANDERS = "LunarLander-v3", "LunarLanderContinuous-v3"
+
+
+class Episode(NamedTuple):
+    start: Any
+    steps: list[tuple]
+    """Of each step: the observation before, the action, and what came of it (see ``outcome``)."""
+
+
+class Replayed(NamedTuple):
+    """How to replay an environment's episodes."""
+
+    put: Any
+    """Puts a Gymnasium environment where an observation says."""
+    act: Any
+    """Actions that bring about every kind of end."""
+    ends: set
+    """The kinds of end to replay: (terminated, truncated, success)."""
+    n_envs: int = 16
+    every_step: bool = False
+    """Whether to put it there at every step: where rounding grows with time."""
+    apart: Any = None
+    """Of an observation, whether the two are known to differ there."""
+
+
+def put_cart_pole(env, obs):
+    env.state = obs.astype(np.float64)
+
+
+def put_pendulum(env, obs):
+    env.state = np.array([math.atan2(obs[1], obs[0]), obs[2]], np.float64)
+
+
+def put_mountain_car(env, obs):
+    env.state = obs.astype(np.float64)
+
+
+def put_parking(env, obs):
+    """Features are x, y, vx, vy, cos h and sin h, in units of 100, 100, 5, 5, 1 and 1; a car starts at rest."""
+    x, y, _, _, cos, sin = obs["observation"].astype(np.float64)
+    (vehicle,) = env.controlled_vehicles
+    vehicle.position, vehicle.heading, vehicle.speed = np.array([100 * x, 100 * y]), math.atan2(sin, cos), 0.0
+    x, y, _, _, cos, sin = obs["desired_goal"].astype(np.float64)
+    vehicle.goal.position, vehicle.goal.heading = np.array([100 * x, 100 * y]), math.atan2(sin, cos)
+
+
+def put_fetch(env, obs):
+    """The arm always starts alike."""
+    env.goal = obs["desired_goal"].astype(np.float64)
+
+
+def balance(obs, t, rng):
+    """Half of them balance the pole, the others do anything."""
+    action = rng.integers(2, size=len(obs))
+    action[::2] = (obs[::2] @ [0.0, 0.1, 1.0, 0.5] > 0).astype(int)
+    return action
+
+
+def swing(obs, t, rng):
+    """Half of them push the way that the car goes, the others anyhow."""
+    action = rng.integers(3, size=len(obs))
+    action[::2] = np.where(obs[::2, 1] >= 0, 2, 0)
+    return action
+
+
+def torque(obs, t, rng):
+    return rng.uniform(-2, 2, (len(obs), 1)).astype(np.float32)
+
+
+def at_top_speed(obs):
+    return abs(obs[2]) == 8.0
+
+
+def drive(obs, t, rng):
+    """The first car stands still; the others hold random pedals and wheels for two seconds."""
+    if t % 10 == 0:
+        drive.held = rng.uniform(-1, 1, (len(obs["observation"]), 2)).astype(np.float32)
+        drive.held[0] = 0.0
+    return drive.held
+
+
+def reach(obs, t, rng):
+    """Half of the arms go to the goal, the others anywhere."""
+    action = rng.uniform(-1, 1, (len(obs["observation"]), 4)).astype(np.float32)
+    action[::2, :3] = np.clip(10 * (obs["desired_goal"] - obs["achieved_goal"]), -1, 1)[::2]
+    return action
+
+
+FALLS, LIMIT = (True, False, None), (False, True, None)
+REPLAYED = {
+    "CartPole-v1": Replayed(put_cart_pole, balance, {FALLS, LIMIT}, every_step=True),
+    "Pendulum-v1": Replayed(put_pendulum, torque, {LIMIT}, every_step=True, apart=at_top_speed),
+    "MountainCar-v0": Replayed(put_mountain_car, swing, {FALLS, LIMIT}, every_step=True),
+    "parking-v0": Replayed(put_parking, drive, {(True, False, 0.0), (True, False, 1.0), (False, True, 0.0)}, n_envs=64),
+    "FetchReach-v4": Replayed(put_fetch, reach, {(False, True, 0.0), (False, True, 1.0)}, n_envs=8),
+}
+COMPARED = *REPLAYED, *LANDERS
+
+
+def both(env_id, n_envs=2, seed=0):
+    """The environments on either side."""
+    if env_id in LANDERS:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of what SWIG generates
+            pytest.importorskip("Box2D")
+    return make_vector(env_id, n_envs, "gymnasium", seed), make_vector(env_id, n_envs, "envpool", seed)
+
+
+def test_every_environment_with_a_preset_is_compared():
+    known = set(envpool.list_all_envs())
+    assert {preset.env_id for preset in presets.ALL if preset.env_id in known} <= set(COMPARED)
+
+
+# What they are.
+
+
+@pytest.mark.parametrize("env_id", COMPARED)
+def test_spaces_limits_and_thresholds_are_the_same(env_id):
+    gymnasium, pool = both(env_id)
+    assert spaces.leaves(pool.observation_space) == spaces.leaves(gymnasium.observation_space)
+    assert spaces.describe(pool.action_space) == spaces.describe(gymnasium.action_space)
+    assert pool.max_episode_steps == gymnasium.max_episode_steps is not None
+    assert pool.reward_threshold == gymnasium.reward_threshold
+    for space in (pool.observation_space, gymnasium.observation_space):
+        for obs in (pool.reset(), gymnasium.reset()):
+            assert space.contains(jax.tree.map(lambda leaf: np.array(leaf[0]), obs))
+
+
+# Replayed.
+
+
+def row(tree, i):
+    return jax.tree.map(lambda leaf: np.array(leaf[i]), tree)
+
+
+def outcome(vector, step, i):
+    success = vector.success(step, i)
+    return row(step.obs, i), step.reward[i], bool(step.terminated[i]), bool(step.truncated[i]), success
+
+
+def end_of(episode):
+    *_, terminated, truncated, success = episode.steps[-1][2]
+    return terminated, truncated, None if math.isnan(success) else success
+
+
+def episodes_of_each_kind(vector, replayed, most=2):
+    """Up to ``most`` episodes of every kind of end."""
+    rng, found = np.random.default_rng(0), {}
+    obs = vector.reset()
+    running = [Episode(row(obs, i), []) for i in range(vector.n_envs)]
+    for t in range(2_000):
+        before, action = jax.tree.map(np.array, obs), replayed.act(obs, t, rng)
+        step = vector.step(action)
+        for i, episode in enumerate(running):
+            episode.steps.append((row(before, i), action[i], outcome(vector, step, i)))
+        done = step.terminated | step.truncated
+        obs = vector.reset_done(done) if done.any() else step.obs
+        for i in np.flatnonzero(done):
+            found.setdefault(end_of(running[i]), []).append(running[i])
+            running[i] = Episode(row(obs, i), [])
+        if set(found) >= replayed.ends:
+            return {end: episodes[:most] for end, episodes in found.items()}
+    raise AssertionError(f"of {replayed.ends} only {set(found)} came about")
+
+
+@pytest.mark.parametrize("env_id", REPLAYED)
+def test_episodes_of_envpool_replayed_in_gymnasium_go_the_same_way(env_id):
+    replayed = REPLAYED[env_id]
+    pool = make_vector(env_id, replayed.n_envs, "envpool", seed=0)
+    gymnasium = make_vector(env_id, 1, "gymnasium", seed=0)
+    env = gymnasium.envs[0].unwrapped
+    episodes = episodes_of_each_kind(pool, replayed)
+    assert set(episodes) == replayed.ends
+    for episode in (episode for some in episodes.values() for episode in some):
+        gymnasium.reset()
+        replayed.put(env, episode.start)
+        for t, (before, action, (obs, reward, *flags)) in enumerate(episode.steps):
+            if replayed.every_step:
+                replayed.put(env, before)
+            step = gymnasium.step(action[None])
+            other_obs, other_reward, *other_flags = outcome(gymnasium, step, 0)
+            if replayed.apart is None or not replayed.apart(obs):
+                jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=0, atol=2e-5), obs, other_obs)
+            np.testing.assert_allclose(reward, other_reward, rtol=0, atol=1e-5)
+            assert str(flags) == str(other_flags), (env_id, t)  # as text, for NaN is unequal to itself
+
+
+@pytest.mark.parametrize("env_id", REPLAYED)
+def test_time_limits_fall_on_the_same_step(env_id):
+    replayed = REPLAYED[env_id]
+    pool = make_vector(env_id, replayed.n_envs, "envpool", seed=0)
+    for (_, truncated, _), some in episodes_of_each_kind(pool, replayed).items():
+        assert all((len(episode.steps) == pool.max_episode_steps) == truncated for episode in some)
+
+
+def test_an_end_in_the_very_step_of_the_time_limit_is_told_by_gymnasium_only():
+    """The one difference in flags: EnvPool says truncated, Gymnasium both. See docs/environments.md."""
+    told = []
+    for vector in both("MountainCar-v0", 256):
+        obs = np.array(vector.reset())
+        wait = 60 + np.arange(256) % 50
+        active = np.ones(256, bool)
+        for t in range(200):
+            step = vector.step(np.where(t < wait, 1, np.where(obs[:, 1] >= 0, 2, 0)), active)
+            obs = np.array(step.obs)
+            at_flag = active & (obs[:, 0] >= 0.5)
+            active &= ~(step.terminated | step.truncated)
+        assert at_flag.any()
+        told.append({*zip(step.terminated[at_flag].tolist(), step.truncated[at_flag].tolist(), strict=True)})
+    assert told == [{(True, True)}, {(False, True)}]
+
+
+def test_a_pendulum_at_its_top_speed_turns_further_in_envpool():
+    """Gymnasium turns it by the speed clipped to 8 rad/s, EnvPool by the speed before clipping. See docs/environments.md."""
+    pool = make_vector("Pendulum-v1", 16, "envpool", seed=0)
+    obs, reached = np.array(pool.reset(), np.float64), 0
+    for _ in range(199):
+        action = 2.0 * np.sign(obs[:, 2:]).astype(np.float32)  # along the way that it turns
+        next_obs = np.array(pool.step(action).obs, np.float64)
+        speed = obs[:, 2] + 0.05 * (15.0 * obs[:, 1] + 3.0 * action[:, 0])  # g = 10, m = l = 1, dt = 0.05
+        angle = np.arctan2(obs[:, 1], obs[:, 0]) + 0.05 * speed
+        np.testing.assert_allclose(next_obs[:, :2], np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-5)
+        np.testing.assert_allclose(next_obs[:, 2], np.clip(speed, -8, 8), atol=1e-5)
+        reached += int((np.abs(speed) > 8.1).sum())
+        obs = next_obs
+    assert reached > 100
+
+
+@pytest.mark.parametrize("env_id", COMPARED)
+def test_episodes_begin_alike(env_id):
+    """Every number of the first observation has the same distribution (Kolmogorov and Smirnov's test, p above 0.001)."""
+    starts = []
+    for vector in both(env_id, 10):
+        seen = [jax.tree.leaves(jax.tree.map(np.array, vector.reset()))]
+        seen += [jax.tree.leaves(jax.tree.map(np.array, vector.reset_done(np.ones(10, bool)))) for _ in range(39)]
+        starts.append(np.concatenate([np.concatenate(obs, axis=1) for obs in seen]))
+    one, two = (np.round(start.astype(np.float64), 5) for start in starts)
+    assert one.shape == two.shape
+    for column in range(one.shape[1]):
+        if np.ptp(one[:, column]) < 1e-4:
+            np.testing.assert_allclose(two[:, column], one[0, column], atol=1e-4)
+        else:
+            assert stats.ks_2samp(one[:, column], two[:, column]).pvalue > 1e-3, column
+
+
+# LunarLander.
+
+
+def shaping(obs):
+    """The potential whose increase is LunarLander's reward (its documentation, "Rewards")."""
+    far, fast = np.hypot(obs[:, 0], obs[:, 1]), np.hypot(obs[:, 2], obs[:, 3])
+    return -100 * (far + fast + np.abs(obs[:, 4])) + 10 * (obs[:, 6] + obs[:, 7])
+
+
+def fuel(action):
+    """0.3 for the main engine's power and 0.03 for a side engine's."""
+    if action.ndim == 1:
+        return 0.3 * (action == 2) + 0.03 * ((action == 1) | (action == 3))
+    main, side = action.astype(np.float64).T
+    return 0.3 * np.where(main > 0, 0.5 + 0.5 * main, 0.0) + 0.03 * np.where(np.abs(side) > 0.5, np.abs(side), 0.0)
+
+
+def anything(vector, obs, rng):
+    return (
+        rng.integers(4, size=vector.n_envs)
+        if vector.action_space.shape == ()
+        else rng.uniform(-1, 1, (vector.n_envs, 2)).astype(np.float32)
+    )
+
+
+def nothing(vector, obs, rng):
+    return np.zeros((vector.n_envs, *vector.action_space.shape), np.float32 if vector.action_space.shape else np.int64)
+
+
+def landing(vector, obs, rng):
+    """The controller that comes with Gymnasium's LunarLander."""
+    from gymnasium.envs.box2d.lunar_lander import heuristic
+
+    continuous = vector.action_space.shape != ()
+    env = types.SimpleNamespace(unwrapped=types.SimpleNamespace(continuous=continuous))
+    action = np.array([heuristic(env, one) for one in obs])
+    return action.astype(np.float32) if continuous else action
+
+
+class Walk(NamedTuple):
+    obs: np.ndarray
+    action: np.ndarray
+    next_obs: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    outcomes: list
+    """Of whole episodes: return, length, how it ended."""
+
+
+def walk(vector, policy, episodes_each):
+    """The steps of as many episodes in each environment: ending at the first to finish would favour short ones."""
+    rng, rows, outcomes = np.random.default_rng(0), [], []
+    n = vector.n_envs
+    obs, total, length, played = np.array(vector.reset(), np.float64), np.zeros(n), np.zeros(n, int), np.zeros(n, int)
+    while played.min() < episodes_each:
+        action = policy(vector, obs, rng)
+        step = vector.step(action)
+        next_obs = np.array(step.obs, np.float64)
+        rows.append((obs, action, next_obs, np.array(step.reward), np.array(step.terminated)))
+        total += step.reward
+        length += 1
+        done = step.terminated | step.truncated
+        for i in np.flatnonzero(done):
+            if played[i] < episodes_each:
+                outcomes.append((total[i], length[i], kind(step, next_obs, i)))
+            played[i] += 1
+            total[i] = length[i] = 0
+        obs = np.array(vector.reset_done(done), np.float64) if done.any() else next_obs
+    return Walk(*(np.concatenate(part) for part in zip(*rows, strict=True)), outcomes)
+
+
+def kind(step, obs, i):
+    if not step.terminated[i]:
+        return "time limit"
+    if step.reward[i] == 100:
+        return "landed"
+    return "flew off" if abs(obs[i, 0]) >= 1 else "crashed"
+
+
+@pytest.mark.parametrize("env_id", LANDERS)
+def test_landers_get_the_documented_reward(env_id):
+    for vector in both(env_id, 8):
+        seen = walk(vector, anything, 6)
+        expected = shaping(seen.next_obs) - shaping(seen.obs) - fuel(seen.action)
+        on = ~seen.terminated
+        np.testing.assert_allclose(seen.reward[on], expected[on], rtol=0, atol=1e-3)
+        assert set(seen.reward[seen.terminated].tolist()) <= {-100.0, 100.0}
+
+
+@pytest.mark.parametrize("env_id", LANDERS)
+def test_landers_fall_alike(env_id):
+    """Without engine the state follows from the state before: fitted on the one side, it holds on the other."""
+    falls = []
+    for vector in both(env_id, 8):
+        seen = walk(vector, nothing, 10)
+        high = (seen.next_obs[:, 1] > 0.6) & ~seen.terminated
+        falls.append((np.c_[seen.obs[high, :6], np.ones(high.sum())], seen.next_obs[high, :6]))
+    (before, after), (other_before, other_after) = falls
+    step, *_ = np.linalg.lstsq(before, after, rcond=None)
+    fitted, held = (np.abs(x @ step - y).mean(axis=0) for x, y in ((before, after), (other_before, other_after)))
+    np.testing.assert_array_less(held, 1.5 * fitted + 1e-6)
+    np.testing.assert_allclose(held, 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("engine", [1, 2, 3])
+@pytest.mark.parametrize("env_id", LANDERS)
+def test_engines_push_alike(env_id, engine):
+    """Thrust scatters, so the changes of velocity and spin by one step are compared as distributions."""
+    changes = []
+    for vector in both(env_id, 10):
+        action = np.full(10, engine)
+        if env_id == "LunarLanderContinuous-v3":
+            action = np.repeat(np.float32([[[0.0, -0.8]], [[0.4, 0.0]], [[0.0, 0.8]]][engine - 1]), 10, axis=0)
+        found = []
+        obs = np.array(vector.reset())
+        for _ in range(30):
+            for _ in range(4):
+                next_obs = np.array(vector.step(action).obs)
+                found.append((next_obs - obs)[:, [2, 3, 5]])
+                obs = next_obs
+            obs = np.array(vector.reset_done(np.ones(10, bool)))
+        changes.append(np.concatenate(found))
+    one, two = changes
+    for column in range(3):
+        assert stats.ks_2samp(one[:, column], two[:, column]).pvalue > 1e-3, column
+
+
+@pytest.mark.parametrize(("policy", "episodes_each"), [(anything, 20), (landing, 8)])
+@pytest.mark.parametrize("env_id", LANDERS)
+def test_landers_end_alike(env_id, policy, episodes_each):
+    """Returns, lengths and how often each end comes about agree within four standard errors of their difference."""
+    sides = []
+    for vector in both(env_id, 16):
+        returns, lengths, kinds = zip(*walk(vector, policy, episodes_each).outcomes, strict=True)
+        assert all((length == 1000) == (how == "time limit") for length, how in zip(lengths, kinds, strict=True))
+        sides.append((np.array(returns), np.array(lengths), kinds))
+    for one, two in zip(sides[0][:2], sides[1][:2], strict=True):
+        assert abs(one.mean() - two.mean()) < 4 * math.hypot(stats.sem(one), stats.sem(two))
+    n, counts = 16 * episodes_each, [Counter(side[2]) for side in sides]
+    for how in counts[0] | counts[1]:
+        share = (counts[0][how] + counts[1][how]) / (2 * n)
+        assert abs(counts[0][how] - counts[1][how]) / n < 4 * math.sqrt(2 * share * (1 - share) / n), how
