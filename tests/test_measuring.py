@@ -169,6 +169,14 @@ def test_files_that_cannot_be_linked_are_kept_all_the_same(rates, folder, monkey
     assert len(rates["asked"]) == len([*folder.iterdir()]) == 1
 
 
+@pytest.mark.parametrize(("again", "words"), [(True, "outside of `if __name__"), (None, "may be another thread")])
+def test_it_is_said_why_workers_were_not_tried(rates, monkeypatch, again, words):
+    rates["gymnasium"] = 100.0
+    monkeypatch.setattr(workers, "main_runs_again", lambda: again)
+    assert words in choose(known=False).passed_over["gymnasium-async"]
+    assert rates["asked"] == [("gymnasium", 8)]
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_nothing_is_measured_where_the_choice_cannot_be_kept(rates, monkeypatch, tmp_path, known):
     """Otherwise two runs with one seed could differ by what else the machine was doing."""

@@ -216,7 +216,10 @@ def why_no_workers() -> str | None:
     """Returns why worker processes cannot be tried, None if they can."""
     if multiprocessing.parent_process() is not None:
         return "this is itself a worker process"
-    if workers.main_runs_again() is not False:
+    again = workers.main_runs_again()
+    if again is None:
+        return "it cannot be told whether workers could import the main script; this may be another thread"
+    if again:
         return "the main script starts this outside of `if __name__ == '__main__':`, so workers cannot import it"
     return None
 
