@@ -330,8 +330,8 @@ class GymnasiumVector(VectorEnv):
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
-        self._over = np.zeros(self.n_envs, bool)
-        """Which have ended and were not reset since; none where they reset themselves."""
+        self._flags = (np.zeros(self.n_envs, bool),) * 2
+        """Which have terminated, and which were truncated, and were not reset since; none where they reset themselves."""
         self._strayed = np.zeros(self.n_envs, bool)
         """Which have moved on unseen and were not reset since."""
 
@@ -339,7 +339,8 @@ class GymnasiumVector(VectorEnv):
         seed = self._seed if seed is None else seed
         self._seed = None
         self._obs = self._after_reset = self._reset(seed=seed)
-        self._over, self._strayed = np.zeros((2, self.n_envs), bool)
+        self._flags = (np.zeros(self.n_envs, bool),) * 2
+        self._strayed = np.zeros(self.n_envs, bool)
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
@@ -348,26 +349,27 @@ class GymnasiumVector(VectorEnv):
         except (EOFError, ConnectionError) as error:
             self._blame_worker(error)
             raise
-        workers.check_answer(info)
+        if workers.FAILURE in info:
+            raise workers.failed(info)
         obs = cast(self.observation_space, self._leaves, obs)
-        over = terminated | truncated
         if self._same_step:
             self._after_reset = obs
-            done = np.flatnonzero(over)
+            done = np.flatnonzero(terminated | truncated)
             if len(done):
                 obs = jax.tree.map(np.copy, obs)
                 for i in done.tolist():
                     _put(obs, i, plain(self.observation_space, info["final_obs"][i]))
         else:
-            self._over = over
+            self._flags = terminated, truncated
         self._obs = obs
         return Step(obs, np.asarray(reward, np.float32), terminated, truncated, info)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         rest = ~active
         before = jax.tree.map(lambda leaf: leaf[rest], self._obs)
-        if (self._over & rest).any():
-            self._reset(options={"reset_mask": self._over & rest})
+        over = (self._flags[0] | self._flags[1]) & rest
+        if over.any():
+            self._reset(options={"reset_mask": over})
         action = np.array(action)
         action[rest] = action[np.argmax(active)]  # the rows of those left out may hold anything, yet are stepped
         step = self._step_all(action)
@@ -391,7 +393,8 @@ class GymnasiumVector(VectorEnv):
                 f"{type(self.env.unwrapped).__name__} resets by itself and was stepped while some environments were left "
                 "out, so those cannot begin anew one by one; reset all, or make it with autoreset_mode=DISABLED"
             )
-        self._over, self._strayed = self._over & ~done, self._strayed & ~done
+        self._flags = self._flags[0] & ~done, self._flags[1] & ~done
+        self._strayed = self._strayed & ~done
         return self._obs
 
     def _reset(self, **arguments: Any) -> Any:
@@ -400,7 +403,8 @@ class GymnasiumVector(VectorEnv):
         except (EOFError, ConnectionError) as error:
             self._blame_worker(error)
             raise
-        workers.check_answer(info)
+        if workers.FAILURE in info:
+            raise workers.failed(info)
         return cast(self.observation_space, self._leaves, obs)
 
     def _blame_worker(self, error: Exception) -> None:

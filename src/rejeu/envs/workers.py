@@ -74,13 +74,12 @@ def check_sendable(make_one: Callable[[], gym.Env]) -> None:
         ) from error
 
 
-def check_answer(info: dict[str, Any]) -> None:
-    """Raises ``WorkerError``, with the traceback from the worker, if a step or reset failed in one."""
-    if FAILURE in info:
-        failed = [(i, text) for i, text in enumerate(info[FAILURE]) if text]
-        which = "environments" if len(failed) > 1 else "environment"
-        numbers = ", ".join(str(i) for i, _ in failed)
-        raise WorkerError(f"{which} {numbers} failed in a worker process:\n{failed[0][1]}")
+def failed(info: dict[str, Any]) -> WorkerError:
+    """Returns the error that a step or reset met with in a worker, which left ``FAILURE`` in its info."""
+    found = [(i, text) for i, text in enumerate(info[FAILURE]) if text]
+    which = "environments" if len(found) > 1 else "environment"
+    numbers = ", ".join(str(i) for i, _ in found)
+    return WorkerError(f"{which} {numbers} failed in a worker process:\n{found[0][1]}")
 
 
 def ended(env: AsyncVectorEnv) -> WorkerError:
