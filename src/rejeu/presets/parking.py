@@ -22,6 +22,7 @@ PRESETS = (
         total_steps=80_000,
         evaluate_every=10_000,
         evaluate_episodes=100,
+        backend="envpool",
         source="rejeu's own tuning, from the hyper-parameters of highway-env's parking notebook",
         result="success 98, 98 and 99.5 % (seeds 0 to 2) in 200 episodes each of highway-env's own parking-v0",
     ),
