@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 
 import equinox as eqx
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
@@ -168,3 +169,20 @@ def test_networks_without_a_drawing_are_counted():
     assert first.startswith("network: ")
     assert second == "(Dueling)"
     assert last == ["state:", "  observation () -> 4 (one-hot)"]
+
+
+def test_policy_and_value_are_drawn_on_a_line_each():
+    env = gym.make("CartPole-v1")
+    agent = rejeu.PPO("MlpPolicy", env, policy_kwargs={"net_arch": {"pi": [32], "vf": [16, 8]}})
+    n = (4 * 32 + 32) + (32 * 2 + 2) + (4 * 16 + 16) + (16 * 8 + 8) + (8 + 1)
+    assert agent.summary() == f"network: {n} parameters\npolicy: state -32- 2\nvalue:  state -16-8- 1\n\nstate: 4"
+
+
+def test_shared_layers_and_memories_are_named():
+    env = gym.make("CartPole-v1")
+    shared = rejeu.A2C("MlpPolicy", env, policy_kwargs={"net_arch": [16], "share_layers": True})
+    assert "policy: state -16- 2\nvalue:  state -16- 1 (shared layers)" in shared.summary()
+    recurrent = rejeu.RecurrentPPO(
+        "MlpPolicy", env, policy_kwargs={"net_arch": [16], "lstm_hidden_size": 8, "cell": "gru"}
+    )
+    assert "policy: state [gru 8] -16- 2\nvalue:  state [gru 8] -16- 1" in recurrent.summary()

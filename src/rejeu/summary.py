@@ -23,6 +23,8 @@ import equinox as eqx
 import jax
 
 from rejeu import running_stats
+from rejeu.algorithms.actor_critic import ActorCritic
+from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
 from rejeu.networks import MLP, Actor, Branches, Critic, SimBa, convolutions
 from rejeu.spaces import Leaf
 
@@ -71,15 +73,35 @@ def draw(network: Any, reach: int = 0) -> str:
     """Returns the drawing of one network.
 
     Args:
-        network: an actor or a critic, single or stacked; of others only the class is named.
+        network: an actor or a critic, single or stacked, or policy and value in one; of others only the class is named.
         reach: least width of the branches, so that actor and critic line up.
     """
+    if isinstance(network, ActorCritic):
+        return draw_policy_and_value(network, "state", "state")
+    if isinstance(network, RecurrentActorCritic):
+        cells = [f"state [{cell.kind} {cell.size}]" for cell in network.cells]
+        return draw_policy_and_value(network.readers, cells[0], cells[-1])
     if not isinstance(network, Actor | Critic):
         return f"({type(network).__name__})"
-    torso, output = network.torso, network.head.bias.shape[-1]
+    output = network.head.bias.shape[-1]
+    if isinstance(network.torso, Branches):
+        return draw_branches(network.torso, output, reach)
+    return draw_torso("state, action" if isinstance(network, Critic) else "state", network.torso, output)
+
+
+def draw_policy_and_value(network: ActorCritic, policy_entrance: str, value_entrance: str) -> str:
+    """Returns policy and value, a line each; where they share layers the value's line shows them again."""
+    torso = network.torso if network.value_torso is None else network.value_torso
+    policy = draw_torso(policy_entrance, network.torso, network.head.bias.shape[-1])
+    value = draw_torso(value_entrance, torso, 1) + (" (shared layers)" if network.value_torso is None else "")
+    return f"policy: {policy}\nvalue:  {value}"
+
+
+def draw_torso(entrance: str, torso: Any, output: int) -> str:
+    """Returns on one line what goes in, the hidden layers and what comes out."""
     if isinstance(torso, Branches):
-        return draw_branches(torso, output, reach)
-    entrance = "state, action" if isinstance(network, Critic) else "state"
+        layers = [*widths(torso.state), *widths(torso.common), *widths(torso.last)]
+        return f"{entrance} {'-'.join(['', *layers, ''])} {output}"
     if isinstance(torso, MLP):
         return f"{entrance} {chain(torso)} {output}"
     if isinstance(torso, SimBa):
