@@ -87,7 +87,7 @@ class Sampled(gym.Env):
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Space | None = None) -> None:
         self.observation_space = observation_space
-        self.action_space = action_space or spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32) if action_space is None else action_space
         self.reward = 0.0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:

@@ -17,14 +17,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from gymnasium import spaces
 from jax import Array
 
 from rejeu import running_stats, schedules
 from rejeu.config import nested, number, whole
 from rejeu.core import Clock, Explorer, Masked, PyTree, Rollout
-from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
+from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, sum_of
 from rejeu.networks import Convolution, Encoder, Linear, PolicyConfig, Torso, make_torso
 from rejeu.replay.rollout import advantages
 from rejeu.running_stats import NormalizationConfig
@@ -431,7 +430,7 @@ def entropy_of(distribution: Distribution, log_prob: Array) -> Array:
 
 def clipped(gradients: PyTree, most: float | None) -> tuple[PyTree, Array]:
     """Returns ``gradients`` scaled down to the norm ``most`` if they are longer (None: never), and their norm before."""
-    norm = optax.global_norm(gradients)
+    norm = jnp.sqrt(sum_of([jnp.sum(jnp.square(g)) for g in jax.tree.leaves(gradients)]))
     if most is None:
         return gradients, norm
     factor = jnp.minimum(1.0, most / (norm + 1e-6))
