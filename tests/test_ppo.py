@@ -180,6 +180,13 @@ def test_advantages_are_standardised_over_the_valid_entries_alone():
     np.testing.assert_allclose(standardised(jnp.array(values), jnp.array(valid))[:13], expected, rtol=1e-4)
 
 
+def test_one_advantage_alone_is_left_as_it_is():
+    """It has no deviation: subtracting its mean would leave nothing to learn from (Stable-Baselines3 1.6.1)."""
+    values = jnp.array([3.5, 100.0])
+    assert float(standardised(values, jnp.array([True, False]))[0]) == 3.5
+    assert float(standardised(values[:1], jnp.array([True]))[0]) == 3.5
+
+
 def test_explained_variance_is_1_for_exact_values_and_0_for_a_constant():
     target, valid = jnp.array([1.0, 2.0, 4.0, 1e6]), jnp.array([True, True, True, False])
     assert float(explained_variance(target + 7.0, target, valid)) == pytest.approx(1.0, abs=1e-6)

@@ -472,5 +472,9 @@ def masked_variance(values: Array, valid: Array) -> Array:
 
 
 def standardised(values: Array, valid: Array) -> Array:
-    """Returns ``values`` with mean 0 and standard deviation 1 over the entries where ``valid``."""
-    return (values - masked_mean(values, valid)) / (jnp.sqrt(masked_variance(values, valid)) + 1e-8)
+    """Returns ``values`` with mean 0 and standard deviation 1 over the entries where ``valid``.
+
+    Where only one is valid, which has no deviation, ``values`` are left as they are.
+    """
+    scaled = (values - masked_mean(values, valid)) / (jnp.sqrt(masked_variance(values, valid)) + 1e-8)
+    return jnp.where(jnp.sum(valid) > 1, scaled, values)
