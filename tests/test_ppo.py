@@ -676,6 +676,10 @@ def test_the_defaults_are_those_of_stable_baselines3():
             "state_dependent_std=True leaves learn_std=False without meaning",
         ),
         (
+            {"policy_kwargs": {"share_layers": True, "share_features_extractor": False}},
+            "share_layers=True leaves share_features_extractor=False without meaning; .* one",
+        ),
+        (
             {"critic_learning_rate": 1e-3, "policy_kwargs": {"share_layers": True}},
             "critic_learning_rate gives the value an optimizer of its own, which share_layers=True forbids; leave one",
         ),

@@ -79,6 +79,10 @@ class ActorCriticConfig(PolicyConfig):
         put("log_std_init", number("log_std_init", self.log_std_init))
         if self.state_dependent_std and not self.learn_std:
             raise ValueError("policy_kwargs: state_dependent_std=True leaves learn_std=False without meaning")
+        if self.share_layers and not self.share_features_extractor:
+            raise ValueError(
+                "policy_kwargs: share_layers=True leaves share_features_extractor=False without meaning; leave out one"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
