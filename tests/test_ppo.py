@@ -691,6 +691,18 @@ def test_an_impossible_setting_is_refused_in_one_line(settings, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("algorithm", [rejeu.PPO, rejeu.A2C])
+def test_a_rate_of_the_values_own_needs_convolutions_of_its_own(algorithm):
+    """Shared ones would follow one of the two optimizers, and the gradients of both."""
+    env = Sampled(IMAGES)
+    with pytest.raises(ValueError, match=r"critic_learning_rate .*share_features_extractor=False") as caught:
+        algorithm("CnnPolicy", env, critic_learning_rate=1e-3)
+    assert "\n" not in str(caught.value)
+    make, config = algorithm.algorithm.make, algorithm.algorithm.Config
+    make(config(critic_learning_rate=1e-3, policy_kwargs={"share_features_extractor": False}), IMAGES, env.action_space)
+    make(config(critic_learning_rate=1e-3), OBS_SPACE, env.action_space)
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [

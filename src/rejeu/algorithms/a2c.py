@@ -28,6 +28,7 @@ from rejeu.algorithms.actor_critic import (
     Samples,
     action_kind,
     check_flag,
+    check_value_rate,
     entropy_of,
     explained_variance,
     explorer_of,
@@ -94,10 +95,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """Returns A2C for these spaces.
 
     Raises:
-        ValueError: if no policy can act in the action space.
+        ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
     check_action(action_space, config.name)
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
+    check_value_rate(config, obs_leaves)
     eps = config.rms_prop_eps
     optimizer = (
         optax.scale_by_rms(RMSPROP_DECAY, eps, initial_scale=1.0)

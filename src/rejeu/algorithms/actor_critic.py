@@ -24,7 +24,7 @@ from rejeu import running_stats, schedules
 from rejeu.config import nested, number, whole
 from rejeu.core import Clock, Explorer, Masked, PyTree, Rollout
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, sum_of
-from rejeu.networks import Convolution, Encoder, Linear, PolicyConfig, Torso, make_torso
+from rejeu.networks import Convolution, Encoder, Linear, PolicyConfig, Torso, convolutions, make_torso
 from rejeu.replay.rollout import advantages
 from rejeu.running_stats import NormalizationConfig
 from rejeu.schedules import Schedule
@@ -173,6 +173,16 @@ def check_flag(key: str, value: Any) -> None:
     """Raises ``TypeError`` unless ``value`` is True or False."""
     if not isinstance(value, bool):
         raise TypeError(f"{key}={value!r} must be True or False")
+
+
+def check_value_rate(config: OnPolicyConfig, obs_leaves: tuple[Leaf, ...]) -> None:
+    """Raises ``ValueError`` if the value has an optimizer of its own and its convolutions are the policy's too."""
+    shared = config.policy_kwargs.share_features_extractor and any(convolutions(leaf) for leaf in obs_leaves)
+    if config.critic_learning_rate is not None and shared:
+        raise ValueError(
+            "critic_learning_rate gives the value an optimizer of its own, and of images policy and value share the "
+            "convolutions; give policy_kwargs=dict(share_features_extractor=False) or leave it out"
+        )
 
 
 class ActionKind(NamedTuple):

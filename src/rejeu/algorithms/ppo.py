@@ -38,6 +38,7 @@ from rejeu.algorithms.actor_critic import (
     OnPolicyConfig,
     Samples,
     action_kind,
+    check_value_rate,
     clipped,
     entropy_of,
     explained_variance,
@@ -127,10 +128,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """Returns PPO for these spaces.
 
     Raises:
-        ValueError: if no policy can act in the action space.
+        ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
     check_action(action_space, config.name)
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
+    check_value_rate(config, obs_leaves)
     optimizer = optax.scale_by_adam(eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
