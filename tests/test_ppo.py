@@ -361,6 +361,21 @@ def test_two_updates_equal_numpy(name):
     assert 2 <= hand.n_updates < full if "early" in name else hand.n_updates == full
 
 
+def test_padding_leaks_into_no_update():
+    space, _ = ACTIONS["box"]
+    _, algorithm = make("box")
+    state, update, rollout = begin(algorithm), jax.jit(algorithm.update), random_rollout(space, valid=LAST_STEP_MISSING)
+    spoil = lambda a: np.where(rollout.valid.reshape(*rollout.valid.shape, *[1] * (a.ndim - 2)), a, 50.0)  # noqa: E731
+    spoilt = rollout._replace(
+        **{name: spoil(getattr(rollout, name)).astype(np.float32) for name in ("obs", "action", "reward", "next_obs")}
+    )
+    (clean, clean_metrics), (given, metrics) = update(state, rollout, CLOCK), update(state, spoilt, CLOCK)
+    for one, two in zip(jax.tree.leaves(clean), jax.tree.leaves(given), strict=True):
+        np.testing.assert_array_equal(one, two)
+    for name, value in clean_metrics.items():
+        assert float(value) == float(metrics[name]), name
+
+
 def test_each_rollout_is_shuffled_anew():
     space, _ = ACTIONS["box"]
     config, algorithm = make("box")

@@ -245,7 +245,8 @@ def loss_of(distribution: Any, value: Array, batch: Samples, config: Config, clo
     log_prob = distribution.log_prob(batch.action)
     advantage = standardised(batch.advantage, batch.valid) if config.normalize_advantage else batch.advantage
     clip = at(config.clip_range, clock.progress)
-    log_ratio = log_prob - batch.log_prob
+    # Padding may hold anything: a ratio that overflows there would turn the gradient to NaN, though it is not counted.
+    log_ratio = jnp.where(batch.valid, log_prob - batch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
     policy_loss = masked_mean(surrogate(ratio, advantage, clip), batch.valid)
     if config.clip_range_vf is not None:
