@@ -361,6 +361,16 @@ def test_two_updates_equal_numpy(name):
     assert 2 <= hand.n_updates < full if "early" in name else hand.n_updates == full
 
 
+def test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them():
+    """Stable-Baselines3 1.8.0 and 2.8.0 mended the count: a rollout of 8 steps would be worth 4 gradient steps."""
+    settings = {**SMALL, "learning_rate": 0.3, "target_kl": 0.01}
+    agent = rejeu.PPO("MlpPolicy", Noisy(), **settings).learn(32)
+    assert 0 < agent.n_updates == int(agent.state.n_updates) < 4 * 4
+    free = rejeu.PPO("MlpPolicy", Noisy(), **{**settings, "target_kl": 1e6}).learn(32)
+    assert free.n_updates == int(free.state.n_updates) == 4 * 4
+    assert free.statistics()["train/gradient_steps"] == 4
+
+
 def test_padding_leaks_into_no_update():
     space, _ = ACTIONS["box"]
     _, algorithm = make("box")

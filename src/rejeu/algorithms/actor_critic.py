@@ -168,6 +168,11 @@ class OnPolicyConfig:
         """Returns how many gradient steps a rollout of ``n`` steps is worth, if nothing stops them early."""
         return 1
 
+    @property
+    def stops_early(self) -> bool:
+        """Whether something may stop them; an update then says under ``gradient_steps`` how many it took."""
+        return False
+
 
 def check_flag(key: str, value: Any) -> None:
     """Raises ``TypeError`` unless ``value`` is True or False."""

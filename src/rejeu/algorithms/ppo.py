@@ -99,6 +99,11 @@ class Config(OnPolicyConfig):
         """Returns how many gradient steps a rollout of ``n`` steps is worth, if nothing stops them early."""
         return self.n_epochs * -(-n // self.batch_size)
 
+    @property
+    def stops_early(self) -> bool:
+        """Whether the policy's divergence may stop the epochs."""
+        return self.target_kl is not None
+
 
 class State(eqx.Module):
     """Everything that PPO learns, every leaf an array."""
@@ -164,16 +169,24 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             loss, state.network, state.optimizer, minibatch, config.n_epochs * n_batches, optimizer, config, clock
         )
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
-        return state, metrics_of(network, losses, data.value, data.target, data.valid, config, clock)
+        return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
     return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer_of(config, kind))
 
 
 def metrics_of(
-    network: Any, losses: Losses, value: Array, target: Array, valid: Array, config: Config, clock: Clock
+    network: Any,
+    n_steps: Array,
+    losses: Losses,
+    value: Array,
+    target: Array,
+    valid: Array,
+    config: Config,
+    clock: Clock,
 ) -> Metrics:
     """Returns what is reported of an update."""
     metrics = losses._asdict()
+    metrics["gradient_steps"] = n_steps.astype(jnp.float32)
     metrics["explained_variance"] = explained_variance(value, target, valid)
     metrics["learning_rate"] = jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32)
     if network.log_std is not None:

@@ -296,7 +296,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             clock,
         )
         state = State(network, optimizer_state, state.key, state.n_updates + n_taken, state.n_rollouts + 1)
-        return state, ppo.metrics_of(network, losses, data.value, data.target, data.valid, config, clock)
+        return state, ppo.metrics_of(network, n_taken, losses, data.value, data.target, data.valid, config, clock)
 
     return Algorithm(init, lambda state: state.network, explore, exploit, update, Explorer(begin, act), recall)
 

@@ -71,8 +71,9 @@ def on_policy(
         t4 = time.perf_counter()
         if is_done:
             clock = clock_of(run, progress(run.step - first))
-            run.n_updates += config.gradient_steps(rollout.size())
+            n_updates = config.gradient_steps(rollout.size())
             run.state, run.metrics, _ = compiled.update(run.state, rollout.rollout(), clock)
+            run.n_updates += int(run.metrics["gradient_steps"]) if config.stops_early else n_updates
             begin(run, config)
         t5 = time.perf_counter()
         run.seconds["env"] += (t2 - t1) + (t4 - t3)
