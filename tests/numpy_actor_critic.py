@@ -6,7 +6,7 @@ policy's, the value's, and where there is one a last layer of the log standard d
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -217,3 +217,36 @@ class RMSprop:
             for i, g in enumerate(slope):
                 v[i] = self.decay * v[i] + (1.0 - self.decay) * g**2
                 layer[i][...] = layer[i] - self.rate * g / np.sqrt(v[i] + self.eps)
+
+
+class A2C:
+    """A2C as its docstring has it; ``optimizers`` makes one or two that have all of a network between them."""
+
+    def __init__(self, network: Any, config: Any, kind: Any, optimizers: Callable[[Network], list[Any]]) -> None:
+        self.network, self.config, self.kind = Network(network), config, kind
+        self.optimizers = optimizers(self.network)
+
+    def update(self, rollout: Any, ent_coef: float) -> dict[str, float]:
+        """One gradient step on the valid steps of a rollout; returns the losses before it."""
+        network, config, keep = self.network, self.config, rollout.valid
+        advantage, value = (x[keep] for x in lambda_advantages(network, rollout, config.gae_lambda))
+        target = advantage + value
+        if config.normalize_advantage:
+            advantage = standard(advantage)
+        obs, action = rollout.obs[keep], rollout.action[keep]
+
+        def losses() -> dict[str, float]:
+            log_prob, entropy = log_prob_and_entropy(network, obs, action, self.kind)
+            parts = {
+                "policy_loss": -np.mean(log_prob * advantage),
+                "value_loss": np.mean((network.value(obs) - target) ** 2),
+                "entropy": np.mean(entropy),
+            }
+            total = parts["policy_loss"] + config.vf_coef * parts["value_loss"] - ent_coef * parts["entropy"]
+            return parts | {"total": total}
+
+        before = losses()
+        slopes = [gradient(optimizer.network, lambda: losses()["total"]) for optimizer in self.optimizers]
+        for optimizer, slope in zip(self.optimizers, slopes, strict=True):
+            optimizer.step(cut(slope, config.max_grad_norm))
+        return before

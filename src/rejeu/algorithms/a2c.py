@@ -7,7 +7,9 @@ value's targets ``R = A + V_old``::
     loss = -mean log pi(a | s) A + vf_coef mean (V(s) - R)^2 - ent_coef mean entropy(pi(. | s))
 
 By default advantages sum the rewards to the rollout's end and add the value there (``gae_lambda`` 1), and the optimizer is
-RMSprop, as in the paper.
+RMSprop, as in the paper. It is TensorFlow's: the mean ``v`` of squared gradients begins at 1, and a step is ``g / sqrt(v +
+rms_prop_eps)``. The first steps are short that way, where from 0 they would be ten times the learning rate for every weight;
+Stable-Baselines3, whose default is PyTorch's, names its ``RMSpropTFLike`` for steadier learning.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ RMSPROP_DECAY = 0.99
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """Hyper-parameters of A2C; the defaults are Stable-Baselines3's."""
+    """Hyper-parameters of A2C; the defaults are Stable-Baselines3's, but for the kind of RMSprop (see the top)."""
 
     learning_rate: float | Schedule = 7e-4
     """Step size of the optimizer; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
@@ -64,7 +66,8 @@ class Config(OnPolicyConfig):
     use_rms_prop: bool = True
     """Use RMSprop as the paper does; False uses Adam."""
     rms_prop_eps: float = 1e-5
-    """Added to the optimizer's denominator. Raising it shortens the steps of rarely used weights."""
+    """Added to RMSprop's mean of squared gradients before the root is taken, and to Adam's root itself. Raising it shortens
+    the steps of rarely used weights."""
 
     name: ClassVar[str] = "A2C"
 
