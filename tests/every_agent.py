@@ -17,7 +17,6 @@ import gymnasium as gym
 
 import rejeu
 from rejeu import agents, spaces
-from rejeu.config import OffPolicyConfig
 from rejeu.loops.compiled import Compiled
 from tests.probes.environments import Discretely, Probe
 
@@ -90,9 +89,9 @@ def shared_functions(kind: Kind) -> Iterator[None]:
     """Agents of this kind that are made or loaded within share their compiled functions."""
     make, settings = kind.agent.algorithm.make, []
 
-    def noted(config: OffPolicyConfig, observation_space: gym.Space, action_space: gym.Space) -> Any:
-        n_actions = int(action_space.n) if isinstance(action_space, gym.spaces.Discrete) else action_space.shape
-        settings.append((_of_gradients(config), spaces.leaves(observation_space), n_actions))
+    def noted(config: Any, observation_space: gym.Space, action_space: gym.Space) -> Any:
+        actions = action_space.shape if isinstance(action_space, gym.spaces.Box) else repr(action_space)
+        settings.append((_of_gradients(config), spaces.leaves(observation_space), actions))
         return make(config, observation_space, action_space)
 
     def compile_once(algorithm: Any, noise: Any) -> Compiled:
@@ -108,8 +107,9 @@ def shared_functions(kind: Kind) -> Iterator[None]:
         yield
 
 
-def _of_gradients(config: OffPolicyConfig) -> OffPolicyConfig:
-    """The configuration with all that only loop and replay buffer read at its default."""
-    read_elsewhere = ("learning_starts", "buffer_size", "gamma", "train_freq", "gradient_steps", "n_steps")
+def _of_gradients(config: Any) -> Any:
+    """The configuration with all that only loop and buffer read at its default."""
+    read_elsewhere = {"learning_starts", "buffer_size", "gamma", "train_freq", "gradient_steps", "n_steps"}
     defaults = type(config)()
-    return dataclasses.replace(config, **{key: getattr(defaults, key) for key in read_elsewhere})
+    names = read_elsewhere & {field.name for field in dataclasses.fields(config)}
+    return dataclasses.replace(config, **{key: getattr(defaults, key) for key in names})

@@ -88,6 +88,29 @@ class BySightAndAction(Probe):
         return 1.0 - 4.0 * (action - 1.0 - 0.5 * self.sign) ** 2
 
 
+class Cut(Probe):
+    """From -1 a step that earns nothing leads to 1, and there a step earns 1 and ends the episode.
+
+    The first step ends the episode too, ``truncated`` by a time limit or ``terminated``: -1 is worth gamma, or 0. New
+    episodes begin in either place, so that what follows a time limit is not what is seen after it.
+    """
+
+    def see(self) -> np.ndarray:
+        return np.float32([self.sign])
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        if self.sign > 0:
+            return self.see(), 1.0, True, False, {}
+        self.sign = 1.0
+        return self.see(), 0.0, self.ends == "terminated", self.ends == "truncated", {}
+
+
+class CutByLimit(Cut):
+    """By a time limit."""
+
+    ends = "truncated"
+
+
 class Discretely(gym.ActionWrapper):
     """A probe with the actions 1, 2 and 3, which stand for 0.5, 1 and 1.5: the best action is one of them."""
 
@@ -96,3 +119,23 @@ class Discretely(gym.ActionWrapper):
     def action(self, action: Any) -> np.ndarray:
         assert self.action_space.contains(action), action
         return np.float32([action / 2.0])
+
+
+class Doubly(gym.ActionWrapper):
+    """A probe with two choices between 1 and 2; together they stand for 0.5, 1 and 1.5."""
+
+    action_space = gym.spaces.MultiDiscrete([2, 2], start=[1, 1])
+
+    def action(self, action: Any) -> np.ndarray:
+        assert self.action_space.contains(action), action
+        return np.float32([(action.sum() - 1) / 2.0])
+
+
+class Bitwise(gym.ActionWrapper):
+    """A probe with two bits; together they stand for 0.5, 1 and 1.5."""
+
+    action_space = gym.spaces.MultiBinary(2)
+
+    def action(self, action: Any) -> np.ndarray:
+        assert self.action_space.contains(action), action
+        return np.float32([(action.sum() + 1) / 2.0])

@@ -1,0 +1,65 @@
+"""Small on-policy agents on every kind of action that they take, sharing what is compiled (see ``every_agent``)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import rejeu
+from rejeu import agents
+from rejeu.envs.vector import InProcess
+from tests.every_agent import shared_functions
+from tests.probes.environments import Bitwise, Discretely, Doubly, Probe
+
+
+class Kind(NamedTuple):
+    """An algorithm with one kind of action space."""
+
+    name: str
+    wrapper: type[gym.ActionWrapper] | None
+    """What gives a probe such actions; None leaves its Box."""
+    settings: dict[str, Any]
+
+    @property
+    def agent(self) -> type[agents.Agent]:
+        return agents.AGENTS[self.name]
+
+    def envs(self, probe: type[Probe], n_envs: int = 1) -> InProcess:
+        """So many of the probe with such actions."""
+        made = [probe() for _ in range(n_envs)]
+        return InProcess([one if self.wrapper is None else self.wrapper(one) for one in made])
+
+    def small(self, env: Any, **settings: Any) -> agents.Agent:
+        """A small agent of this kind."""
+        with shared_functions(self):
+            return self.agent("MlpPolicy", env, **{**LEARNING, **self.settings, **settings})
+
+    def load(self, path: Any, **settings: Any) -> agents.Agent:
+        """The agent of a file, sharing what is compiled."""
+        with shared_functions(self):
+            return rejeu.load(path, **settings)
+
+    def numbers(self, actions: np.ndarray) -> np.ndarray:
+        """What a batch of actions stands for in the probes, from 0 to 2."""
+        if self.wrapper is None:
+            return actions[:, 0]
+        made = self.wrapper(Probe())
+        return np.array([made.action(action)[0] for action in actions])
+
+
+LEARNING = {"learning_rate": rejeu.Linear(2e-2, 1e-3), "gamma": 0.5, "policy_kwargs": {"net_arch": [16]}, "seed": 0}
+ALGORITHMS = {
+    "PPO": {"n_steps": 16, "batch_size": 16, "n_epochs": 4},
+    "A2C": {"n_steps": 4, "learning_rate": rejeu.Linear(5e-2, 1e-2)},
+}
+ACTIONS = {"Box": None, "Discrete": Discretely, "MultiDiscrete": Doubly, "MultiBinary": Bitwise}
+NARROW = {"policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}}
+"""A Box policy that begins narrower finds its place sooner."""
+
+KINDS = {
+    f"{name}, {actions}": Kind(name, wrapper, settings | (NARROW if wrapper is None else {}))
+    for name, settings in ALGORITHMS.items()
+    for actions, wrapper in ACTIONS.items()
+}
