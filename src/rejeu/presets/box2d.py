@@ -17,7 +17,7 @@ PRESETS = (
         evaluate_episodes=32,
         backend="envpool",
         source="RL Baselines3 Zoo, hyperparams/ppo.yml",
-        result="",
+        result="mean return 265.4 over 5 seeds (95 % interval 258.6 to 272.3), 97 to 100 % of episodes at 200 or more",
     ),
     Preset(
         env_id="LunarLander-v3",

@@ -153,7 +153,7 @@ PRESETS = (
         evaluate_episodes=20,
         backend="envpool",
         source="RL Baselines3 Zoo, hyperparams/ppo.yml",
-        result="",
+        result="mean return 499.1 over 5 seeds (95 % interval 496.6 to 501.6; four of them 500), 100 episodes each",
     ),
     Preset(
         env_id="CartPole-v1",
@@ -165,7 +165,7 @@ PRESETS = (
         evaluate_episodes=20,
         backend="envpool",
         source="RL Baselines3 Zoo, hyperparams/a2c.yml",
-        result="",
+        result="mean return 500 on each of 5 seeds, 100 episodes each",
     ),
     Preset(
         env_id="rejeu/CartPoleNoVelocity-v0",
@@ -205,7 +205,7 @@ PRESETS = (
         evaluate_episodes=20,
         backend="envpool",
         source="RL Baselines3 Zoo, hyperparams/ppo.yml, without state-dependent noise",
-        result="",
+        result="mean return -183.4 over 5 seeds (95 % interval -204.7 to -162.0), 100 episodes each",
     ),
     Preset(
         env_id="MountainCar-v0",
@@ -224,6 +224,6 @@ PRESETS = (
         evaluate_episodes=20,
         backend="envpool",
         source="RL Baselines3 Zoo, hyperparams/ppo.yml",
-        result="",
+        result="mean return -113.7 over 5 seeds (95 % interval -124.7 to -102.8), 100 episodes each",
     ),
 )
