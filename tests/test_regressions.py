@@ -55,7 +55,8 @@ Numbers of environments
   ``test_qrdqn.py::test_target_network_moves_at_multiples_of_environment_steps``
 
 Not a number
-- batches of one (1.1.0, 1.6.1, PPO's): ``test_every_algorithm.py::test_batches_of_one_transition_are_learnt_from``
+- batches of one (1.1.0, 1.6.1, PPO's): ``test_every_algorithm.py::test_batches_of_one_transition_are_learnt_from``,
+  ``test_every_on_policy.py::test_one_step_at_a_time_is_learnt_from``
 - the checker of environments did not reset them (2.0.0): does not apply, there is none; a reward that is no number ends
   training: ``test_bad_input.py::test_a_reward_that_is_no_number_ends_training_with_its_place``
 - MaskablePPO's probabilities did not add up to 1 in float32 (2.8.0): does not apply, there is no MaskablePPO;
@@ -66,7 +67,7 @@ Dtypes
   ``test_every_algorithm.py::test_float64_actions_reach_the_environment_as_such_within_their_bounds``,
   ``test_every_algorithm.py::test_an_agent_of_float64_actions_goes_on_after_loading``
 - dtypes of Dict buffers (1.1.0): ``test_regressions.py::test_every_part_of_a_dict_observation_keeps_its_dtype_and_value``
-- rollout buffers forced float32 (2.7.1): does not apply, there are none
+- rollout buffers forced float32 (2.7.1): ``test_rollout.py::test_what_goes_into_the_buffer_comes_out``
 
 Files
 - models beyond 2 GB (1.6.0) and buffers beyond 4 GB (0.11.0):
@@ -90,7 +91,8 @@ Logging
   ``test_callbacks.py::test_evaluate_counts_environment_steps_whatever_the_number_of_environments``
 - names cut to the same length collided (1.5.0): ``test_regressions.py::test_long_names_that_begin_alike_are_all_logged``
 - steps per second divided by zero (1.6.1): ``test_regressions.py::test_a_clock_that_stands_still_does_not_end_a_run``
-- ``n_updates`` after an early stop (1.8.0, 2.8.0): PPO's does not apply;
+- ``n_updates`` after an early stop (1.8.0, 2.8.0):
+  ``test_ppo.py::test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them``,
   ``test_regressions.py::test_updates_are_counted_where_a_callback_stops``,
   ``test_every_algorithm.py::test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe``
 
