@@ -86,12 +86,19 @@ class Config(ppo.Config):
     def __post_init__(self) -> None:
         object.__setattr__(self, "policy_kwargs", nested("policy_kwargs", RecurrentConfig, self.policy_kwargs))
         ppo.Config.__post_init__(self)
+        if self.critic_learning_rate is not None:
+            raise ValueError("critic_learning_rate: policy and value read through one encoder here; leave it out")
         if self.use_sde:
             raise ValueError("use_sde: state-dependent noise is not for policies with a memory; leave it out")
         if self.n_episodes is not None:
             raise ValueError(
                 "n_episodes: a recurrent policy learns from rollouts of equal length; give n_steps and leave it out"
             )
+
+    @property
+    def stops_early(self) -> bool:
+        """Whether a rollout may be worth fewer gradient steps than :meth:`gradient_steps` says: minibatches are uneven."""
+        return True
 
     def steps_per_gradient(self, n_envs: int) -> int:
         """Returns how many steps of ``n_envs`` environments one gradient is taken on."""
