@@ -51,13 +51,14 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         obs, info = self.env.reset(seed=seed, options=options)
-        return {OBSERVATION: obs, MASK: self._mask(info)}, info
+        return {OBSERVATION: obs, MASK: self._mask(info, False)}, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return {OBSERVATION: obs, MASK: self._mask(info)}, reward, terminated, truncated, info
+        mask = self._mask(info, terminated or truncated)
+        return {OBSERVATION: obs, MASK: mask}, reward, terminated, truncated, info
 
-    def _mask(self, info: dict[str, Any]) -> np.ndarray:
+    def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
         if MASK in info:
             given = info[MASK]
         else:
@@ -76,7 +77,8 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
             raise BadEnvironmentError(
                 f"{describe(self.env)} gave a mask of {mask.size} entries, expected {self._n} for {self.action_space}"
             )
-        self._check_some_allowed(mask)
+        if not over:  # where an episode is over there may be nothing left to do, and nothing is done
+            self._check_some_allowed(mask)
         return mask
 
     def _check_some_allowed(self, mask: np.ndarray) -> None:
@@ -157,7 +159,7 @@ def make_masked(env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int 
     if isinstance(env, MaskedVector):
         return env
     if isinstance(env, InProcess):
-        return MaskedVector(InProcess([MaskInObservation(one) for one in env.envs], seed))
+        return MaskedVector(env.handed_on(MaskInObservation, seed))
     if isinstance(env, VectorEnv | gym.vector.VectorEnv):
         raise TypeError(
             f"the masks of {type(env).__name__} cannot be reached; give the id, the environment, or a function that makes "

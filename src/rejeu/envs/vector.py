@@ -244,6 +244,14 @@ class InProcess(VectorEnv):
         self._keys = flat_keys(structure(self.observation_space))
         self._obs = jax.tree.unflatten(structure(self.observation_space), stores)
 
+    def handed_on(self, wrap: Callable[[gym.Env], gym.Env], seed: int | None = None) -> InProcess:
+        """Returns the same environments wrapped, as another vector that is to be used in place of this one.
+
+        It takes over the seed of the first reset if that is still to come; ``seed`` is for where there is none.
+        """
+        seed, self._seed = seed if self._seed is None else self._seed, None
+        return InProcess([wrap(env) for env in self.envs], seed)
+
     def reset(self, seed: int | None = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
