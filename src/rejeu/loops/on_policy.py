@@ -108,6 +108,7 @@ def renewed(run: Run, step: Step, config: OnPolicyConfig, is_done: bool) -> PyTr
         return run.env.reset_done(run.ended) if run.ended.any() else step.obs
     if is_done:
         run.ended = np.ones(run.env.n_envs, bool)
+        run.episode_return[:], run.episode_length[:] = 0.0, 0  # of episodes that the update cut off
         return run.env.reset_done(run.ended)
     renew = run.ended & (run.playing > 0)
     return run.env.reset_done(renew) if renew.any() else step.obs
