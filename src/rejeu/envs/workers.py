@@ -9,11 +9,11 @@ from __future__ import annotations
 import ast
 import linecache
 import multiprocessing
-import pickle
 import signal
 import sys
 import traceback
 from collections.abc import Callable
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import gymnasium as gym
@@ -66,7 +66,7 @@ def start(make_one: Callable[[], gym.Env], one: gym.Env, n_envs: int) -> AsyncVe
 def check_sendable(make_one: Callable[[], gym.Env]) -> None:
     """Raises ``TypeError`` unless the function can be sent to another process."""
     try:
-        pickle.dumps(CloudpickleWrapper(make_one))
+        ForkingPickler.dumps(CloudpickleWrapper(make_one))
     except Exception as error:  # whatever the things that it refers to raise
         raise TypeError(
             f"the function that makes environments is sent to worker processes, and cannot be pickled: {error}; let it "
