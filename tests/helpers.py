@@ -60,7 +60,7 @@ def count_updates(agent: rejeu.SAC) -> list[int]:
     calls: list[int] = []
 
     def update(leaves: Any, batches: Any, clock: Any) -> tuple[Any, dict, None]:
-        calls.append(len(batches.reward))
+        calls.append(1 if batches.reward.ndim == 1 else len(batches.reward))
         return leaves, {}, None
 
     agent._compiled.update = update

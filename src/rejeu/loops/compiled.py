@@ -67,18 +67,15 @@ class Compiled:
             state: PackedState, vectors: list[Array], plan: Packing
         ) -> tuple[PackedState, Readings, Array | None]:
             batches, clock = plan.unpack(vectors)
-            if isinstance(batches, Rollout):
+            if isinstance(batches, Rollout) or batches.reward.ndim == 1:
                 after, metrics = algorithm.update(packing.unpack(state), batches, clock)
-                return packing.pack(after), Readings.of(metrics), None
-            after, metrics = jax.lax.scan(
-                lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
-            )
+            else:
+                after, metrics = jax.lax.scan(
+                    lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
+                )
             td_error = metrics.pop(TD_ERROR, None)
-            return (
-                packing.pack(after),
-                Readings.of(jax.tree.map(jnp.mean, metrics)),
-                None if batches.weight is None else td_error,
-            )
+            wanted = isinstance(batches, Transition) and batches.weight is not None
+            return packing.pack(after), Readings.of(jax.tree.map(jnp.mean, metrics)), td_error if wanted else None
 
         self.init = init
         """``init(key) -> state``, packed."""
@@ -116,10 +113,11 @@ class Compiled:
     def update(
         self, state: PackedState, batches: Transition | Rollout, clock: Clock
     ) -> tuple[PackedState, Readings, Array | None]:
-        """Takes one gradient step for each entry of the leading axis of ``batches``, in one scan; or learns a rollout.
+        """Takes a gradient step on a batch, or one on each of several in one scan, or learns a rollout.
 
-        Returns the packed state, whose predecessor is donated, the metrics, means over the steps, and the absolute TD
-        errors ``(steps, batch)``, which are None unless the batches are weighted.
+        ``batches`` has leaves ``(batch, ...)`` or ``(steps, batch, ...)``. Returns the packed state, whose predecessor is
+        donated, the metrics, means over the steps, and the absolute TD errors, shaped as the rewards are, which are None
+        unless the batches are weighted.
         """
         weighted = isinstance(batches, Transition) and batches.weight is not None
         return self._update(state, *self._update_packer((batches, clock), (batches.reward.shape, weighted)))

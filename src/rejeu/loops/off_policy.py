@@ -85,7 +85,8 @@ def off_policy(
         clock = clock_of(run, done)
         chosen = choose_or_draw(run, compiled, config, clock)
         t5 = time.perf_counter()
-        samples = [run.replay.sample(run.rng, (size, config.batch_size), done) for size in sizes]
+        shapes = [(config.batch_size,) if size == 1 else (size, config.batch_size) for size in sizes]
+        samples = [run.replay.sample(run.rng, shape, done) for shape in shapes]
         t6 = time.perf_counter()
         run.replay.reprioritise(run.td_errors)
         run.td_errors = []

@@ -109,6 +109,8 @@ def batch(
     if weight is not None:
         weight = shaped(weight)
         weight /= weight.max(axis=-1, keepdims=True)
+    if len(shape) == 1:
+        return Transition(ring.tree(obs), action, reward, ring.tree(next_obs), discount, weight)
     return Transition(
         ring.tree([shaped(leaf) for leaf in obs]),
         shaped(action),
