@@ -379,3 +379,29 @@ def test_environments_whose_masks_cannot_be_had_are_refused(env, error, message)
 def test_the_id_of_an_envpool_environment_is_made_where_its_masks_can_be_reached():
     with pytest.raises(BadEnvironmentError, match="CartPole-v1 says nowhere which actions are allowed"):
         small("CartPole-v1", n_steps=4).learn(4)
+
+
+# Who looks on.
+
+
+class Drawn(Rules):
+    """Can be filmed."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+def test_films_keep_to_the_masks(tmp_path):
+    agent = small(vector("multi"))
+    env = Drawn("multi")
+    rejeu.record_video(agent, tmp_path / "film.mp4", env, episodes=20, seed=0)
+    assert env.taken > 20
+
+
+def test_predict_takes_what_an_environment_with_its_mask_shows():
+    agent = small(vector("discrete"))
+    shown = {"observation": np.zeros(2, np.float32), "action_mask": np.array([0, 0, 0, 1, 0], np.int8)}
+    assert agent.predict(shown)[0] == 3

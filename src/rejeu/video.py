@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.config import number, whole
+from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
 from rejeu.envs.vector import InProcess
 from rejeu.errors import MissingExtra
@@ -72,7 +73,7 @@ def record_video(
     fps = None if fps is None else number("fps", fps, above=0)
     ffmpeg()
     given = isinstance(env, gym.Env)
-    playing = env if given else rendering_env(agent, env)
+    playing = shown_to(agent, env if given else rendering_env(agent, env))
     try:
         check_renders(playing)
         with VideoFile(path, natural_fps(playing) if fps is None else fps) as video:

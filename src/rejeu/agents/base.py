@@ -22,6 +22,7 @@ import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, spaces, summary
 from rejeu.envs.auto_reset import AutoResetView
+from rejeu.envs.masks import split
 from rejeu.envs.vector import Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
@@ -76,6 +77,8 @@ class Best(NamedTuple):
 class Agent(ABC):
     """What all agents share. Abstract: use SAC, PPO and their kin."""
 
+    takes_masks: ClassVar[bool] = False
+    """Whether it asks the environment which actions are allowed."""
     algorithm: ClassVar[ModuleType]
     """The module with ``Config`` and ``make``."""
 
@@ -402,6 +405,8 @@ class Agent(ABC):
         Raises:
             ValueError: if the observation or the mask does not have the space's structure or shape.
         """
+        if self.takes_masks:
+            observation, action_masks = split(observation, action_masks)
         batch, single = self._as_batch(observation)
         batch = self._with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])

@@ -26,8 +26,6 @@ class OnPolicyAgent(Agent):
     """What the agents share that learn from rollouts of their present policy. Abstract."""
 
     config: OnPolicyConfig
-    takes_masks: ClassVar[bool] = False
-    """Whether it asks the environment which actions are allowed."""
 
     def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)

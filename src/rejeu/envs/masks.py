@@ -7,7 +7,7 @@ choice of a MultiDiscrete space in a row, one for each bit of a MultiBinary spac
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,6 +141,18 @@ class MaskedVector(VectorEnv):
 def masked(obs: dict[str, Any]) -> Masked:
     """Returns what :class:`MaskInObservation` shows as an observation with its mask, ``bool (n_envs, n)``."""
     return Masked(obs[OBSERVATION], obs[MASK].astype(bool))
+
+
+def shown_to(agent: Any, env: gym.Env) -> gym.Env:
+    """Returns an environment as an agent is to see it: with its masks, if the agent takes any."""
+    return MaskInObservation(env) if getattr(agent, "takes_masks", False) else env
+
+
+def split(observation: Any, masks: Any) -> tuple[Any, Any]:
+    """Returns an observation and its mask, from what :class:`MaskInObservation` shows or from the two apart."""
+    if isinstance(observation, Mapping) and {*observation} == {OBSERVATION, MASK}:
+        return observation[OBSERVATION], observation[MASK] if masks is None else masks
+    return observation, masks
 
 
 def mask_leaf(action_space: spaces.Space, env_id: str) -> Leaf:

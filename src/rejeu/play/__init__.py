@@ -16,6 +16,7 @@ import numpy as np
 
 from rejeu.agents import Agent
 from rejeu.config import number, whole
+from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
 from rejeu.play.game import Act, Game, Pace, Player
 from rejeu.play.keys import KeyMap
@@ -66,7 +67,7 @@ def play(
         by_hand = Player("you", playing, lambda obs, held, step: keys_of_env.action(held, step))
         players = [by_hand]
         if against is not None:
-            rival = make_drawing(env_id)
+            rival = shown_to(against, make_drawing(env_id))
             stack.callback(rival.close)
             players.append(Player(_name(against), rival, _policy(against)))
         if record is not None:
@@ -102,7 +103,7 @@ def watch(
     env_id = full_name(env)
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing = make_drawing(env_id)
+        playing = shown_to(agent, make_drawing(env_id))
         stack.callback(playing.close)
         fps = natural_fps(playing) if fps is None else fps
         player = Player(_name(agent), playing, _policy(agent))
