@@ -387,7 +387,7 @@ def test_the_id_of_an_envpool_environment_is_made_where_its_masks_can_be_reached
 class Drawn(Rules):
     """Can be filmed."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     render_mode = "rgb_array"
 
     def render(self):
