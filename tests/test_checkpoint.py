@@ -387,3 +387,13 @@ def test_the_search_for_pickles_finds_them(tmp_path):
     sample = tmp_path / "sample.py"
     sample.write_text("import pickle\nfrom joblib import load\neval('1')\nnp.load('x', allow_pickle=True)\n")
     assert {"pickle", "joblib", "eval()", "allow_pickle"} <= set(calls_in(sample))
+
+
+def test_a_file_of_stable_baselines3_s_suffix_is_looked_for_under_ours(trained, tmp_path):
+    agent, _ = trained
+    path = agent.save(tmp_path / "model")
+    assert_same_parameters(rejeu.SAC.load(tmp_path / "model.zip"), agent)
+    path.rename(tmp_path / "model.zip")
+    assert_same_parameters(rejeu.SAC.load(tmp_path / "model.zip"), agent)
+    with pytest.raises(FileNotFoundError, match=r"other\.zip"):
+        rejeu.SAC.load(tmp_path / "other.zip")

@@ -21,6 +21,9 @@ from safetensors.numpy import save_file
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError
 
+SUFFIX = ".safetensors"
+FOREIGN = (".zip", ".pkl")
+"""Suffixes that Stable-Baselines3 gives its files; where a script asks for one, ours of that name is read."""
 SCHEMA = 1
 """Version of the header's layout; raised when it changes."""
 HEADER_KEY = "rejeu"
@@ -32,7 +35,7 @@ DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BO
 def resolve(path: str | Path) -> Path:
     """Returns the path with ``.safetensors`` added if it has no suffix, as Stable-Baselines3 adds ``.zip``."""
     path = Path(path)
-    return path if path.suffix else path.with_name(path.name + ".safetensors")
+    return path if path.suffix else path.with_name(path.name + SUFFIX)
 
 
 def write(path: str | Path, kind: str, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> Path:
@@ -60,13 +63,17 @@ def write(path: str | Path, kind: str, arrays: Mapping[str, np.ndarray], header:
 
 
 def read(path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Returns header and arrays of a file of that ``kind`` (``"agent"`` or ``"replay"``).
+    """Returns header and arrays of a file of that ``kind`` (``"agent"``, ``"replay"`` or ``"vec_normalize"``).
+
+    For ``model.zip``, where there is none, ``model.safetensors`` is read.
 
     Raises:
         FileNotFoundError: if there is no such file.
         CheckpointError: if it is not a complete rejeu file of that kind and schema.
     """
     path = resolve(path)
+    if path.suffix in FOREIGN and not path.exists() and path.with_suffix(SUFFIX).exists():
+        path = path.with_suffix(SUFFIX)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
     try:
