@@ -20,6 +20,7 @@ import numpy as np
 
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.config import whole
+from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.vector import InProcess, VectorEnv, make_vector
 from rejeu.evaluation import Evaluation
 from rejeu.loops.host import Episode, Progress
@@ -395,4 +396,6 @@ def _mean(values: Iterable[float]) -> float:
 
 def _identities(env: VectorEnv) -> set[int]:
     """Identifies the environments behind a vector, so that two vectors around the same ones are recognised."""
-    return {id(env), *(id(one) for one in env.envs)} if isinstance(env, InProcess) else {id(env)}
+    base = env.venv.unwrapped if env.venv is not None else env
+    inside = env.envs if isinstance(env, InProcess) else base.envs if isinstance(base, DummyVecEnv) else []
+    return {id(env), id(base), *map(id, inside)}

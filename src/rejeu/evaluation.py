@@ -110,7 +110,8 @@ def evaluate(
         done = step.terminated | step.truncated
         for i in np.flatnonzero(done).tolist():
             if played[i] < share[i]:
-                rows.append((total[i], length[i], env.judge(step, i, float(total[i]), success_threshold)))
+                value = step.return_of(i, total[i])
+                rows.append((value, length[i], env.judge(step, i, value, success_threshold)))
                 played[i] += 1
             total[i] = length[i] = 0
         obs = env.reset_done(done) if done.any() and len(rows) < episodes else step.obs
@@ -130,6 +131,9 @@ def evaluate_policy(
     warn: bool = True,
 ) -> tuple[float, float] | tuple[list[float], list[int]]:
     """Plays whole episodes and returns mean and standard deviation of the return, as Stable-Baselines3 does.
+
+    Where vector wrappers such as ``VecNormalize`` change rewards, the returns are those that a ``Monitor`` beneath them
+    counted, if there is one.
 
     Args:
         model: anything with ``predict(obs, state=..., episode_start=..., deterministic=...) -> (action, state)``.
@@ -174,7 +178,7 @@ def evaluate_policy(
                 callback(locals(), globals())
             if dones[i]:
                 if episode_counts[i] < share[i]:
-                    episode_rewards.append(float(current_rewards[i]))
+                    episode_rewards.append(step.return_of(i, current_rewards[i]))
                     episode_lengths.append(int(current_lengths[i]))
                     episode_counts[i] += 1
                 current_rewards[i] = current_lengths[i] = 0

@@ -21,6 +21,7 @@ import numpy as np
 from rejeu.config import number, whole
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
+from rejeu.envs.vec_env import VecEnvWrapper
 from rejeu.envs.vector import InProcess
 from rejeu.errors import MissingExtra
 
@@ -113,6 +114,11 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
     vector = agent.env
     if vector is None:
         raise ValueError("this agent has no environment; give one: record_video(agent, path, env='parking-v0')")
+    if isinstance(vector.venv, VecEnvWrapper):
+        raise ValueError(
+            f"the agent's own environments are wrapped in {type(vector.venv).__name__}, which a new one would lack; step "
+            "them in a VecVideoRecorder, or give env="
+        )
     spec = vector.envs[0].spec if isinstance(vector, InProcess) else None
     if spec is None and vector.env_id not in gym.registry and ":" not in vector.env_id:
         raise ValueError(

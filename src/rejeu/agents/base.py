@@ -21,9 +21,11 @@ import jax
 import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, spaces, summary
-from rejeu.envs.auto_reset import AutoResetView
+from rejeu.envs.auto_reset import AutoResetView, around
 from rejeu.envs.masks import split
-from rejeu.envs.vector import Backend, VectorEnv
+from rejeu.envs.vec_env import VecEnv
+from rejeu.envs.vec_normalize import VecNormalize, unwrap_vec_normalize
+from rejeu.envs.vector import Backend, InProcess, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
 from rejeu.exploration import explorer as exploration
@@ -272,6 +274,8 @@ class Agent(ABC):
         seconds = math.inf if minutes is None else 60 * configs.number("minutes", minutes, above=0)
         if reset_num_timesteps:
             self._steps_before = self._run.step
+            if self._run.env.venv is not None:  # may have been stepped by hand since
+                self._run.obs = self._run.action = None
         callbacks = [callback] if callable(callback) else list(callback or ())
         outputs = [*sinks, *([Console()] if self.verbose else [])]
         own_outputs: list[Sink] = []
@@ -503,22 +507,42 @@ class Agent(ABC):
         else:
             vector = self._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
         try:
+            self._check_scaled(vector)
             return evaluate(self._player(deterministic), vector, episodes, threshold)
         finally:
             if own:
                 self._run.obs = self._run.action = None
-            elif not isinstance(env, gym.Env | gym.vector.VectorEnv | VectorEnv):
+            elif env is None or isinstance(env, str) or callable(env):
                 vector.close()
 
-    def get_env(self) -> AutoResetView | None:
+    def _check_scaled(self, vector: VectorEnv) -> None:
+        """Raises ``ValueError`` if the agent learns from a ``VecNormalize`` and ``vector`` is none."""
+        has_statistics = vector.venv is not None and unwrap_vec_normalize(vector.venv) is not None
+        if self.get_vec_normalize_env() is not None and not has_statistics:
+            raise ValueError(
+                "this agent learns in a VecNormalize, so it must be evaluated in one that has the same statistics; wrap the "
+                "environment alike and use sync_envs_normalization, or let the agent scale: normalize=True"
+            )
+
+    def get_env(self) -> VecEnv | None:
         """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
 
-        The episodes that ran there are given up: the next ``learn`` begins new ones.
+        That is the vector environment it was given, if it was given one that resets itself; around a Gymnasium environment
+        it is a :class:`DummyVecEnv`. The episodes that ran there are given up: the next ``learn`` begins new ones.
         """
-        if self._run.env is None:
+        env = self._run.env
+        if env is None:
             return None
         self._run.obs = self._run.action = None
-        return AutoResetView(self._run.env)
+        if env.venv is None:
+            inside = env.envs if isinstance(env, InProcess) else []
+            env.venv = around(inside) if inside else AutoResetView(env)
+        return env.venv
+
+    def get_vec_normalize_env(self) -> VecNormalize | None:
+        """Returns the ``VecNormalize`` around the environments it trains on, or None."""
+        env = self._run.env
+        return None if env is None or env.venv is None else unwrap_vec_normalize(env.venv)
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Gives the agent another environment of the same spaces; its episodes start anew.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,12 @@ import jax
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
+from rejeu.envs.vec_env import Indices, StepResult, VecEnv, VecEnvWrapper, is_wrapped, tile
 from rejeu.envs.vector import VectorEnv
 from rejeu.video import VideoFile, check_renders, rgb_frame
 
-Indices = int | Iterable[int] | None
-"""Which environments: one, several, or None for all."""
 
-
-class DummyVecEnv:
+class DummyVecEnv(VecEnv):
     """Environments stepped one after the other in this process; an ended one is reset within the step that ended it.
 
     Observations are arrays with a leading axis ``num_envs``, nested as the observation space is; they, rewards
@@ -54,16 +52,9 @@ class DummyVecEnv:
         self.envs = [function() for function in env_fns]
         if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
             raise ValueError("two functions of env_fns returned the same environment; each must make a new one")
-        self.num_envs = len(self.envs)
-        self.observation_space = self.envs[0].observation_space
-        self.action_space = self.envs[0].action_space
-        self.metadata = self.envs[0].metadata
-        self.render_mode = self.envs[0].render_mode
-        self.reset_infos: list[dict[str, Any]] = [{} for _ in self.envs]
-        """What the last ``reset`` of each environment said."""
+        super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
+        self.metadata, self.render_mode = self.envs[0].metadata, self.envs[0].render_mode
         self._actions: Any = None
-        self._seeds: list[int | None] = [None] * self.num_envs
-        self._options: list[dict[str, Any] | None] = [None] * self.num_envs
 
     def reset(self) -> Any:
         """Resets every environment, with the seeds and options set before, and returns the observations."""
@@ -71,20 +62,9 @@ class DummyVecEnv:
         for i, env in enumerate(self.envs):
             obs, self.reset_infos[i] = env.reset(seed=self._seeds[i], options=self._options[i])
             parts.append(copy.deepcopy(obs))
-        self._seeds, self._options = [None] * self.num_envs, [None] * self.num_envs
+        self._reset_seeds()
+        self._reset_options()
         return self._stack(parts)
-
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Steps every environment and returns observations, rewards, dones and infos.
-
-        Where an episode ended, the observation is the next episode's first, and the info has the ended one's last under
-        ``terminal_observation``. Every info says under ``TimeLimit.truncated`` whether a time limit alone ended it.
-
-        Args:
-            actions: one for each environment, in the environment's own range.
-        """
-        self.step_async(actions)
-        return self.step_wait()
 
     def step_async(self, actions: Any) -> None:
         """Notes the actions of the next :meth:`step_wait`."""
@@ -92,7 +72,7 @@ class DummyVecEnv:
             raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
         self._actions = actions
 
-    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> StepResult:
         """Takes the step of :meth:`step_async` and returns what :meth:`step` does."""
         parts, infos = [], []
         rewards, dones = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
@@ -114,35 +94,10 @@ class DummyVecEnv:
         empty: Any = create_empty_array(space, self.num_envs)
         return concatenate(space, parts, empty)
 
-    def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seeds the next :meth:`reset`, each environment by one more than the one before; returns the seeds."""
-        first = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
-        self._seeds = [first + i for i in range(self.num_envs)]
-        return self._seeds
-
-    def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
-        """Sets the options of the next :meth:`reset`: one dict for all environments, or one for each."""
-        one_for_all = options is None or isinstance(options, dict)
-        each: list[Any] = [options] * self.num_envs if one_for_all else list(options or ())
-        self._options = copy.deepcopy(each)
-
     def close(self) -> None:
         """Closes every environment."""
         for env in self.envs:
             env.close()
-
-    def render(self, mode: str | None = None) -> np.ndarray | None:
-        """Returns all environments' pictures as one, ``uint8 (height, width, 3)``, or None if they show themselves.
-
-        Args:
-            mode: accepted if it is the mode that the environments were made with; None is that mode.
-        """
-        if mode is not None and mode != self.render_mode:
-            raise ValueError(f"render(mode={mode!r}): the environments were made with render_mode={self.render_mode!r}")
-        if self.render_mode == "human":
-            self.env_method("render")
-            return None
-        return tile(self.get_images())
 
     def get_images(self) -> list[np.ndarray]:
         """Returns the picture of each environment, ``uint8 (height, width, 3)``."""
@@ -174,36 +129,39 @@ class DummyVecEnv:
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
         """Returns for each environment whether a wrapper of that class is around it."""
-        return [_is_wrapped(env, wrapper_class) for env in self._chosen(indices)]
+        return [is_wrapped(env, wrapper_class) for env in self._chosen(indices)]
 
     def _chosen(self, indices: Indices) -> list[gym.Env]:
-        chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
-        return [self.envs[i] for i in chosen]
-
-    @property
-    def unwrapped(self) -> DummyVecEnv:
-        """Itself."""
-        return self
+        return [self.envs[i] for i in self._get_indices(indices)]
 
 
-class AutoResetView:
-    """An agent's own environments, stepped by hand as Stable-Baselines3's ``model.get_env()`` is.
+def around(envs: Sequence[gym.Env]) -> DummyVecEnv:
+    """Returns a vector environment of environments that are there already."""
+    remaining = iter(envs)
+    return DummyVecEnv([lambda: next(remaining)] * len(envs))
 
-    Stepping it ends the episodes that the agent was training in; its next ``learn`` begins new ones.
-    """
+
+class AutoResetView(VecEnv):
+    """Environments that are no Python objects of their own, such as EnvPool's, with automatic resets, to step by hand."""
 
     def __init__(self, vector: VectorEnv) -> None:
         self.vector = vector
-        self.num_envs = vector.n_envs
-        self.observation_space, self.action_space = vector.observation_space, vector.action_space
+        super().__init__(vector.n_envs, vector.observation_space, vector.action_space)
+        self._actions: Any = None
 
     def reset(self) -> Any:
         """Starts an episode in every environment and returns the observations ``(num_envs, ...)``."""
-        return jax.tree.map(np.copy, self.vector.reset())
+        seed = self._seeds[0]
+        self._reset_seeds()
+        return jax.tree.map(np.copy, self.vector.reset(seed))
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Steps every environment and returns observations, rewards, dones and infos, as :class:`DummyVecEnv` does."""
-        step = self.vector.step(np.asarray(actions))
+    def step_async(self, actions: Any) -> None:
+        """Notes the actions of the next :meth:`step_wait`."""
+        self._actions = np.asarray(actions)
+
+    def step_wait(self) -> StepResult:
+        """Takes the step of :meth:`step_async` and returns what :meth:`step` does."""
+        step = self.vector.step(self._actions)
         dones = step.terminated | step.truncated
         infos: list[dict[str, Any]] = []
         for i in range(self.num_envs):
@@ -222,8 +180,32 @@ class AutoResetView:
         """Releases the environments."""
         self.vector.close()
 
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Raises ``AttributeError``: there are no single environments to ask."""
+        raise AttributeError(self._out_of_reach(attr_name))
 
-class VecVideoRecorder:
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Raises ``AttributeError``, as :meth:`get_attr` does."""
+        raise AttributeError(self._out_of_reach(attr_name))
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Raises ``AttributeError``, as :meth:`get_attr` does."""
+        raise AttributeError(self._out_of_reach(method_name))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Returns False for each environment."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _out_of_reach(self, name: str) -> str:
+        return (
+            f"{name!r}: the single environments of {self.vector.env_id} on the backend {self.vector.backend} are out of "
+            "reach; give the agent gymnasium.make(id) or make_vec_env(id) instead of an id"
+        )
+
+
+class VecVideoRecorder(VecEnvWrapper):
     """Records what a vector environment looks like while it is stepped.
 
     A recording begins at a reset or step where the trigger says so, has the frame of that moment and one for each of
@@ -231,11 +213,8 @@ class VecVideoRecorder:
     if ``close`` or a further triggered ``reset`` ends it early. Several environments are shown side by side. Frames go
     to the file as they come.
 
-    Whatever else is asked of it, it hands on to ``venv``, except ``envs``: stepping those directly, as agents do, would
-    record nothing.
-
     Args:
-        venv: a :class:`DummyVecEnv` whose environments were made with ``render_mode="rgb_array"``, or another recorder.
+        venv: a vector environment whose environments were made with ``render_mode="rgb_array"``.
         video_folder: where the files go; made if missing.
         record_video_trigger: told the number of steps so far, says whether to begin a recording.
         video_length: steps in a recording.
@@ -248,14 +227,14 @@ class VecVideoRecorder:
 
     def __init__(
         self,
-        venv: DummyVecEnv | VecVideoRecorder,
+        venv: VecEnv,
         video_folder: str | Path,
         record_video_trigger: Callable[[int], bool],
         video_length: int = 200,
         name_prefix: str = "rl-video",
     ) -> None:
+        super().__init__(venv)
         check_renders(venv)
-        self.venv = venv
         self.video_folder = Path(video_folder).absolute()
         self.video_folder.mkdir(parents=True, exist_ok=True)
         self.record_video_trigger = record_video_trigger
@@ -280,12 +259,7 @@ class VecVideoRecorder:
             self._begin()
         return obs
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Steps the environments and returns observations, rewards, dones and infos."""
-        self.venv.step_async(actions)
-        return self.step_wait()
-
-    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> StepResult:
         """Takes the step noted by ``step_async`` and returns what :meth:`step` does."""
         result = self.venv.step_wait()
         self.step_id += 1
@@ -309,7 +283,7 @@ class VecVideoRecorder:
 
     def _capture(self, video: VideoFile) -> None:
         try:
-            video.write(tile(self.venv.get_images()))
+            video.write(tile([image for image in self.venv.get_images() if image is not None]))
         except BaseException:
             video.discard()
             self._video = None
@@ -321,24 +295,3 @@ class VecVideoRecorder:
         if self._video is not None:
             video, self._video = self._video, None
             video.close()
-
-    def __getattr__(self, name: str) -> Any:
-        if name in ("venv", "envs"):
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        return getattr(self.venv, name)
-
-
-def tile(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns pictures of one shape as one picture, in rows of a near-square grid; places left over are black."""
-    rows = math.ceil(math.sqrt(len(images)))
-    columns = math.ceil(len(images) / rows)
-    filled = [*images, *[np.zeros_like(images[0])] * (rows * columns - len(images))]
-    return np.concatenate([np.concatenate(filled[r * columns : (r + 1) * columns], axis=1) for r in range(rows)])
-
-
-def _is_wrapped(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> bool:
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, wrapper_class):
-            return True
-        env = env.env
-    return False

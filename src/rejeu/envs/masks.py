@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from rejeu.core import Masked
 from rejeu.envs.registry import maker
+from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vector import Backend, InProcess, Step, VectorEnv, make_vector
 from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
@@ -166,8 +167,8 @@ def make_masked(env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int 
     Raises:
         TypeError: for a vector environment whose single environments cannot be reached.
     """
-    behind = getattr(env, "vector", None)
-    env = behind if isinstance(behind, VectorEnv) else env
+    if isinstance(env, VecEnv):
+        env = make_vector(env, seed=seed)
     if isinstance(env, MaskedVector):
         return env
     if isinstance(env, InProcess):

@@ -20,6 +20,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from rejeu.envs import goals as goals_module, measuring, workers
 from rejeu.envs.registry import make_env, maker, provider, register, unknown_environment
+from rejeu.envs.vec_env import VecEnv
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, flat_keys, leaves, plain, structure
 
@@ -42,6 +43,14 @@ class Step(NamedTuple):
     """Whether a time limit ended the episode, ``bool (n_envs,)``."""
     info: Any
     """The backend's own info; read it with :meth:`VectorEnv.success`."""
+    returns: np.ndarray | None = None
+    """The return of each episode that ended, as a ``Monitor`` beneath wrappers that change rewards counted it, ``(n_envs,)``,
+    NaN elsewhere; None where the sum of the rewards is the return."""
+
+    def return_of(self, env: int, total: float) -> float:
+        """Returns the return of the episode that ended in environment ``env`` and whose rewards sum up to ``total``."""
+        counted = math.nan if self.returns is None else float(self.returns[env])
+        return float(total) if math.isnan(counted) else counted
 
 
 class Description(NamedTuple):
@@ -75,6 +84,8 @@ class VectorEnv(ABC):
     """The time limit, where it is known."""
     reward_threshold: float | None = None
     """The return at which the environment counts as solved, where it declares one."""
+    venv: VecEnv | None = None
+    """The vector environment with automatic resets that these are or came from, if there is one."""
     _obs: Any
     """The observations last returned."""
 
@@ -145,7 +156,7 @@ class VectorEnv(ABC):
 
 
 def make_vector(
-    env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv | VectorEnv,
+    env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv | VecEnv | VectorEnv,
     n_envs: int = 1,
     backend: Backend = "auto",
     seed: int | None = None,
@@ -155,7 +166,7 @@ def make_vector(
 
     Args:
         env: an id; a Gymnasium environment (then ``n_envs`` must be 1); a function that makes one; or a vector
-            environment, whose automatic resets are undone.
+            environment of Gymnasium's or Stable-Baselines3's kind, whose automatic resets are undone.
         n_envs: how many; ignored for vector environments.
         backend: ``"envpool"`` (C++ threads), ``"gymnasium"`` (in this process), ``"gymnasium-async"`` (one worker process
             each), or ``"auto"``: for an id the fastest, as measured when it was first asked for on this machine (see
@@ -179,9 +190,10 @@ def make_vector(
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
     if isinstance(env, VectorEnv):
         return env
-    behind = getattr(env, "vector", None)
-    if isinstance(behind, VectorEnv):
-        return behind
+    if isinstance(env, VecEnv):
+        from rejeu.envs.self_resetting import without_resets  # which imports this module
+
+        return without_resets(env, seed)
     if isinstance(env, gym.vector.VectorEnv):
         return GymnasiumVector(env, seed)
     if isinstance(env, gym.Env):
@@ -190,8 +202,6 @@ def make_vector(
                 f"n_envs={n_envs} needs an id or a function that makes an environment, not one environment"
             )
         return InProcess([env], seed)
-    if hasattr(env, "envs") and isinstance(env.envs, list):
-        return InProcess(env.envs, seed)
     if callable(env):
         if backend == "gymnasium-async":
             one = env()
@@ -226,12 +236,13 @@ class InProcess(VectorEnv):
 
     backend = "gymnasium"
 
-    def __init__(self, envs: Sequence[gym.Env], seed: int | None = None) -> None:
+    def __init__(self, envs: Sequence[gym.Env], seed: int | None = None, venv: VecEnv | None = None) -> None:
         if len({id(env) for env in envs}) < len(envs):
             raise ValueError(
                 "the same environment was given more than once; the function must make a new one each time"
             )
         self.envs = list(envs)
+        self.venv = venv
         self.n_envs = len(envs)
         self.observation_space = envs[0].observation_space
         self.action_space = envs[0].action_space

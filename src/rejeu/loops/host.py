@@ -154,16 +154,9 @@ def book(run: Run, step: Step, counts: np.ndarray | None, stepped: np.ndarray | 
     for env in np.flatnonzero(run.ended).tolist():
         if counts is None or counts[env]:
             run.episode += 1
-            episodes.append(
-                Episode(
-                    run.step,
-                    env,
-                    float(run.episode_return[env]),
-                    int(run.episode_length[env]),
-                    run.env.judge(step, env, float(run.episode_return[env]), run.success_threshold),
-                    run.seconds["total"],
-                )
-            )
+            value = step.return_of(env, run.episode_return[env])
+            success = run.env.judge(step, env, value, run.success_threshold)
+            episodes.append(Episode(run.step, env, value, int(run.episode_length[env]), success, run.seconds["total"]))
         run.episode_return[env] = 0.0
         run.episode_length[env] = 0
     return episodes
