@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+import numpy as np
 
 from rejeu.errors import MissingExtra
 
@@ -91,6 +93,101 @@ class TensorBoard:
     def close(self) -> None:
         self._writer.flush()
         self._writer.close()
+
+
+class Logger:
+    """Collects numbers by name until they are written: what callbacks add to the rows of a run.
+
+    Args:
+        folder: where its files lie, None for nowhere.
+        output_formats: sinks that take the rows, in place of console and TensorBoard.
+
+    >>> logger = Logger()
+    >>> logger.record("game/score", 3)
+    >>> logger.take()
+    {'game/score': 3}
+    """
+
+    def __init__(self, folder: str | Path | None = None, output_formats: Iterable[Sink] = ()) -> None:
+        self.dir = None if folder is None else str(folder)
+        self.outputs = list(output_formats)
+        self.name_to_value: dict[str, float] = {}
+        """What was recorded since the last row."""
+        self._counts: dict[str, int] = {}
+
+    def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+        """Adds a number to the next row, in place of one of that name.
+
+        Args:
+            key: its name, ``group/name``.
+            value: a number.
+            exclude: accepted and without effect: every place gets every number.
+
+        Raises:
+            TypeError: if it is no number.
+        """
+        self.name_to_value[key] = _number(key, value)
+
+    def record_mean(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+        """Does the same with the mean of what was given under that name since the last row; None is passed over."""
+        if value is None:
+            return
+        n = self._counts[key] = self._counts.get(key, 0) + 1
+        mean = self.name_to_value.get(key, 0.0)
+        self.name_to_value[key] = mean + (_number(key, value) - mean) / n
+
+    def take(self) -> dict[str, float]:
+        """Returns what was recorded, and forgets it."""
+        taken, self.name_to_value, self._counts = self.name_to_value, {}, {}
+        return taken
+
+    def dump(self, step: int = 0) -> None:
+        """Writes what was recorded as a row of its own, and forgets it."""
+        row = self.take()
+        for output in self.outputs if row else ():
+            output.write(step, row)
+
+    def get_dir(self) -> str | None:
+        """Returns where its files lie."""
+        return self.dir
+
+    def close(self) -> None:
+        """Finishes the outputs."""
+        for output in self.outputs:
+            output.close()
+
+
+def configure(folder: str | Path | None = None, format_strings: Sequence[str] | None = None) -> Logger:
+    """Returns a logger for ``agent.set_logger``.
+
+    Args:
+        folder: where the files go; None is the working folder.
+        format_strings: of ``"stdout"``, ``"csv"`` (``progress.csv``) and ``"tensorboard"``; None: ``"stdout"``.
+
+    Raises:
+        ValueError: for another format.
+    """
+    folder = Path("." if folder is None else folder)
+    outputs: list[Sink] = []
+    for kind in ["stdout"] if format_strings is None else format_strings:
+        if kind == "stdout":
+            outputs.append(Console())
+        elif kind == "csv":
+            outputs.append(CsvFile(folder / "progress.csv"))
+        elif kind == "tensorboard":
+            outputs.append(TensorBoard(folder))
+        else:
+            raise ValueError(f"format_strings has {kind!r}; there are 'stdout', 'csv' and 'tensorboard'")
+    return Logger(folder, outputs)
+
+
+def _number(key: str, value: Any) -> float:
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf" or array.size != 1:
+        raise TypeError(
+            f"record({key!r}) takes a number, got {type(value).__name__}; write other things to files of yours"
+        )
+    return array.item()
 
 
 def next_folder(root: str | Path, name: str) -> Path:

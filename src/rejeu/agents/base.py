@@ -31,8 +31,9 @@ from rejeu.evaluation import Evaluation, evaluate
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.history import History
+from rejeu.hooks import BaseCallback, told_apart
 from rejeu.interrupt import Interrupt
-from rejeu.logging import Console, Sink, TensorBoard, next_folder
+from rejeu.logging import Console, Logger, Sink, TensorBoard, next_folder
 from rejeu.loops import host
 from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.loops.host import Episode, Progress, Run
@@ -83,6 +84,8 @@ class Agent(ABC):
     """Whether it asks the environment which actions are allowed."""
     algorithm: ClassVar[ModuleType]
     """The module with ``Config`` and ``make``."""
+    _learning: bool = False
+    """Whether ``learn`` is under way."""
 
     def __init__(
         self,
@@ -116,6 +119,8 @@ class Agent(ABC):
         self.ep_success_buffer: deque[float] = deque(maxlen=self.stats_window_size)
         self.interrupted = False
         """Whether the last ``learn`` was ended by Ctrl-C."""
+        self.logger = Logger()
+        """Takes further numbers for the rows of statistics."""
         self.best: Best | None = None
         """The best weights so far, by smoothed training return or by evaluation."""
         self.steps_per_second = math.nan
@@ -234,7 +239,7 @@ class Agent(ABC):
     def learn(
         self,
         total_timesteps: int | None = None,
-        callback: Callback | Iterable[Callback] | None = None,
+        callback: Callback | BaseCallback | Iterable[Callback | BaseCallback] | None = None,
         log_interval: int = 4,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
@@ -250,6 +255,7 @@ class Agent(ABC):
             total_timesteps: environment steps to take, over all environments; exactly so many are taken. None with
                 ``episodes`` or ``minutes``.
             callback: called after every step as ``callback(agent, progress)``, or several; ``False`` stops training.
+                Objects with hooks as in Stable-Baselines3 are taken too, see :mod:`rejeu.hooks`.
             log_interval: episodes between two rows of statistics.
             tb_log_name: name of the run in ``tensorboard_log``; None: the algorithm's.
             reset_num_timesteps: start counting and log anew; learning itself goes on where it stood in either case.
@@ -276,12 +282,11 @@ class Agent(ABC):
             self._steps_before = self._run.step
             if self._run.env.venv is not None:  # may have been stepped by hand since
                 self._run.obs = self._run.action = None
-        callbacks = [callback] if callable(callback) else list(callback or ())
-        outputs = [*sinks, *([Console()] if self.verbose else [])]
-        own_outputs: list[Sink] = []
-        if self.tensorboard_log is not None:
+        hooks, callbacks = told_apart(callback)
+        loggers, own_outputs = self.logger.outputs, []
+        if not loggers and self.tensorboard_log is not None:
             own_outputs.append(TensorBoard(next_folder(self.tensorboard_log, tb_log_name or self.name)))
-        outputs += own_outputs
+        outputs: list[Sink] = [*sinks, *loggers, *([Console()] if self.verbose and not loggers else []), *own_outputs]
         bar = None
         if progress_bar:
             from rejeu.callbacks import ProgressBar
@@ -299,7 +304,9 @@ class Agent(ABC):
 
         self.interrupted = False
         self._run.success_threshold = self.success_threshold
+        self.logger.outputs, self._learning = outputs, True
         try:
+            hooks.begin(self, n_steps, {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps})
             with Interrupt() as interrupt:
                 for turn in self._turns(n_steps, progress):
                     elapsed = time.perf_counter() - began
@@ -308,12 +315,12 @@ class Agent(ABC):
                         self._record(episode)
                     if len(self.history) - logged >= log_interval and outputs:
                         logged = len(self.history)
-                        row = self.statistics()
+                        row = self.statistics() | self.logger.take()
                         for output in outputs:
                             output.write(self.num_timesteps, row)
                     if turn.episodes:
                         self._note_training_return()
-                    answers = [callback(self, turn) for callback in callbacks]
+                    answers = [*(callback(self, turn) for callback in callbacks), hooks.step(self, turn, self._run.obs)]
                     if any(isinstance(answer, bool | np.bool_) and not answer for answer in answers):
                         break
                     if elapsed >= seconds or self._run.episode - first_episode >= n_episodes:
@@ -321,7 +328,9 @@ class Agent(ABC):
                     if interrupt.requested:
                         self.interrupted = True
                         break
+            hooks.end()
         finally:
+            self.logger.outputs, self._learning = loggers, False
             if bar is not None:
                 bar.close()
             for output in own_outputs:
@@ -528,16 +537,22 @@ class Agent(ABC):
         """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
 
         That is the vector environment it was given, if it was given one that resets itself; around a Gymnasium environment
-        it is a :class:`DummyVecEnv`. The episodes that ran there are given up: the next ``learn`` begins new ones.
+        it is a :class:`DummyVecEnv`. The episodes that ran there are given up: the next ``learn`` begins new ones. While
+        it learns they are to be looked at only.
         """
         env = self._run.env
         if env is None:
             return None
-        self._run.obs = self._run.action = None
+        if not self._learning:
+            self._run.obs = self._run.action = None
         if env.venv is None:
             inside = env.envs if isinstance(env, InProcess) else []
             env.venv = around(inside) if inside else AutoResetView(env)
         return env.venv
+
+    def set_logger(self, logger: Logger) -> None:
+        """Lets rows of statistics go to the outputs of a logger, in place of console and TensorBoard."""
+        self.logger = logger
 
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """Returns the ``VecNormalize`` around the environments it trains on, or None."""
@@ -671,7 +686,7 @@ class Agent(ABC):
         agent.history = History()
         agent.ep_info_buffer, agent.ep_success_buffer = deque(maxlen=window), deque(maxlen=window)
         agent.interrupted, agent.steps_per_second = False, math.nan
-        agent.best = None
+        agent.best, agent.logger = None, Logger()
         agent._n_predictions, agent._own_env = 0, isinstance(env, str)
         compilation.enable_cache()
         try:

@@ -46,6 +46,14 @@ class Progress(NamedTuple):
     """Those that ended in this turn."""
     metrics: Mapping[str, Array] | None
     """Of the newest update, on the device: reading one waits for it. None before the first."""
+    action: np.ndarray | None = None
+    """The actions of this turn, in the environments' own range."""
+    result: Step | None = None
+    """What the environments answered. Where episodes ended, its observations may be those of the next ones already."""
+    last_obs: PyTree = None
+    """A copy of the observations before new episodes began, in turns that ended some; None in others."""
+    rollout_ended: bool = False
+    """Whether this turn was the last before an update, or would have been if learning had begun."""
 
 
 @dataclass
@@ -160,6 +168,11 @@ def book(run: Run, step: Step, counts: np.ndarray | None, stepped: np.ndarray | 
         run.episode_return[env] = 0.0
         run.episode_length[env] = 0
     return episodes
+
+
+def last_of(run: Run, step: Step) -> PyTree:
+    """Returns a copy of the observations of a step that ended episodes, which new ones may overwrite; else None."""
+    return jax.tree.map(np.copy, step.obs) if run.ended.any() else None
 
 
 def check_rewards(step: Step, env: VectorEnv, taken: int) -> None:

@@ -25,7 +25,7 @@ from jax import Array
 from rejeu.config import OffPolicyConfig
 from rejeu.core import Clock
 from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, restart
+from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, last_of, restart
 from rejeu.spaces import action_scaler, random_action
 
 
@@ -57,7 +57,8 @@ def off_policy(
         remaining = counted(run, n_envs, last)
         active = None if remaining is None else np.arange(remaining)
         t0 = time.perf_counter()
-        step = env.step(scale(run.action))
+        action = scale(run.action)
+        step = env.step(action)
         t1 = time.perf_counter()
         check_rewards(step, env, run.step)
         if compiled.observe is not None:
@@ -68,10 +69,8 @@ def off_policy(
         run.seconds["total"] = t1 - began
         episodes = book(run, step, None if active is None else np.arange(n_envs) < taken)
         t2 = time.perf_counter()
-        if run.ended.any():
-            run.obs = env.reset_done(run.ended)
-        else:
-            run.obs = step.obs
+        last_obs = last_of(run, step)
+        run.obs = step.obs if last_obs is None else env.reset_done(run.ended)
         t3 = time.perf_counter()
         if run.ended.any():
             run.replay.begin(run.obs, np.flatnonzero(run.ended))
@@ -101,7 +100,8 @@ def off_policy(
         run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)
         run.seconds["update"] += (t5 - t4) + (t7 - t6)
         run.seconds["total"] = t7 - began
-        yield Progress(run.step, episodes, run.metrics)
+        ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, taken, len(episodes)))
+        yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 
 
 def choose_or_draw(run: Run, compiled: Compiled, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
@@ -128,6 +128,15 @@ def due(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> int:
         return 0
     steps, run.steps_since_update = run.steps_since_update, 0
     return steps if config.gradient_steps == -1 else times * config.gradient_steps
+
+
+def reaches(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> bool:
+    """Returns whether a turn of ``taken`` steps, in which ``ended`` episodes ended, completes what ``train_freq`` asks for."""
+    if isinstance(config.train_freq, int):
+        count, passed, every = run.step, taken, config.train_freq
+    else:
+        count, passed, every = run.episode, ended, config.train_freq[0]
+    return count // every > (count - passed) // every
 
 
 def updates_per_turn(config: OffPolicyConfig, n_envs: int) -> int:

@@ -20,7 +20,7 @@ from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.core import PyTree
 from rejeu.envs.vector import Step
 from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, restart
+from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, last_of, restart
 from rejeu.spaces import action_scaler
 
 
@@ -53,7 +53,8 @@ def on_policy(
         rollout.observe(run.obs)
         t1 = time.perf_counter()
         stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
-        step = env.step(scale(run.action), stepped)
+        action = scale(run.action)
+        step = env.step(action, stepped)
         t2 = time.perf_counter()
         check_rewards(step, env, run.step)
         counts = which_count(run, stepped, last)
@@ -67,6 +68,7 @@ def on_policy(
             run.playing -= run.ended
         is_done = rollout.full or run.step == last or (config.n_episodes is not None and not run.playing.any())
         t3 = time.perf_counter()
+        last_obs = last_of(run, step)
         run.obs = renewed(run, step, config, is_done)
         t4 = time.perf_counter()
         if is_done:
@@ -80,7 +82,7 @@ def on_policy(
         run.seconds["replay"] += t3 - t2
         run.seconds["update"] += (t1 - t0) + (t5 - t4)
         run.seconds["total"] = t5 - began
-        yield Progress(run.step, episodes, run.metrics)
+        yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
 
 
 def begin(run: Run, config: OnPolicyConfig) -> None:
