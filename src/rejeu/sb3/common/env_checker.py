@@ -1,0 +1,5 @@
+"""Checking an environment."""
+
+from rejeu.envs.checker import check_env
+
+__all__ = ["check_env"]

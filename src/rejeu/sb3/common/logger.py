@@ -1,0 +1,5 @@
+"""Where numbers go."""
+
+from rejeu.logging import Logger, configure
+
+__all__ = ["Logger", "configure"]

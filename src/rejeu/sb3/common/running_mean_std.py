@@ -1,0 +1,5 @@
+"""Running moments."""
+
+from rejeu.envs.vec_normalize import RunningMeanStd
+
+__all__ = ["RunningMeanStd"]

@@ -1,0 +1,5 @@
+"""One of the vector environments."""
+
+from rejeu.envs.subproc import SubprocVecEnv
+
+__all__ = ["SubprocVecEnv"]

@@ -1,0 +1,5 @@
+"""Deep deterministic policy gradient."""
+
+from rejeu.agents import DDPG
+
+__all__ = ["DDPG"]

@@ -1,0 +1,5 @@
+"""Deep Q-learning."""
+
+from rejeu.agents import DQN
+
+__all__ = ["DQN"]

@@ -1,0 +1,6 @@
+"""Proximal policy optimisation."""
+
+from rejeu.agents import PPO
+from rejeu.sb3.common.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+
+__all__ = ["PPO", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"]

@@ -1,0 +1,5 @@
+"""Proximal policy optimisation."""
+
+from rejeu.agents import PPO
+
+__all__ = ["PPO"]

@@ -1,0 +1,5 @@
+"""Soft actor-critic."""
+
+from rejeu.agents import SAC
+
+__all__ = ["SAC"]
