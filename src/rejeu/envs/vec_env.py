@@ -297,7 +297,7 @@ def show(picture: np.ndarray) -> None:
     try:
         import pygame
     except ImportError:
-        raise MissingExtra("render('human')", "pygame", "parking") from None
+        raise MissingExtra("render('human')", "pygame-ce", "play") from None
     pygame.display.init()
     size = picture.shape[1], picture.shape[0]
     window = pygame.display.get_surface()
