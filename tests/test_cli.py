@@ -27,8 +27,15 @@ FILES = {
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=8", "buffer_size=5000", "learning_starts=50"]
 
 
-class Switches(gym.Env):
+class Words(gym.Env):
     """An environment whose actions nothing here takes."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Text(3)
+
+
+class Switches(gym.Env):
+    """An environment whose actions SAC does not take."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,))
     action_space = gym.spaces.MultiBinary(3)
@@ -50,6 +57,7 @@ class Broken(gym.Env):
         return np.zeros(2, np.float32), np.nan if self.steps == 120 else 1.0, False, self.steps % 50 == 0, {}
 
 
+gym.register("rejeu-test/Words-v0", Words)
 gym.register("rejeu-test/Switches-v0", Switches)
 gym.register("rejeu-test/Broken-v0", Broken)
 
@@ -252,7 +260,7 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "Pendulum-v1", "--steps", "5", "--minutes", "1"], "exclude each other"),
         (["train", "Pendulum-v1", "--steps", "0"], "--steps=0 must be"),
         (["train", "Pendulum-v1", "--seed", "-1"], "seed=-1 must be"),
-        (["train", "rejeu-test/Switches-v0"], "which no algorithm here takes"),
+        (["train", "rejeu-test/Words-v0"], "which no algorithm here takes"),
         (["train", "rejeu-test/Switches-v0", "--algo", "SAC"], "MultiBinary(3)"),
         (["evaluate", "no-such-run"], "no run folder or model file no-such-run"),
         (["record", "no-such-run"], "no run folder or model file no-such-run"),
