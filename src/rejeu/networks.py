@@ -274,10 +274,9 @@ class SimBa(eqx.Module):
     """A linear embedding, residual blocks and a final layer norm.
 
     Source: Lee et al. 2024, "SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement Learning" (arXiv
-    2410.09754). The paper's running normalisation of observations is left out: it is a state of its own, not learnt by
-    gradient. Nor is there a layer norm at the entrance, which would mix the units of unlike observations. Wrap the
-    environment with ``gymnasium.wrappers.NormalizeObservation`` if their scales differ much. Weights are drawn as in all
-    our layers rather than as the authors draw them.
+    2410.09754). The paper's running normalisation of observations is not part of it: give the agent ``normalize=True`` if
+    their scales differ much. Nor is there a layer norm at the entrance, which would mix the units of unlike observations.
+    Weights are drawn as in all our layers rather than as the authors draw them.
     """
 
     embedding: Linear

@@ -8,8 +8,8 @@ Policy Gradients", arXiv 2005.12729), ``clip(r / sqrt(variance + epsilon), -clip
 
 Moments are merged as in Chan, Golub and LeVeque 1983, "Algorithms for Computing the Sample Variance". Learners with a
 replay buffer take in every observation as it comes; what they draw later is scaled by the newest statistics. On-policy
-learners take in a rollout after they have learnt from it, so that the policy that is updated is exactly the one that
-acted; the first rollout, of whose scale nothing is known before, they take in at once.
+learners take in a rollout's observations after they have learnt from it, so that the policy that is updated is exactly the one
+that acted; its rewards, and all of the first rollout, of whose scale nothing is known before, they take in at once.
 """
 
 from __future__ import annotations
