@@ -6,6 +6,7 @@ raises a Python float to an int32 power, which JAX's strict mode forbids.
 
 from __future__ import annotations
 
+import gc
 import os
 import tempfile
 from collections.abc import Iterator
@@ -31,3 +32,11 @@ def strict_dtypes() -> Iterator[None]:
     """JAX raises wherever two dtypes meet; for tests of functions that hold no optimizer."""
     with jax.numpy_dtype_promotion("strict"):
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_functions_are_let_go() -> Iterator[None]:
+    """Every compiled function is a few mappings of memory, of which Linux allows a process 65,530; JAX keeps them all."""
+    yield
+    jax.clear_caches()
+    gc.collect()
