@@ -128,6 +128,8 @@ def both(env_id, n_envs=2, seed=0):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of what SWIG generates
             pytest.importorskip("Box2D")
+    if env_id.startswith("Fetch"):
+        pytest.importorskip("gymnasium_robotics", exc_type=ImportError)
     return make_vector(env_id, n_envs, "gymnasium", seed), make_vector(env_id, n_envs, "envpool", seed)
 
 
