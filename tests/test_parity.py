@@ -122,14 +122,18 @@ REPLAYED = {
 COMPARED = *REPLAYED, *LANDERS
 
 
+def skip_without_robotics(env_id):
+    if env_id.startswith("Fetch"):
+        pytest.importorskip("gymnasium_robotics", exc_type=ImportError)
+
+
 def both(env_id, n_envs=2, seed=0):
     """The environments on either side."""
     if env_id in LANDERS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of what SWIG generates
             pytest.importorskip("Box2D")
-    if env_id.startswith("Fetch"):
-        pytest.importorskip("gymnasium_robotics", exc_type=ImportError)
+    skip_without_robotics(env_id)
     return make_vector(env_id, n_envs, "gymnasium", seed), make_vector(env_id, n_envs, "envpool", seed)
 
 
@@ -192,6 +196,7 @@ def episodes_of_each_kind(vector, replayed, most=2):
 
 @pytest.mark.parametrize("env_id", REPLAYED)
 def test_episodes_of_envpool_replayed_in_gymnasium_go_the_same_way(env_id):
+    skip_without_robotics(env_id)
     replayed = REPLAYED[env_id]
     pool = make_vector(env_id, replayed.n_envs, "envpool", seed=0)
     gymnasium = make_vector(env_id, 1, "gymnasium", seed=0)
