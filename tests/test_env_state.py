@@ -1,0 +1,184 @@
+"""Environments whose state can be taken out and put back, and those where it cannot."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu import plain
+from rejeu.envs.state import carried, put_back, restore, state_of
+from rejeu.envs.vector import make_vector
+
+CARRIED = [
+    "CartPole-v1",
+    "MountainCar-v0",
+    "MountainCarContinuous-v0",
+    "Pendulum-v1",
+    "Acrobot-v1",
+    "rejeu/Ball-v0",
+    "rejeu/CartPoleNoVelocity-v0",
+]
+MUJOCO = ["HalfCheetah-v5", "Hopper-v5", "Reacher-v5"]
+has_mujoco = importlib.util.find_spec("mujoco") is not None
+
+
+def walk(env, actions):
+    """Steps an environment, beginning anew where an episode ends, and returns all that it said."""
+    said = []
+    for action in actions:
+        obs, reward, terminated, truncated, _ = env.step(action)
+        said.append((np.copy(obs), reward, terminated, truncated))
+        if terminated or truncated:
+            said.append(np.copy(env.reset()[0]))
+    return said
+
+
+def assert_goes_on_alike(make, n_before=13, n_after=300):
+    one, two = make(), make()
+    one.action_space.seed(1)
+    actions = [one.action_space.sample() for _ in range(n_before + n_after)]
+    one.reset(seed=4)
+    walk(one, actions[:n_before])
+    arrays = {}
+    text = json.dumps(plain.encode(state_of(one), arrays, "env"), allow_nan=False)
+    expected = walk(one, actions[n_before:])
+    restore(two, plain.decode(json.loads(text), arrays))
+    np.testing.assert_equal(walk(two, actions[n_before:]), expected)
+    for env in (one, two):
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", CARRIED)
+def test_environments_go_on_alike(env_id):
+    assert_goes_on_alike(lambda: gym.make(env_id))
+
+
+@pytest.mark.skipif(not has_mujoco, reason="MuJoCo is not installed")
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_mujoco_goes_on_alike(env_id):
+    assert_goes_on_alike(lambda: gym.make(env_id), n_after=80)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        rejeu.Monitor,
+        gym.wrappers.RecordEpisodeStatistics,
+        lambda env: gym.wrappers.RescaleAction(env, -1, 1),
+        lambda env: gym.wrappers.TransformReward(env, lambda r: 2 * r),
+        lambda env: gym.wrappers.TimeLimit(env, 50),
+        gym.wrappers.ClipAction,
+        gym.wrappers.FlattenObservation,
+    ],
+)
+def test_wrappers_are_carried(wrap):
+    assert_goes_on_alike(lambda: wrap(gym.make("Pendulum-v1")))
+
+
+def test_monitors_count_on():
+    one, two = (rejeu.Monitor(gym.make("CartPole-v1")) for _ in range(2))
+    one.reset(seed=0)
+    walk(one, [1, 0, 1])
+    restore(two, state_of(one))
+    assert two.get_total_steps() == 3
+    while not (step := two.step(1))[2]:
+        pass
+    assert step[4]["episode"]["l"] == two.get_total_steps()
+
+
+def test_an_environment_that_has_not_begun_can_be_carried():
+    env = gym.make("Pendulum-v1")
+    restore(env, state_of(gym.make("Pendulum-v1")))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(1))
+
+
+class Remembering(gym.Wrapper):
+    """Remembers something, and does not say so."""
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Remembering(gym.make("Pendulum-v1")),
+        lambda: gym.wrappers.NormalizeObservation(gym.make("Pendulum-v1")),
+        lambda: gym.make("FrozenLake-v1"),
+    ],
+)
+def test_what_is_not_known_is_not_carried(make):
+    env = make()
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_box2d_cannot_be_carried():
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # of what SWIG generates, and it crashes where they are errors
+        pytest.importorskip("Box2D")
+    env = gym.make("LunarLander-v3")
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_an_heir_of_a_known_environment_is_not_taken_for_it():
+    class Heir(gym.envs.classic_control.PendulumEnv):
+        """Might remember more."""
+
+    env = Heir()
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_envpool_cannot_be_carried():
+    vector = make_vector("CartPole-v1", 2, "envpool", seed=0)
+    vector.reset()
+    assert carried(vector) is None
+    with pytest.raises(ValueError, match="do not fit 2 environments of the envpool backend"):
+        put_back(vector, [[], []], np.zeros((2, 4), np.float32))
+
+
+def test_the_state_of_another_environment_is_refused():
+    pendulum, cart = gym.make("Pendulum-v1"), gym.make("CartPole-v1")
+    pendulum.reset(seed=0)
+    with pytest.raises(ValueError, match="expected"):
+        restore(cart, state_of(pendulum))
+    with pytest.raises(ValueError, match="another environment"):
+        restore(pendulum, state_of(pendulum)[:-1])
+    with pytest.raises(ValueError, match="another environment"):
+        restore(pendulum, [*state_of(pendulum), {}])
+
+
+def test_the_state_taken_out_does_not_move_with_the_environment():
+    env = gym.make("CartPole-v1")
+    env.reset(seed=0)
+    state = state_of(env)
+    before = json.dumps(plain.encode(state, arrays := {}, "x")), {k: v.copy() for k, v in arrays.items()}
+    walk(env, [0, 1] * 30)
+    after = json.dumps(plain.encode(state, arrays := {}, "x")), arrays
+    np.testing.assert_equal(after, before)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_vectors_are_carried_whole(n_envs):
+    def make():
+        return make_vector("CartPole-v1", n_envs, "gymnasium", seed=2)
+
+    one, two = make(), make()
+    obs = one.reset()
+    for _ in range(5):
+        obs = one.step(np.ones(n_envs, int)).obs
+    put_back(two, carried(one), obs)
+    only_first = np.arange(n_envs) == 0
+    for active in (only_first, None):
+        first, second = one.step(np.zeros(n_envs, int), active), two.step(np.zeros(n_envs, int), active)
+        np.testing.assert_array_equal(first.obs, second.obs)
+    done = np.ones(n_envs, bool)
+    np.testing.assert_array_equal(one.reset_done(done), two.reset_done(done))
