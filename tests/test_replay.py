@@ -193,3 +193,36 @@ def test_a_damaged_file_of_a_buffer_changes_nothing(arrays, damage, words):
         replay.restore(arrays)
     for name, array in replay.arrays().items():
         np.testing.assert_array_equal(array, before[name])
+
+
+@settings(max_examples=150)
+@given(case=histories(), cuts=st.lists(st.integers(0, 40), max_size=4), priorities=st.booleans())
+def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
+    n_envs, rows, history = case
+    replay, parts, heads = None, [], np.full(n_envs, -1, np.int64)
+    for cut in sorted({min(cut, len(history)) for cut in (*cuts, len(history))}):
+        replay, _ = filled(n_envs, rows, history[:cut], priorities=priorities)  # the same up to there, whatever follows
+        parts.append({key: np.copy(value) for key, value in replay.ring.rows_since(heads).items()})
+        heads = replay.ring.head.copy()
+    other = make_ring(rows * n_envs, n_envs)
+    other.put_rows(parts)
+    expected, found = replay.ring.arrays(), other.arrays()
+    kept = [replay.ring.index(np.full(k, e), replay.ring.head[e] - np.arange(k)) for e, k in enumerate(counts(replay))]
+    for key in expected:
+        if key in ("head", "n_steps"):
+            np.testing.assert_array_equal(found[key], expected[key])
+    for store, own in zip((*other.obs, other.records), (*replay.ring.obs, replay.ring.records), strict=True):
+        np.testing.assert_array_equal(store[np.concatenate(kept)], own[np.concatenate(kept)])
+    if priorities:
+        again = Priorities(other, PriorityConfig())
+        again.restore(replay.priorities.state())
+        np.testing.assert_array_equal(again.tree.nodes, replay.priorities.tree.nodes)
+        if len(replay.ring):
+            one, two = (p.draw(np.random.default_rng(0), 5, 0.5) for p in (again, replay.priorities))
+            np.testing.assert_array_equal(one[0], two[0])
+            np.testing.assert_array_equal(one[1], two[1])
+
+
+def counts(replay):
+    """The rows kept of each environment."""
+    return np.minimum(replay.ring.head + 1, replay.ring.rows).tolist()

@@ -282,7 +282,6 @@ def test_a_new_rollout_has_nothing_of_the_one_before_in_it():
     assert_holds(rollout, steps)
     np.testing.assert_array_equal(rollout.valid, np.arange(4)[:, None] < np.full(3, 2))
     np.testing.assert_array_equal(rollout.started, [True, False, True])
-    assert len(buffer.rollout(3).reward) == len(buffer.rollout(3).obs) == 3
 
 
 def test_only_the_steps_of_active_environments_count():
@@ -294,7 +293,7 @@ def test_only_the_steps_of_active_environments_count():
     buffer.observe(batch_of(space, 3))
     buffer.add(np.zeros((3, 2)), np.zeros(3), none, none, batch_of(space, 3), valid=np.array([True, True, False]))
     assert (buffer.length, buffer.size()) == (2, 5)
-    np.testing.assert_array_equal(buffer.rollout(2).valid, [[True] * 3, [True, True, False]])
+    np.testing.assert_array_equal(buffer.rollout().valid[:2], [[True] * 3, [True, True, False]])
 
 
 def test_an_environment_may_write_to_what_it_returned_without_changing_what_is_kept():
@@ -315,6 +314,12 @@ def test_an_environment_may_write_to_what_it_returned_without_changing_what_is_k
     np.testing.assert_array_equal(rollout.action[:, 0, 0], [0.0, 1.0, 2.0, 3.0])
 
 
+def steps_of(buffer, n):
+    """The leaves of the first n steps of a rollout."""
+    rollout = buffer.rollout()
+    return [leaf[:n] for leaf in jax.tree.leaves(rollout._replace(started=()))]
+
+
 @pytest.mark.parametrize("kind", OBSERVATIONS)
 def test_arrays_put_back_give_the_same_rollout(kind):
     space = OBSERVATIONS[kind]
@@ -326,7 +331,7 @@ def test_arrays_put_back_give_the_same_rollout(kind):
     assert {len(array) for array in arrays.values()} == {3}
     other.restore(arrays)
     assert (other.length, other.size(), other.full) == (3, 9, False)
-    for one, two in zip(jax.tree.leaves(buffer.rollout(3)), jax.tree.leaves(other.rollout(3)), strict=True):
+    for one, two in zip(steps_of(buffer, 3), steps_of(other, 3), strict=True):
         np.testing.assert_array_equal(one, two)
     assert not other.rollout().valid[3].any()
 

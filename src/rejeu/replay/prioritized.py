@@ -9,7 +9,7 @@ the largest priority so far.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +62,16 @@ class SumTree:
         for _ in range(self.n_leaves.bit_length() - 1):
             node = node >> 1
             self.nodes[node] = self.nodes[2 * node] + self.nodes[2 * node + 1]
+
+    def fill(self, values: np.ndarray) -> None:
+        """Puts ``values`` ``(n,)`` at the positions from 0 on, and 0 at the others."""
+        self.nodes[:] = 0.0
+        self.nodes[self.n_leaves : self.n_leaves + len(values)] = values
+        first = self.n_leaves
+        while first > 1:
+            half = first // 2
+            self.nodes[half:first] = self.nodes[first : 2 * first : 2] + self.nodes[first + 1 : 2 * first : 2]
+            first = half
 
     def find(self, mass: np.ndarray) -> np.ndarray:
         """Returns for each ``mass`` in [0, total) the position where the running sum first exceeds it, ``int64 (n,)``."""
@@ -125,15 +135,46 @@ class Priorities:
                 self.tree.set(index[kept], priority[kept])
             self.largest = max(self.largest, float(priority.max()))
 
-    def restore(self) -> None:
-        """Gives every step of the ring the largest priority: they are learnt anew within one pass over the buffer."""
-        ring = self.ring
+    def state(self) -> dict[str, Any]:
+        """Returns everything, for :meth:`restore`."""
+        n = self.ring.rows * self.ring.n_envs
+        drawn = [list(draw) for draw in self._drawn]
+        return {"values": self.tree[np.arange(n)], "largest": self.largest, "drawn": drawn}
+
+    def restore(self, state: Mapping[str, Any] | None = None) -> None:
+        """Puts back what :meth:`state` returned, or gives every step of the ring the largest priority.
+
+        Raises:
+            KeyError, ValueError: if the state is damaged, or of another ring.
+        """
+        if state is not None:
+            values, drawn = state["values"], [(index, time) for index, time in state["drawn"]]
+            steps = self._step_positions()
+            within = all(
+                i.dtype == t.dtype == np.int64 and i.shape == t.shape and ((i >= 0) & (i < len(values))).all()
+                for i, t in drawn
+            )
+            if values.shape != (self.ring.rows * self.ring.n_envs,) or values.dtype != np.float64 or not within:
+                raise ValueError("the priorities are of another replay buffer")
+            if not np.isfinite(values).all() or not np.array_equal(np.flatnonzero(values > 0), np.sort(steps)):
+                raise ValueError("the priorities do not belong to the steps of this replay buffer")
+            self.tree.fill(values)
+            self.largest = float(state["largest"])
+            self._drawn = deque(drawn)
+            return
         nowhere = np.zeros(0, np.int64)
         self._drawn = deque((nowhere, nowhere) for _ in self._drawn)
-        self.tree = SumTree(ring.rows * ring.n_envs)
+        self.tree = SumTree(self.ring.rows * self.ring.n_envs)
+        steps = self._step_positions()
+        if len(steps):
+            self.tree.set(steps, self.largest)
+
+    def _step_positions(self) -> np.ndarray:
+        """Returns the positions of the ring that hold steps, environment after environment."""
+        ring = self.ring
+        found = []
         for env in range(ring.n_envs):
             times = np.arange(ring.oldest()[env], ring.head[env])
             index = ring.index(np.full(len(times), env), times)
-            steps = index[ring.kind[index] != LAST]
-            if len(steps):
-                self.tree.set(steps, self.largest)
+            found.append(index[ring.kind[index] != LAST])
+        return np.concatenate(found)

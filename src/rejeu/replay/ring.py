@@ -90,6 +90,8 @@ class Ring:
         self._newest = self.base
         """Positions of the newest rows, by environment."""
         self.all_envs = np.arange(n_envs)
+        self.version = 0
+        """Rises when rows were replaced otherwise than by being written in turn."""
         self._keys = flat_keys(obs_structure)
         self._names = [f"obs.{i}" for i in range(len(obs_leaves))]
 
@@ -287,8 +289,81 @@ class Ring:
             raise ValueError("the replay file's counters are damaged")
         for name, array in own.items():
             array.reshape(self.n_envs, self.rows, *array.shape[1:])[:, :used] = arrays[name]
-        self.head, self.n_steps = head.copy(), n_steps.copy()
+        self._stand(head.copy(), n_steps.copy())
+
+    def rows_since(self, heads: np.ndarray) -> dict[str, np.ndarray]:
+        """Returns the rows from those that were the newest at ``heads`` on, ``(n, ...)``, environment after environment.
+
+        The row at a head is among them: its action and reward came later. With ``-1`` for every head these are all rows.
+        ``until_end`` is left out; it follows from ``kind``.
+        """
+        first = np.maximum(heads, self.oldest())
+        spans = [np.arange(first[env], self.head[env] + 1) for env in range(self.n_envs)]
+        index = np.concatenate([self.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
+        rows = {f"obs.{leaf.path or 'array'}": a[index] for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
+        rows |= {name: getattr(self, name)[index] for name in ("action", "reward", "kind", "since_start")}
+        return rows | {"first": first, "head": self.head.copy()}
+
+    def put_rows(self, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Puts back what :meth:`rows_since` returned in turn, each beginning where the one before ended, or earlier.
+
+        Raises:
+            ValueError: if they are of another ring, or something between them is missing; the ring is then empty.
+        """
+        self._stand(np.full(self.n_envs, -1, np.int64), np.zeros(self.n_envs, np.int64))
+        own = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
+        own |= {name: getattr(self, name) for name in ("action", "reward", "kind", "since_start")}
+        known = newest = self.head
+        for rows in parts:
+            if {*rows} != {*own, "first", "head"}:
+                raise ValueError(
+                    f"rows of the replay buffer hold {sorted(rows)}, expected {sorted({*own, 'first', 'head'})}"
+                )
+            first, head = rows["first"], rows["head"]
+            good = all(a.shape == (self.n_envs,) and a.dtype == np.int64 for a in (first, head))
+            if not good or not ((head >= first - 1) & (head - first < self.rows) & (first >= 0) & (head < 2**62)).all():
+                raise ValueError("rows of the replay buffer have damaged counters")
+            n = int((head - first + 1).sum())
+            for name, array in own.items():
+                if rows[name].shape != (n, *array.shape[1:]) or rows[name].dtype != array.dtype:
+                    raise ValueError(
+                        f"{name} in rows of the replay buffer is {rows[name].dtype}{list(rows[name].shape)}, expected "
+                        f"{array.dtype}{[n, *array.shape[1:]]}; it was saved with another environment or buffer_size"
+                    )
+            spans = [np.arange(first[env], head[env] + 1) for env in range(self.n_envs)]
+            index = np.concatenate([self.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
+            for name, array in own.items():
+                array[index] = rows[name]
+            known, newest = np.where(first > newest, first, np.minimum(known, first)), head
+        self._stand(newest.copy(), self._follow(known, newest))
+
+    def _follow(self, known: np.ndarray, head: np.ndarray) -> np.ndarray:
+        """Writes ``until_end`` anew from ``kind`` and returns the steps kept, for rows from the times ``known`` on.
+
+        Raises:
+            ValueError: if older rows should be there, or the counters do not agree.
+        """
+        n_steps = np.zeros(self.n_envs, np.int64)
+        for env in range(self.n_envs):
+            if head[env] < 0:
+                continue
+            oldest = max(int(head[env]) - self.rows + 1, 0)
+            times = np.arange(oldest, head[env] + 1)
+            index = int(self.base[env]) + times % self.rows
+            kind, since_start = self.kind[index], self.since_start[index]
+            if known[env] > oldest or kind.max() > LAST or not ((since_start >= 0) & (since_start <= times)).all():
+                raise ValueError("rows of the replay buffer are missing or damaged")
+            ends = times[kind == LAST]
+            where = np.searchsorted(ends, times)
+            last = np.append(ends, 0)[where]
+            self.until_end[index] = np.where(where < len(ends), last - times, 0)
+            n_steps[env] = np.count_nonzero(kind[:-1] != LAST)
+        return n_steps
+
+    def _stand(self, head: np.ndarray, n_steps: np.ndarray) -> None:
+        self.head, self.n_steps = head, n_steps
         self._newest = self.base + self.head % self.rows
+        self.version += 1
 
     def _consistent(
         self, head: np.ndarray, n_steps: np.ndarray, kind: np.ndarray, since_start: np.ndarray, until_end: np.ndarray

@@ -37,7 +37,7 @@ class RolloutBuffer:
     ) -> None:
         """Reserves ``n_steps`` steps of each environment."""
         self.n_steps, self.n_envs, self.gamma = n_steps, n_envs, gamma
-        self.obs_structure = obs_structure
+        self.obs_leaves, self.obs_structure = obs_leaves, obs_structure
         shape = (n_steps, n_envs)
         make = lambda: [np.zeros((*shape, *leaf.shape), leaf.dtype) for leaf in obs_leaves]  # noqa: E731
         self.obs, self.next_obs = make(), make()
@@ -103,20 +103,23 @@ class RolloutBuffer:
         self.running_return[t] = running_return
         self.length += 1
 
-    def rollout(self, n_steps: int | None = None) -> Rollout:
-        """Returns what is kept, padded to ``n_steps`` (None: all that was reserved); views, so use them before adding."""
-        n = self.n_steps if n_steps is None else n_steps
+    def cut(self) -> None:
+        """Ends the episodes that run where they stand, without a terminal state: they cannot be gone on with."""
+        self.ended[self.length - 1] = True
+
+    def rollout(self) -> Rollout:
+        """Returns what is kept, padded to all that was reserved; views, so use them before adding."""
         self.valid[self.length :] = False
-        tree = lambda stores: jax.tree.unflatten(self.obs_structure, [store[:n] for store in stores])  # noqa: E731
+        tree = lambda stores: jax.tree.unflatten(self.obs_structure, stores)  # noqa: E731
         return Rollout(
             tree(self.obs),
-            self.action[:n],
-            self.reward[:n],
+            self.action,
+            self.reward,
             tree(self.next_obs),
-            self.discount[:n],
-            self.ended[:n],
-            self.valid[:n],
-            self.running_return[:n],
+            self.discount,
+            self.ended,
+            self.valid,
+            self.running_return,
             self.started,
             self.carry,
         )
