@@ -11,7 +11,7 @@ from rich.console import Console
 
 import rejeu
 from rejeu import callbacks
-from rejeu.callbacks import Checkpoint, Evaluate, Film, ProgressBar, better, crossed, stop_on_return, stop_on_success
+from rejeu.callbacks import Evaluate, Film, ProgressBar, better, crossed, stop_on_return, stop_on_success
 from rejeu.evaluation import Evaluation
 from rejeu.history import History
 from rejeu.loops.host import Episode, Progress
@@ -36,7 +36,7 @@ def scripted_agent(evaluations):
     remaining = deque(evaluations)
     saved = []
     agent = SimpleNamespace(env=None, n_envs=1, saved=saved, save=saved.append, remember_best=lambda score, by: True)
-    agent.evaluate = lambda episodes, env: remaining.popleft()
+    agent.evaluate = lambda episodes, env, seed: remaining.popleft()
     return agent
 
 
@@ -102,12 +102,6 @@ def test_the_saved_best_model_acts_as_the_agent_did_then(tmp_path):
     obs = np.array([1.0, 0.0, 0.5], np.float32)
     loaded = rejeu.load(tmp_path / "best.safetensors")
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
-
-
-def test_checkpoint_saves_every_so_many_steps_and_one_replay_buffer(tmp_path):
-    pendulum(2).learn(41, Checkpoint(20, tmp_path, replay_buffer=True))
-    names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["agent_20.safetensors", "agent_40.safetensors", "replay_buffer.safetensors"]
 
 
 def test_crossed_sees_a_multiple_that_a_step_jumps_over():

@@ -11,14 +11,14 @@ import importlib.util
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from rejeu.agents.off_policy import OffPolicyAgent
+from rejeu.agents.checkpoints import Checkpoint as Checkpoint
 from rejeu.config import whole
 from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.vector import InProcess, VectorEnv, make_vector
@@ -34,6 +34,8 @@ REFRESH_SECONDS = 0.125
 """Least time between two refreshes of the progress bar on a terminal."""
 LINE_SECONDS = 10.0
 """Least time between two lines of progress where the output is no terminal."""
+EVALUATION = 0x4556
+"""Sets the random numbers of evaluations apart from all others."""
 RATE_SECONDS = 10.0
 """Stretch over which the shown steps per second are measured."""
 
@@ -75,7 +77,7 @@ class Evaluate:
             every: environment steps between two evaluations.
             episodes: of each evaluation.
             best_path: where the best model so far is saved, replacing the one before it; None for nowhere.
-            seed: of the environments that are made here; None draws one.
+            seed: with the number of steps taken, of the environments at each evaluation; None takes the agent's.
             report: called with each result and whether it is the best so far.
         """
         self.every = whole("every", every, least=1)
@@ -88,6 +90,7 @@ class Evaluate:
         """The best so far: by success rate, then by mean return."""
         self._made_here = isinstance(env, str) or callable(env)
         self.env = make_vector(env, min(self.episodes, 16) if self._made_here else 1, seed=seed)
+        self.seed = seed
         self._last_step: int | None = None
 
     def __call__(self, agent: Agent, progress: Progress) -> None:
@@ -105,7 +108,9 @@ class Evaluate:
         """
         if agent.env is not None and _identities(agent.env) & _identities(self.env):
             raise ValueError("Evaluate was given the environments that the agent trains on; give it others, or an id")
-        result = Evaluated(step, agent.evaluate(self.episodes, env=self.env))
+        root = agent.seed if self.seed is None else self.seed
+        seed = int(np.random.SeedSequence([root, step, EVALUATION]).generate_state(1)[0])
+        result = Evaluated(step, agent.evaluate(self.episodes, env=self.env, seed=seed))
         self.results.append(result)
         is_best = self.best is None or better(result.evaluation, self.best.evaluation)
         if is_best:
@@ -117,35 +122,20 @@ class Evaluate:
             self.report(result, is_best)
         return result
 
+    def state_dict(self) -> dict[str, Any]:
+        """Returns every result so far, as plain data for a checkpoint."""
+        rows = [(r.step, r.evaluation.returns, r.evaluation.lengths, r.evaluation.successes) for r in self.results]
+        return {"results": rows, "best": None if self.best is None else self.results.index(self.best)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes back what :meth:`state_dict` returned."""
+        self.results = [Evaluated(int(step), Evaluation(*arrays)) for step, *arrays in state["results"]]
+        self.best = None if state["best"] is None else self.results[state["best"]]
+
     def close(self) -> None:
         """Releases the environments, unless they were given ready-made."""
         if self._made_here:
             self.env.close()
-
-
-class Checkpoint:
-    """Saves the agent to ``folder/agent_<step>.safetensors`` every so many steps, and the replay buffer if asked.
-
-    The buffer is large, so only the newest is kept, as ``folder/replay_buffer.safetensors``; it belongs to the newest
-    agent.
-    """
-
-    def __init__(self, every: int, folder: str | Path, replay_buffer: bool = False) -> None:
-        self.every = whole("every", every, least=1)
-        self.folder = Path(folder)
-        self.replay_buffer = replay_buffer
-        self._last_step: int | None = None
-
-    def __call__(self, agent: Agent, progress: Progress) -> None:
-        """Saves if a checkpoint has fallen due in this step."""
-        before = step_before(agent, progress) if self._last_step is None else self._last_step
-        self._last_step = progress.step
-        if crossed(before, progress.step, self.every):
-            agent.save(self.folder / f"agent_{progress.step}.safetensors")
-            if self.replay_buffer:
-                if not isinstance(agent, OffPolicyAgent):
-                    raise TypeError(f"Checkpoint(replay_buffer=True): {agent.name} has none; leave replay_buffer out")
-                agent.save_replay_buffer(self.folder / "replay_buffer.safetensors")
 
 
 class Film:
@@ -209,6 +199,15 @@ class Film:
 
             path = self.folder / f"step_{progress.step}.mp4"
             self.paths.append(record_video(agent, path, self.env, self.episodes, self.max_steps, self.seed))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns what it counts, as plain data for a checkpoint."""
+        return {"n_episodes": self._n_episodes, "paths": [str(path) for path in self.paths]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes back what :meth:`state_dict` returned."""
+        self._n_episodes = int(state["n_episodes"])
+        self.paths = [Path(path) for path in state["paths"]]
 
 
 def stop_on_return(threshold: float, episodes: int = 100) -> Callback:

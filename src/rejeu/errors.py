@@ -20,3 +20,7 @@ class BadEnvironmentError(RuntimeError):
 
 class WorkerError(RuntimeError):
     """A worker process failed; the message holds the traceback from there, where there is one."""
+
+
+class RunInUseError(RuntimeError):
+    """Another process is training in the folder of a run."""

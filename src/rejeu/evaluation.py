@@ -83,6 +83,7 @@ def evaluate(
     env: VectorEnv,
     episodes: int,
     success_threshold: float | None = None,
+    seed: int | None = None,
 ) -> Evaluation:
     """Plays ``episodes`` whole episodes and returns what they came to.
 
@@ -95,6 +96,7 @@ def evaluate(
         episodes: at least 1.
         success_threshold: return from which on an episode counts as a success where the environment does not say; None
             takes the environment's reward threshold.
+        seed: of the environments' reset; None lets their random numbers go on.
     """
     if episodes < 1:
         raise ValueError(f"episodes={episodes} must be at least 1")
@@ -102,7 +104,7 @@ def evaluate(
     played = np.zeros(env.n_envs, int)
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
     rows: list[tuple[float, int, float]] = []
-    obs, done = env.reset(), np.ones(env.n_envs, bool)
+    obs, done = env.reset(seed), np.ones(env.n_envs, bool)
     while len(rows) < episodes:
         step = env.step(scale_action(env.action_space, policy(obs, done)))
         total += step.reward

@@ -13,9 +13,9 @@ called.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -51,6 +51,10 @@ class BaseCallback(ABC):
     model: Agent
     """The agent."""
 
+    carried: ClassVar[tuple[str, ...]] = ("n_calls",)
+    """Names of the attributes that a checkpoint of the run keeps: numbers, texts, lists, dicts and arrays. An heir that
+    remembers more adds to them."""
+
     def __init__(self, verbose: int = 0) -> None:
         self.verbose = verbose
         self.n_calls = 0
@@ -74,6 +78,15 @@ class BaseCallback(ABC):
     def logger(self) -> Logger:
         """Takes numbers for the next row of statistics: ``self.logger.record("group/name", value)``."""
         return self.model.logger
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns what ``carried`` names, for a checkpoint."""
+        return {name: getattr(self, name) for name in self.carried}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes back what :meth:`state_dict` returned."""
+        for name in self.carried:
+            setattr(self, name, state[name])
 
     def init_callback(self, model: Agent) -> None:
         """Tells it the agent."""
@@ -159,6 +172,19 @@ class EventCallback(BaseCallback):
         if self.callback is not None:
             self.callback.init_callback(model)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Returns what it and what it calls remember."""
+        return {"self": super().state_dict(), "inside": [child.state_dict() for child in self._inside()]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes that back."""
+        super().load_state_dict(state["self"])
+        for child, part in zip(self._inside(), state["inside"], strict=True):
+            child.load_state_dict(part)
+
+    def _inside(self) -> list[BaseCallback]:
+        return [] if self.callback is None else [self.callback]
+
     def update_child_locals(self, locals_: dict[str, Any]) -> None:
         """Tells what it calls what the loop knows."""
         if self.callback is not None:
@@ -182,6 +208,24 @@ class CallbackList(BaseCallback):
     def __init__(self, callbacks: Iterable[BaseCallback | Callable[..., Any]]) -> None:
         super().__init__()
         self.callbacks = [hooked(callback) for callback in callbacks]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns what each remembers, by kind and place."""
+        parts = [[type(callback).__name__, callback.state_dict()] for callback in self.callbacks]
+        return {"self": super().state_dict(), "inside": parts}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes that back.
+
+        Raises:
+            ValueError: if these are other callbacks.
+        """
+        super().load_state_dict(state["self"])
+        own, saved = [type(callback).__name__ for callback in self.callbacks], [name for name, _ in state["inside"]]
+        if own != saved:
+            raise ValueError(f"the run was saved with the callbacks {', '.join(saved)}, and is given {', '.join(own)}")
+        for callback, (_, part) in zip(self.callbacks, state["inside"], strict=True):
+            callback.load_state_dict(part)
 
     def update_child_locals(self, locals_: dict[str, Any]) -> None:
         """Tells each what the loop knows."""
@@ -301,6 +345,16 @@ class EvalCallback(EventCallback):
         TypeError: if ``eval_env`` is no environment.
     """
 
+    carried: ClassVar[tuple[str, ...]] = (
+        *BaseCallback.carried,
+        "best_mean_reward",
+        "last_mean_reward",
+        "evaluations_timesteps",
+        "evaluations_results",
+        "evaluations_length",
+        "evaluations_successes",
+    )
+
     def __init__(
         self,
         eval_env: gym.Env | VecEnv,
@@ -335,6 +389,9 @@ class EvalCallback(EventCallback):
         self.evaluations_length: list[list[int]] = []
         self.evaluations_successes: list[list[bool]] = []
         self._successes: list[bool] = []
+
+    def _inside(self) -> list[BaseCallback]:
+        return super()._inside() + ([] if self.callback_on_new_best is None else [self.callback_on_new_best])
 
     def init_callback(self, model: Agent) -> None:
         """Tells it the agent.
@@ -457,6 +514,8 @@ class StopTrainingOnNoModelImprovement(BaseCallback):
         verbose: 1 says so.
     """
 
+    carried: ClassVar[tuple[str, ...]] = (*BaseCallback.carried, "last_best_mean_reward", "no_improvement_evals")
+
     def __init__(self, max_no_improvement_evals: int, min_evals: int = 0, verbose: int = 0) -> None:
         super().__init__(verbose)
         self.max_no_improvement_evals, self.min_evals = max_no_improvement_evals, min_evals
@@ -482,6 +541,8 @@ class StopTrainingOnMaxEpisodes(BaseCallback):
         verbose: 1 says so.
     """
 
+    carried: ClassVar[tuple[str, ...]] = (*BaseCallback.carried, "n_episodes")
+
     def __init__(self, max_episodes: int, verbose: int = 0) -> None:
         super().__init__(verbose)
         self.max_episodes = whole("max_episodes", max_episodes, least=1)
@@ -502,6 +563,8 @@ class EveryNTimesteps(EventCallback):
         n_steps: environment steps, over all environments.
         callback: what is called; a function takes ``(locals, globals)``.
     """
+
+    carried: ClassVar[tuple[str, ...]] = (*EventCallback.carried, "last_time_trigger")
 
     def __init__(self, n_steps: int, callback: BaseCallback | Callable[..., Any]) -> None:
         super().__init__(callback)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import inspect
 import math
-import time
+import secrets
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
@@ -21,17 +22,20 @@ import jax
 import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, spaces, summary
+from rejeu.agents import checkpoints, files
+from rejeu.agents.call import Call
+from rejeu.agents.checkpoints import Checkpoint, Resumed, RowFiles
+from rejeu.agents.files import AGENT_ARGUMENTS, whole_seed
 from rejeu.envs.auto_reset import AutoResetView, around
 from rejeu.envs.masks import split
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vec_normalize import VecNormalize, unwrap_vec_normalize
 from rejeu.envs.vector import Backend, InProcess, VectorEnv
-from rejeu.errors import CheckpointError
 from rejeu.evaluation import Evaluation, evaluate
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.history import History
-from rejeu.hooks import BaseCallback, told_apart
+from rejeu.hooks import BaseCallback, Hooks, told_apart
 from rejeu.interrupt import Interrupt
 from rejeu.logging import Console, Logger, Sink, TensorBoard, next_folder
 from rejeu.loops import host
@@ -44,22 +48,6 @@ Callback = Callable[["Agent", Progress], bool | None]
 
 POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
 
-AGENT_ARGUMENTS = {
-    "policy": "``MlpPolicy``, ``MultiInputPolicy`` (Dict observations) or ``CnnPolicy`` (images). All three build what "
-    "the observation space needs; a name that does not fit the space is an error.",
-    "env": "An id, a Gymnasium environment, a function that makes one, or a vector environment.",
-    "seed": "Seeds everything: networks, exploration, batches and environments. None draws one.",
-    "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
-    "tensorboard_log": "Folder for TensorBoard logs, None for none.",
-    "stats_window_size": "Episodes over which reported means are taken.",
-    "success_threshold": "Return from which on an episode counts as a success where the environment does not say; None: "
-    "the environment's own reward threshold, if it has one.",
-    "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
-}
-
-
-COUNTERS = ("step", "steps_before", "episode", "n_updates")
-"""What a model file counts; all below 2^32."""
 BEST_WINDOW = 20
 """Training episodes over whose mean return the best weights are judged."""
 
@@ -104,35 +92,61 @@ class Agent(ABC):
         for key in hyperparameters:
             if key not in known:
                 raise TypeError(configs.unknown_name(key, known, self.name))
-        self.config: Any = self.algorithm.Config(**hyperparameters)
-        self.policy = policy
-        self.seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed)
-        self.verbose = verbose
-        self.tensorboard_log = tensorboard_log
-        self.stats_window_size = configs.whole("stats_window_size", stats_window_size, least=1)
-        self.success_threshold = (
-            None if success_threshold is None else configs.number("success_threshold", success_threshold)
+        self._set_up(
+            policy,
+            self.algorithm.Config(**hyperparameters),
+            int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed),
+            verbose,
+            tensorboard_log,
+            configs.whole("stats_window_size", stats_window_size, least=1),
+            None if success_threshold is None else configs.number("success_threshold", success_threshold),
         )
+        self._own_env = isinstance(env, str)
+        vector = self._vector(env, 1, seed=self.seed)
+        self._check_policy(policy, vector.observation_space)
+        self._build(vector.observation_space, vector.action_space, vector.n_envs)
+        self._start(vector)
+
+    def _set_up(
+        self,
+        policy: str,
+        config: Any,
+        seed: int,
+        verbose: int,
+        tensorboard_log: str | Path | None,
+        stats_window_size: int,
+        success_threshold: float | None,
+    ) -> None:
+        """Sets everything that does not depend on the environment."""
+        self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
+        self.tensorboard_log = tensorboard_log
+        self.stats_window_size, self.success_threshold = stats_window_size, success_threshold
         self.history = History()
-        self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=self.stats_window_size)
+        self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=stats_window_size)
         """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
-        self.ep_success_buffer: deque[float] = deque(maxlen=self.stats_window_size)
+        self.ep_success_buffer: deque[float] = deque(maxlen=stats_window_size)
         self.interrupted = False
-        """Whether the last ``learn`` was ended by Ctrl-C."""
+        """Whether the last ``learn`` was ended by Ctrl-C or SIGTERM."""
+        self.interrupted_by: int | None = None
+        """The number of that signal."""
         self.logger = Logger()
         """Takes further numbers for the rows of statistics."""
         self.best: Best | None = None
         """The best weights so far, by smoothed training return or by evaluation."""
         self.steps_per_second = math.nan
         """Environment steps per second of the present or last ``learn``."""
+        self.resumed: Resumed | None = None
+        """Where :meth:`resume` took up the run; None for an agent that began here or was loaded."""
+        self._run_id = secrets.token_hex(8)
+        self._rows: dict[Path, RowFiles] = {}
+        self._call: Call | None = None
+        self._callbacks: list[Any] = []
+        self._saved_callbacks: list[Any] | None = None
         self._steps_before = 0
         self._n_predictions = 0
-        self._own_env = isinstance(env, str)
+        self._own_env = False
+        """Whether the environment was given by its id."""
         compilation.enable_cache()
-        vector = self._vector(env, 1, seed=self.seed)
-        self._check_policy(policy, vector.observation_space)
-        self._build(vector.observation_space, vector.action_space, vector.n_envs)
-        self._start(vector)
 
     def _build(self, observation_space: gym.Space, action_space: gym.Space, n_envs: int) -> None:
         """Compiles the algorithm for these spaces."""
@@ -160,7 +174,7 @@ class Agent(ABC):
         self._run: Run = host.initial_run(env, self._make_buffer(env), self._compiled, self._learn_from(0), self.seed)
 
     @abstractmethod
-    def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+    def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         """Returns environments as this agent needs them, from what :func:`make_vector` takes."""
 
     @abstractmethod
@@ -264,7 +278,10 @@ class Agent(ABC):
             minutes: stop after so much wall time. Schedules follow whichever limit is nearest.
             sinks: further places for the rows of statistics, such as ``rejeu.logging.CsvFile(path)``.
 
-        Ctrl-C ends training after the step it is in, with everything consistent; ``interrupted`` is then True.
+        Without any limit, an agent from :meth:`resume` goes on with the ``learn`` that was cut off, to its end; arguments
+        that count steps and rows are then those of that call.
+
+        Ctrl-C and SIGTERM end training after the step it is in, with everything consistent; ``interrupted`` is then True.
 
         Raises:
             ValueError: without an environment, or if no limit is given.
@@ -273,17 +290,30 @@ class Agent(ABC):
             raise ValueError(
                 "this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)"
             )
-        if total_timesteps is None and minutes is None and episodes is None:
-            raise ValueError("learn needs total_timesteps, episodes or minutes")
-        n_episodes = math.inf if episodes is None else configs.whole("episodes", episodes, least=1)
-        n_steps = None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1)
-        seconds = math.inf if minutes is None else 60 * configs.number("minutes", minutes, above=0)
-        if reset_num_timesteps:
-            self._steps_before = self._run.step
-            if self._run.env.venv is not None:  # may have been stepped by hand since
-                self._run.obs = self._run.action = None
+        goes_on = total_timesteps is None and minutes is None and episodes is None
+        if goes_on:
+            call = self._call_to_go_on_with()
+        else:
+            call = Call(
+                n_steps=None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1),
+                n_episodes=None if episodes is None else configs.whole("episodes", episodes, least=1),
+                seconds=None if minutes is None else 60 * configs.number("minutes", minutes, above=0),
+                first_step=self._run.step,
+                first_episode=self._run.episode,
+                log_interval=log_interval,
+                logged=len(self.history),
+            )
+            if reset_num_timesteps:
+                self._steps_before = self._run.step
+        if self._run.env.venv is not None and (reset_num_timesteps or goes_on):  # may have been stepped by hand since
+            self._run.obs = self._run.action = None
         hooks, callbacks = told_apart(callback)
-        loggers, own_outputs = self.logger.outputs, []
+        savers = [one for one in callbacks if isinstance(one, Checkpoint)]
+        callbacks = [one for one in callbacks if not isinstance(one, Checkpoint)]
+        self._call = call
+        self._callbacks = [one for one in (*callbacks, hooks.callback) if hasattr(one, "state_dict")]
+        loggers = self.logger.outputs
+        own_outputs: list[Sink] = []
         if not loggers and self.tensorboard_log is not None:
             own_outputs.append(TensorBoard(next_folder(self.tensorboard_log, tb_log_name or self.name)))
         outputs: list[Sink] = [*sinks, *loggers, *([Console()] if self.verbose and not loggers else []), *own_outputs]
@@ -291,57 +321,95 @@ class Agent(ABC):
         if progress_bar:
             from rejeu.callbacks import ProgressBar
 
-            bar = ProgressBar(n_steps, None if minutes is None else seconds)
+            bar = ProgressBar(call.n_steps, call.seconds)
             callbacks.append(bar)
-        began, first, logged = time.perf_counter(), self._run.step, len(self.history)
-        first_episode = self._run.episode
-
-        def progress(taken: int) -> float:
-            by_steps = taken / n_steps if n_steps else 0.0
-            by_episodes = (self._run.episode - first_episode) / n_episodes
-            by_time = (time.perf_counter() - began) / seconds
-            return min(max(by_steps, by_episodes, by_time), 1.0)
-
-        self.interrupted = False
+        self.interrupted, self.interrupted_by = False, None
         self._run.success_threshold = self.success_threshold
         self.logger.outputs, self._learning = outputs, True
-        try:
-            hooks.begin(self, n_steps, {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps})
-            with Interrupt() as interrupt:
-                for turn in self._turns(n_steps, progress):
-                    elapsed = time.perf_counter() - began
-                    self.steps_per_second = (turn.step - first) / max(elapsed, 1e-9)
-                    for episode in turn.episodes:
-                        self._record(episode)
-                    if len(self.history) - logged >= log_interval and outputs:
-                        logged = len(self.history)
-                        row = self.statistics() | self.logger.take()
-                        for output in outputs:
-                            output.write(self.num_timesteps, row)
-                    if turn.episodes:
-                        self._note_training_return()
-                    answers = [*(callback(self, turn) for callback in callbacks), hooks.step(self, turn, self._run.obs)]
-                    if any(isinstance(answer, bool | np.bool_) and not answer for answer in answers):
-                        break
-                    if elapsed >= seconds or self._run.episode - first_episode >= n_episodes:
-                        break
-                    if interrupt.requested:
-                        self.interrupted = True
-                        break
+        with ExitStack() as held:
+            held.callback(self._stop_learning, loggers, bar, own_outputs)
+            for saver in savers:
+                held.enter_context(saver.held(self))
+            hooks.begin(self, call.n_steps, {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps})
+            self._restore_callbacks()
+            try:
+                with Interrupt() as interrupt:
+                    self._iterate(call, callbacks, hooks, savers, outputs, interrupt)
+            except Exception as error:
+                for saver in savers:
+                    saver.save_after(error, self)
+                raise
             hooks.end()
-        finally:
-            self.logger.outputs, self._learning = loggers, False
-            if bar is not None:
-                bar.close()
-            for output in own_outputs:
-                output.close()
+            for saver in savers:
+                saver.save(self)
         return self
+
+    def _iterate(
+        self,
+        call: Call,
+        callbacks: list[Callback],
+        hooks: Hooks,
+        savers: list[Checkpoint],
+        outputs: list[Sink],
+        interrupt: Interrupt,
+    ) -> None:
+        """Trains until a limit is reached, a callback says so or Ctrl-C is pressed."""
+        run, first = self._run, self._run.step
+        remaining = None if call.last_step is None else call.last_step - first
+        for turn in self._turns(remaining, lambda taken: call.progress(first + taken, run.episode)):
+            self.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
+            for episode in turn.episodes:
+                self._record(episode)
+            if len(self.history) - call.logged >= call.log_interval and outputs:
+                call.logged = len(self.history)
+                row = self.statistics() | self.logger.take()
+                for output in outputs:
+                    output.write(self.num_timesteps, row)
+            if turn.episodes:
+                self._note_training_return()
+            answers = [*(callback(self, turn) for callback in callbacks), hooks.step(self, turn, run.obs)]
+            for saver in savers:  # last, so that they hold what the others did
+                saver(self, turn)
+            self.interrupted, self.interrupted_by = interrupt.requested, interrupt.signal
+            refused = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
+            if refused or self.interrupted or call.is_over(turn.step, run.episode):
+                break
+
+    def _call_to_go_on_with(self) -> Call:
+        call = self._call if self.resumed is not None else None
+        if call is None:
+            raise ValueError(
+                "learn needs total_timesteps, episodes or minutes (or an agent from resume(), to go on with)"
+            )
+        if call.is_over(self._run.step, self._run.episode):
+            raise ValueError("the run is complete; give total_timesteps, episodes or minutes to train on")
+        return call
+
+    def _stop_learning(self, loggers: list[Sink], bar: Any, own_outputs: list[Sink]) -> None:
+        """Gives back what ``learn`` held, however it ended."""
+        self.logger.outputs, self._learning = loggers, False
+        if bar is not None:
+            bar.close()
+        for output in own_outputs:
+            output.close()
+
+    def _restore_callbacks(self) -> None:
+        """Gives callbacks what they remembered when the run was saved, once."""
+        saved, self._saved_callbacks = self._saved_callbacks, None
+        if saved is not None:
+            checkpoints.restore_callbacks(self._callbacks, saved)
 
     def _record(self, episode: Episode) -> None:
         self.history.append(episode)
         self.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
         if not math.isnan(episode.success):
             self.ep_success_buffer.append(episode.success)
+
+    def _fill_windows(self) -> None:
+        """Fills the windows of statistics from the history."""
+        episodes = self.history.episodes[-self.stats_window_size :]
+        self.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
+        self.ep_success_buffer.extend(e.success for e in self.history.episodes if not math.isnan(e.success))
 
     def _note_training_return(self) -> None:
         """Remembers the present weights if the mean of the last episodes' returns is the best so far."""
@@ -358,8 +426,11 @@ class Agent(ABC):
         """
         if self.best is not None and self.best.by == by and score <= self.best.score:  # type: ignore[operator]
             return False
-        self.best = Best(score, by, self._run.step, self._compiled.copy(self._run.state))
+        self._put_best(score, by, self._run.step, self._compiled.copy(self._run.state))
         return True
+
+    def _put_best(self, score: float | tuple[float, ...], by: str, step: int, state: PackedState) -> None:
+        self.best = Best(score, by, step, state)
 
     def restore_best(self) -> Self:
         """Puts back the best weights so far: actor, critics, their targets and optimizers as they were together.
@@ -516,8 +587,10 @@ class Agent(ABC):
         else:
             vector = self._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
         try:
+            self._check_spaces(vector, "the environment to evaluate in")
             self._check_scaled(vector)
-            return evaluate(self._player(deterministic), vector, episodes, threshold)
+            again = seed if isinstance(env, VectorEnv) else None  # others have just been made with it
+            return evaluate(self._player(deterministic), vector, episodes, threshold, again)
         finally:
             if own:
                 self._run.obs = self._run.action = None
@@ -618,26 +691,7 @@ class Agent(ABC):
         ``.safetensors`` is added to a path without a suffix. The file holds everything learnt, the hyper-parameters, the
         spaces and the counters. An older file at that path is replaced only once the new one is complete.
         """
-        run = self._run
-        header = {
-            "algorithm": self.name,
-            "config": configs.to_json(self.config),
-            "policy": self.policy,
-            "observation_space": spaces.describe(self.observation_space),
-            "action_space": spaces.describe(self.action_space),
-            "env_id": run.env.env_id if run.env is not None else None,
-            "seed": self.seed,
-            "stats_window_size": self.stats_window_size,
-            "success_threshold": self.success_threshold,
-            "counters": {
-                "step": run.step,
-                "steps_before": self._steps_before,
-                "episode": run.episode,
-                "n_updates": run.n_updates,
-            },
-            "rng": run.rng.bit_generator.state["state"],
-        }
-        return checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), header)
+        return checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), files.header(self))
 
     @classmethod
     def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:
@@ -653,53 +707,38 @@ class Agent(ABC):
             CheckpointError: if the file is damaged, of another algorithm, environment, schema or shape; it says which.
         """
         header, arrays = checkpoint.read(path, "agent")
-        if header.get("algorithm") != cls.algorithm.Config.name:
-            raise CheckpointError(
-                f"{path} holds a {str(header.get('algorithm'))[:40]} agent, not {cls.algorithm.Config.name}; "
-                f"use rejeu.load(path) or rejeu.{str(header.get('algorithm'))[:40]}.load"
-            )
-        own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
-        try:
-            config = configs.rebuild(cls.algorithm.Config, header["config"], changes)
-            observation_space = spaces.rebuild(header["observation_space"])
-            action_space = spaces.rebuild(header["action_space"])
-            counters = {key: configs.whole(key, header["counters"][key], 0, 2**32 - 1) for key in COUNTERS}
-            rng = {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")}
-            seed = whole_seed(own.pop("seed", header["seed"]))
-            threshold = own.pop("success_threshold", header.get("success_threshold"))
-            threshold = None if threshold is None else configs.number("success_threshold", threshold)
-            window = configs.whole("stats_window_size", own.pop("stats_window_size", header["stats_window_size"]), 1)
-            policy = own.pop("policy", header["policy"])
-            cls._check_policy(policy, observation_space)
-        except CheckpointError as error:
-            raise CheckpointError(f"{path}: {error}") from None
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-            if changes and not isinstance(error, KeyError):
-                raise
-            raise CheckpointError(f"{path}: the header is damaged or of another version: {error}") from None
+        agent = files.load(
+            cls,
+            path,
+            header,
+            arrays,
+            lambda agent: None if env is None else agent._vector(env, seed=agent.seed),
+            changes,
+        )
+        agent._own_env = isinstance(env, str)
+        return agent
 
-        agent = cls.__new__(cls)
-        agent.config, agent.policy, agent.seed = config, policy, seed
-        agent.verbose = own.pop("verbose", 0)
-        agent.tensorboard_log = own.pop("tensorboard_log", None)
-        agent.stats_window_size, agent.success_threshold = window, threshold
-        agent.history = History()
-        agent.ep_info_buffer, agent.ep_success_buffer = deque(maxlen=window), deque(maxlen=window)
-        agent.interrupted, agent.steps_per_second = False, math.nan
-        agent.best, agent.logger = None, Logger()
-        agent._n_predictions, agent._own_env = 0, isinstance(env, str)
-        compilation.enable_cache()
-        try:
-            agent._build(observation_space, action_space, 1)
-        except (TypeError, ValueError, MemoryError, OverflowError) as error:
-            raise CheckpointError(f"{path}: {error}") from None
-        state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
-        vector = None if env is None else agent._vector(env, 1, seed=seed)
-        if vector is not None:
-            agent._check_spaces(vector, "the given environment")
-        return agent._resume(vector, state, counters, rng)
+    @classmethod
+    def resume(cls, folder: str | Path, env: Any = None, **changes: Any) -> Self:
+        """Returns the agent of a run as its newest checkpoint holds it; ``learn()`` then goes on to the end that was set.
 
-    def _resume(self, vector: VectorEnv | None, state: Any, counters: dict[str, int], rng: dict[str, int]) -> Self:
+        Everything stands as it stood: what was learnt, the replay buffer, running episodes, exploration, random numbers,
+        counters, statistics, callbacks' own memory (give ``learn`` the same callbacks). Where the state of the environments
+        can be carried (see :mod:`rejeu.envs.state`), the run that follows is the same, bit for bit, that would have
+        followed without a break; elsewhere new episodes begin, and a warning says so. ``resumed`` tells which.
+
+        Args:
+            folder: as given to :class:`rejeu.callbacks.Checkpoint`.
+            env: as for the constructor; None makes environments of the id and number that the run had.
+            changes: hyper-parameters to set otherwise than they were.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+            CheckpointError: if the checkpoints are damaged, or of another algorithm or environment.
+        """
+        return checkpoints.resume(cls, Path(folder), env, changes)
+
+    def _stand(self, vector: VectorEnv | None, state: Any, counters: dict[str, int], rng: dict[str, int]) -> None:
         """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
         if vector is not None:
             self._start(vector)
@@ -712,7 +751,6 @@ class Agent(ABC):
         run.learn_from = self._learn_from(run.step)
         run.seed = int(np.random.SeedSequence([self.seed, run.step]).generate_state(1)[0])
         self._steps_before = counters["steps_before"]
-        return self
 
     def summary(self) -> str:
         """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.summary`."""
@@ -744,17 +782,6 @@ def refuse_masks(masks: Any, name: str) -> None:
     """Raises ``TypeError`` if masks are given to an agent that takes none."""
     if masks is not None:
         raise TypeError(f"{name}.predict takes no action_masks; use MaskablePPO")
-
-
-def whole_seed(seed: Any) -> int:
-    """Returns a seed as an int in [0, 2^32).
-
-    Raises:
-        ValueError: otherwise.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
-    return int(seed)
 
 
 class _ClassOnly:

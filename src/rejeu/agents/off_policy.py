@@ -63,7 +63,7 @@ class OffPolicyAgent(Agent):
         self._run.learn_from = self.config.learning_starts
         self._run.obs = self._run.action = None
 
-    def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+    def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return make_vector(env, n_envs, backend, seed)
 
     def _with_masks(self, obs: Any, masks: Any) -> Any:

@@ -27,7 +27,7 @@ class OnPolicyAgent(Agent):
 
     config: OnPolicyConfig
 
-    def _vector(self, env: Any, n_envs: int, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+    def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
 
     def _with_masks(self, obs: Any, masks: Any) -> Any:

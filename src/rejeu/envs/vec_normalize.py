@@ -10,7 +10,7 @@ at 1e-4 with mean 0 and variance 1, as in Stable-Baselines3.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -229,16 +229,34 @@ class VecNormalize(VecEnvWrapper):
     def _unscale(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
         return obs * np.sqrt(moments.var + self.epsilon) + moments.mean
 
-    def save(self, save_path: str | Path) -> Path:
-        """Writes statistics and settings to one safetensors file and returns its path; the environments are not in it.
-
-        ``.safetensors`` is added to a path without a suffix. Nothing in the file is code, whatever its suffix says.
-        """
+    def statistics(self) -> dict[str, np.ndarray]:
+        """Returns what has been seen, as arrays by name."""
         arrays = {f"returns.{name}": value for name, value in _arrays(self.ret_rms).items()}
         if isinstance(self.obs_rms, dict):
             arrays |= {f"obs.{i}.{n}": v for i, m in enumerate(self.obs_rms.values()) for n, v in _arrays(m).items()}
         elif self.obs_rms is not None:
             arrays |= {f"obs.{name}": value for name, value in _arrays(self.obs_rms).items()}
+        return arrays
+
+    def put_statistics(self, arrays: Mapping[str, np.ndarray], path: str | Path = "the statistics") -> None:
+        """Puts back what :meth:`statistics` returned; ``path`` is where it is from, for messages.
+
+        Raises:
+            CheckpointError: if they are damaged, or of an environment with other observations.
+        """
+        _restore(self.ret_rms, arrays, "returns", path)
+        if isinstance(self.obs_rms, dict):
+            for i, moments in enumerate(self.obs_rms.values()):
+                _restore(moments, arrays, f"obs.{i}", path)
+        elif self.obs_rms is not None:
+            _restore(self.obs_rms, arrays, "obs", path)
+
+    def save(self, save_path: str | Path) -> Path:
+        """Writes statistics and settings to one safetensors file and returns its path; the environments are not in it.
+
+        ``.safetensors`` is added to a path without a suffix. Nothing in the file is code, whatever its suffix says.
+        """
+        arrays = self.statistics()
         header = {
             "settings": {key: float(getattr(self, key)) for key in NUMBERS}
             | {key: bool(getattr(self, key)) for key in SWITCHES},
@@ -261,12 +279,7 @@ class VecNormalize(VecEnvWrapper):
             new = VecNormalize(venv, **switches, **settings, norm_obs_keys=header["keys"])  # type: ignore[arg-type]
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
-        _restore(new.ret_rms, arrays, "returns", load_path)
-        if isinstance(new.obs_rms, dict):
-            for i, moments in enumerate(new.obs_rms.values()):
-                _restore(moments, arrays, f"obs.{i}", load_path)
-        elif new.obs_rms is not None:
-            _restore(new.obs_rms, arrays, "obs", load_path)
+        new.put_statistics(arrays, load_path)
         return new
 
 
@@ -298,7 +311,7 @@ def _arrays(moments: RunningMeanStd) -> dict[str, np.ndarray]:
     return {"mean": moments.mean, "var": moments.var, "count": np.array(moments.count, np.float64)}
 
 
-def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, path: str | Path) -> None:
+def _restore(moments: RunningMeanStd, arrays: Mapping[str, np.ndarray], name: str, path: str | Path) -> None:
     for part, shape in (("mean", moments.mean.shape), ("var", moments.mean.shape), ("count", ())):
         found = arrays.get(f"{name}.{part}")
         if found is None or found.shape != shape or not np.isfinite(found).all():

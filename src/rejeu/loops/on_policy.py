@@ -46,7 +46,10 @@ def on_policy(
     began = time.perf_counter() - run.seconds["total"]
     if run.obs is None:
         restart(run)
-        begin(run, config)
+        if rollout.length and config.n_episodes is None:
+            rollout.cut()
+        else:
+            begin(run, config)
     while last is None or run.step < last:
         t0 = time.perf_counter()
         run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
