@@ -2,6 +2,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from rejeu.logging import CsvFile
 FILES = {
     "agent.safetensors",
     "best.safetensors",
+    "checkpoints",
     "config.json",
     "curve.png",
     "episodes.csv",
@@ -308,6 +310,78 @@ def test_metrics_that_come_up_later_get_their_column(tmp_path):
         ["2", "2.0", "0.5"],
         ["3", "", "0.25"],
     ]
+
+
+def test_a_table_that_is_gone_on_with_keeps_the_rows_up_to_a_step(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("step,a\n1,1.0\n2,2.0\n3,3.0\n4,")  # and the last was cut short
+    table = CsvFile(path, up_to=2)
+    table.write(3, {"a": 3.5, "b": 1.0})
+    table.close()
+    assert [list(row.values()) for row in rows(path)] == [["1", "1.0", ""], ["2", "2.0", ""], ["3", "3.5", "1.0"]]
+
+
+def table(path):
+    """A table without what depends on the clock."""
+    return [{k: v for k, v in row.items() if "seconds" not in k and not k.startswith("time/")} for row in rows(path)]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys):
+    arguments = ["--steps", "900", "--seed", "3", "--evaluate-every", "300", "--evaluate-episodes", "2"]
+    argv = ["train", "rejeu/Ball-v0", *arguments, "--set", *TINY, "--checkpoint-minutes", "0.002"]
+    assert main([*argv, "--out", str(tmp_path / "whole")]) == 0
+    script = """if True:
+        import os, signal, sys
+        from rejeu.callbacks import Evaluate
+        from rejeu.cli import main
+        evaluate = Evaluate.__call__
+        def call(self, agent, progress):
+            evaluate(self, agent, progress)
+            if progress.step >= 500:
+                os.kill(os.getpid(), signal.SIGKILL)
+        Evaluate.__call__ = call
+        main(sys.argv[1:])
+    """
+    killed = subprocess.run([sys.executable, "-c", script, *argv, "--out", str(tmp_path / "cut")], capture_output=True)
+    assert killed.returncode == -signal.SIGKILL
+    assert not (tmp_path / "cut" / "agent.safetensors").exists()
+    capsys.readouterr()
+    assert main(["resume", str(tmp_path / "cut")]) == 0
+    assert re.search(r"resumed at step \d+, exactly where it stood", capsys.readouterr().out)
+    for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
+        assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
+    one, two = (rejeu.load(tmp_path / run / "agent.safetensors").get_parameters() for run in ("whole", "cut"))
+    assert all(np.array_equal(one[key], two[key]) for key in one)
+
+
+def test_a_complete_run_can_be_trained_further(run, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "run")
+    text = error_of(capsys, "resume", str(tmp_path / "run"))
+    assert "the run is complete" in text
+    before = rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps
+    assert main(["resume", str(tmp_path / "run"), "--steps", "50"]) == 0
+    assert rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps == before + 50
+
+
+def test_resume_explains_what_it_cannot_go_on_with(run, tmp_path, capsys):
+    assert "no run folder" in error_of(capsys, "resume", str(tmp_path))
+    assert "exclude each other" in error_of(capsys, "resume", str(run), "--steps", "5", "--minutes", "1")
+    shutil.copytree(run, tmp_path / "run")
+    config = tmp_path / "run" / "config.json"
+    content = json.loads(config.read_text())
+    for damage, message in (
+        ({"n_envs": "8"}, "n_envs"),
+        ({"algorithm": "os.system"}, "unknown"),
+        ({"seed": None}, "seed"),
+    ):
+        config.write_text(json.dumps({**content, **damage}))
+        assert message in error_of(capsys, "resume", str(tmp_path / "run"))
+    config.write_text("{")
+    assert "is damaged" in error_of(capsys, "resume", str(tmp_path / "run"))
+    config.write_text(json.dumps(content))
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    assert "no checkpoint in" in error_of(capsys, "resume", str(tmp_path / "run"))
 
 
 def test_an_error_of_many_lines_becomes_one():

@@ -47,13 +47,27 @@ class Console:
 
 
 class CsvFile:
-    """Appends rows to a CSV file; a row may bring new columns, which are then empty in those before it."""
+    """Appends rows to a CSV file; a row may bring new columns, which are then empty in those before it.
 
-    def __init__(self, path: str | Path) -> None:
+    Args:
+        path: of the file.
+        up_to: of a file that is there already, keep the rows up to this step; None begins it anew.
+    """
+
+    def __init__(self, path: str | Path, up_to: int | None = None) -> None:
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        kept: list[dict[str, str]] = []
+        if up_to is not None and self.path.exists():
+            with self.path.open(newline="", encoding="utf-8") as file:
+                kept = [row for row in csv.DictReader(file) if (row.get("step") or "").isdigit()]
+            kept = [row for row in kept if int(row["step"]) <= up_to and None not in row and None not in row.values()]
         self._file = self.path.open("w+", newline="", encoding="utf-8")
-        self._writer: csv.DictWriter[str] = csv.DictWriter(self._file, [], restval="")
+        self._writer: csv.DictWriter[str] = csv.DictWriter(self._file, [*kept[0]] if kept else [], restval="")
+        if kept:
+            self._writer.writeheader()
+            self._writer.writerows(kept)
+            self._file.flush()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         row = {"step": step, **metrics}

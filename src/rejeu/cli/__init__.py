@@ -11,10 +11,11 @@ from typing import Any
 
 import tyro
 
-from rejeu.cli import evaluate, list as listing, play, record, train, watch
+from rejeu.cli import evaluate, list as listing, play, record, resume, train, watch
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
+    "resume": (resume.Resume, resume.run),
     "evaluate": (evaluate.Evaluate, evaluate.run),
     "record": (record.Record, record.run),
     "play": (play.Play, play.run),
@@ -65,7 +66,7 @@ def expected_errors() -> tuple[type[Exception], ...]:
 
     from rejeu import errors
 
-    own = (errors.BadEnvironmentError, gymnasium.error.Error)
+    own = (errors.BadEnvironmentError, errors.RunInUseError, errors.WorkerError, gymnasium.error.Error)
     return ValueError, TypeError, ImportError, OSError, MemoryError, *own
 
 

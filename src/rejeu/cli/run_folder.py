@@ -6,7 +6,7 @@ import json
 import platform
 import re
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +14,15 @@ from typing import Any, Literal
 from rejeu.errors import CheckpointError
 
 Which = Literal["best", "last"]
+KINDS: dict[str, Any] = {
+    "str": str,
+    "bool": bool,
+    "int": int,
+    "int | None": int | None,
+    "float | None": float | int | None,
+    "dict[str, Any]": dict,
+}
+"""What the annotations of :class:`RunConfig` allow."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,11 @@ class RunFolder:
     def best(self) -> Path:
         """The model that evaluated best."""
         return self.path / "best.safetensors"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints from which the run can go on."""
+        return self.path / "checkpoints"
 
     @property
     def curve(self) -> Path:
@@ -96,6 +110,8 @@ class RunConfig:
     """Environment steps between two films of the policy, None for none."""
     evaluate_every: int
     evaluate_episodes: int
+    checkpoint_minutes: float | None
+    """Minutes between two checkpoints, None for none."""
 
 
 def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
@@ -129,6 +145,27 @@ def write_config(folder: RunFolder, config: RunConfig) -> None:
     """Writes ``config.json``, with the versions of what ran."""
     content = {**asdict(config), "versions": versions()}
     folder.config.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_config(folder: RunFolder) -> RunConfig:
+    """Returns what :func:`write_config` wrote.
+
+    Raises:
+        FileNotFoundError: if the folder is of no run.
+        CheckpointError: if the file is damaged.
+    """
+    if not folder.config.is_file():
+        raise FileNotFoundError(f"{folder.path} is no run folder: it holds no {folder.config.name}")
+    try:
+        content = json.loads(folder.config.read_text(encoding="utf-8"))
+        config = RunConfig(**{field.name: content[field.name] for field in fields(RunConfig)})
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{folder.config} is damaged: {type(error).__name__} {error}") from None
+    for field in fields(RunConfig):
+        value = getattr(config, field.name)
+        if not isinstance(value, KINDS[str(field.type)]):
+            raise CheckpointError(f"{folder.config} is damaged: {field.name} is {str(value)[:40]!r}, not {field.type}")
+    return config
 
 
 def versions() -> dict[str, str | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -35,7 +36,7 @@ say = partial(print, flush=True)
 class Train:
     """Trains an agent and leaves a run folder: models, tables, learning curve, video.
 
-    Ctrl-C stops cleanly and saves everything. Example: rejeu train Pendulum-v1 --steps 20000 --set learning_rate=1e-3
+    Ctrl-C stops cleanly; rejeu resume goes on. Example: rejeu train Pendulum-v1 --steps 20000 --set learning_rate=1e-3
     """
 
     env: Annotated[Positional[str], arg(metavar="ENV")]
@@ -60,6 +61,8 @@ class Train:
     """Return from which on an episode counts as a success; by default what the environment says or declares."""
     film_every: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Film an episode of the policy every so many environment steps, into the folder films."""
+    checkpoint_minutes: Annotated[float, arg(metavar="M", help_behavior_hint="(default: 5)")] = 5.0
+    """Minutes between two checkpoints, from which rejeu resume goes on; 0 for none."""
     evaluate_every: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Environment steps between two evaluations; by default the preset's, else 5000."""
     evaluate_episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -67,12 +70,11 @@ class Train:
 
 
 def run(arguments: Train) -> int:
-    """Trains and returns the exit status: 0, or 130 after Ctrl-C."""
-    began = time.perf_counter()
-    from rejeu import compilation, presets
+    """Trains and returns the exit status: 0, 130 after Ctrl-C or 143 after SIGTERM."""
+    watch = Watch()
+    from rejeu import presets
     from rejeu.envs.measuring import sentence
 
-    compiled_before = compilation.seconds()
     check(arguments)
     algorithm = None if arguments.algo is None else algorithm_name(arguments.algo)
     preset = presets.find(arguments.env, algorithm)
@@ -84,11 +86,37 @@ def run(arguments: Train) -> int:
             folder = run_folder.create(arguments.out, config.env, config.algorithm, seed)
             run_folder.write_config(folder, config)
             say(header(config, sentence(env), folder))
-            evaluate = train(agent, config, evaluation_env, folder)
-        picture(agent, evaluate, config, folder)
-        seconds, compile_seconds = time.perf_counter() - began, compilation.seconds() - compiled_before
-        say(summary(agent, evaluate, folder, seconds, compile_seconds))
-    return 130 if agent.interrupted else 0
+            limits = Limits(config.steps, config.minutes)
+            return finish(agent, config, folder, train(agent, config, evaluation_env, folder, limits), watch)
+
+
+class Limits(NamedTuple):
+    """What ends a run; None for both goes on with one that was cut off."""
+
+    steps: int | None
+    minutes: float | None
+
+
+class Watch:
+    """Measures what a command takes, from when it is made."""
+
+    def __init__(self) -> None:
+        from rejeu import compilation
+
+        self._began, self._compiled = time.perf_counter(), compilation.seconds()
+
+    def seconds(self) -> tuple[float, float]:
+        """Returns wall time, and how much of it went into compiling."""
+        from rejeu import compilation
+
+        return time.perf_counter() - self._began, compilation.seconds() - self._compiled
+
+
+def finish(agent: Agent, config: RunConfig, folder: RunFolder, evaluate: Evaluate, watch: Watch) -> int:
+    """Draws and films what a run came to, says so, and returns the exit status."""
+    picture(agent, evaluate, config, folder)
+    say(summary(agent, evaluate, folder, *watch.seconds()))
+    return 0 if agent.interrupted_by is None else 128 + agent.interrupted_by
 
 
 def check(arguments: Train) -> None:
@@ -103,6 +131,7 @@ def check(arguments: Train) -> None:
             whole(f"--{name.replace('_', '-')}", getattr(arguments, name), least=1)
     if arguments.minutes is not None:
         number("--minutes", arguments.minutes, above=0)
+    number("--checkpoint-minutes", arguments.checkpoint_minutes, least=0)
     if arguments.success_threshold is not None:
         number("--success-threshold", arguments.success_threshold)
     if arguments.seed is not None:
@@ -193,6 +222,7 @@ def plan(arguments: Train, preset: Preset | None, algorithm: str, env: VectorEnv
         film_every=arguments.film_every,
         evaluate_every=arguments.evaluate_every or base.evaluate_every,
         evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
+        checkpoint_minutes=arguments.checkpoint_minutes or None,
     )
 
 
@@ -216,24 +246,40 @@ def make_evaluation_env(config: RunConfig) -> VectorEnv:
     return make_vector(config.env, min(config.evaluate_episodes, 16), backend, seed)  # type: ignore[arg-type]
 
 
-def train(agent: Agent, config: RunConfig, evaluation_env: VectorEnv, folder: RunFolder) -> Evaluate:
-    """Trains, evaluates and saves; whatever ends it, the tables hold all that happened. Returns the evaluations."""
+def train(
+    agent: Agent, config: RunConfig, evaluation_env: VectorEnv, folder: RunFolder, limits: Limits, anew: bool = True
+) -> Evaluate:
+    """Trains, evaluates and saves; whatever ends it, the tables hold all that happened. Returns the evaluations.
+
+    Args:
+        agent: new, or taken up from a checkpoint.
+        config: of the run.
+        evaluation_env: to evaluate in.
+        folder: where everything goes.
+        limits: what ends it.
+        anew: whether it begins, rather than goes on.
+    """
     from rejeu import errors
-    from rejeu.callbacks import Evaluate, Film
+    from rejeu.callbacks import Checkpoint, Evaluate, Film
     from rejeu.logging import CsvFile
 
-    metrics, table = CsvFile(folder.metrics), CsvFile(folder.evaluations)
+    up_to = None if anew else agent.num_timesteps
+    metrics, table = CsvFile(folder.metrics, up_to), CsvFile(folder.evaluations, up_to)
     evaluate = Evaluate(
         evaluation_env, config.evaluate_every, config.evaluate_episodes, folder.best, report=reporter(agent, table)
     )
     films = [] if config.film_every is None else [Film(folder.films, config.film_every, max_steps=VIDEO_STEPS)]
+    checkpoints = []
+    if config.checkpoint_minutes is not None:
+        checkpoints.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
     try:
         agent.learn(
-            config.steps,
-            [evaluate, *films],
+            limits.steps,
+            [evaluate, *films, *checkpoints],
             log_interval=4 * config.n_envs,
+            reset_num_timesteps=anew,
             progress_bar=True,
-            minutes=config.minutes,
+            minutes=limits.minutes,
             sinks=[metrics],
         )
         agent.save(folder.agent)
@@ -289,7 +335,7 @@ def picture(agent: Agent, evaluate: Evaluate, config: RunConfig, folder: RunFold
     except ImportError as error:
         say(f"no curve: {error}")
     if agent.interrupted:
-        say(f"no video after Ctrl-C; rejeu record {folder.path} makes one")
+        say(f"no video of a run that was stopped; rejeu record {folder.path} makes one")
         return
     try:
         record_video(load(folder.best), folder.video, config.env, VIDEO_EPISODES, VIDEO_STEPS, config.seed)
@@ -315,7 +361,11 @@ def header(config: RunConfig, backend: str, folder: RunFolder) -> str:
 
 def summary(agent: Agent, evaluate: Evaluate, folder: RunFolder, seconds: float, compile_seconds: float) -> str:
     """Returns what a run says at its end."""
-    lines = ["", "stopped by Ctrl-C; everything is saved"] if agent.interrupted else [""]
+    lines = [""]
+    if agent.interrupted:
+        how = f"; rejeu resume {folder.path} goes on" if folder.checkpoints.is_dir() else ""
+        name = "Ctrl-C" if agent.interrupted_by == signal.SIGINT else "SIGTERM"
+        lines.append(f"stopped by {name}; everything is saved{how}")
     if agent.ep_info_buffer:
         lines.append(f"training      last {len(agent.ep_info_buffer)} episodes: {training(agent)}")
     if evaluate.best is not None:
