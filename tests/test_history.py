@@ -67,3 +67,15 @@ def test_the_csv_file_holds_the_table(tmp_path):
     assert [row["return"] for row in rows] == ["1.0", "3.0", "5.0", "7.0"]
     assert rows[0].keys() == set(COLUMNS)
     assert rows[0]["success"] == "nan"
+
+
+def test_a_table_put_back_is_the_same_history():
+    one, two = history(), History()
+    two.replace(one.table())
+    np.testing.assert_equal(two.episodes, one.episodes)
+    assert [type(value) for value in two.last(1)[0][:4]] == [int, int, float, int]
+    assert [episode.step for episode in one.last(2)] == [25, 40]
+    np.testing.assert_equal(one.last(9), one.episodes)
+    assert History().table().shape == (0, 6)
+    with pytest.raises(ValueError, match=r"float64\[n, 6\], got float64\[2, 3\]"):
+        two.replace(np.zeros((2, 3)))

@@ -238,7 +238,7 @@ def _stop_on_mean(least: float, episodes: int, value: Callable[[Episode], float]
     whole("episodes", episodes, least=1)
 
     def stop(agent: Agent, progress: Progress) -> bool:
-        last = agent.history.episodes[-episodes:] if progress.episodes else []
+        last = agent.history.last(episodes) if progress.episodes else []
         return not (len(last) == episodes and np.mean([value(episode) for episode in last]) >= least)
 
     return stop

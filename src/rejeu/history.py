@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from array import array
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,13 +19,15 @@ COLUMNS = ("step", "env", "return", "length", "success", "seconds")
 
 
 class History:
-    """A growing table of episodes."""
+    """A growing table of episodes, 48 bytes each."""
 
     def __init__(self, episodes: Iterable[Episode] = ()) -> None:
-        self.episodes = list(episodes)
+        self._values = array("d")
+        for episode in episodes:
+            self.append(episode)
 
     def __len__(self) -> int:
-        return len(self.episodes)
+        return len(self._values) // len(COLUMNS)
 
     def __getitem__(self, column: str) -> np.ndarray:
         """Returns one column, ``(n_episodes,)``: step, env, return, length, success or seconds.
@@ -34,11 +37,40 @@ class History:
         """
         if column not in COLUMNS:
             raise KeyError(f"{column!r} is no column; there are {', '.join(COLUMNS)}")
-        return np.array([episode[COLUMNS.index(column)] for episode in self.episodes], np.float64)
+        return np.array(self._values[COLUMNS.index(column) :: len(COLUMNS)], np.float64)
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """All episodes, oldest first; a list made anew."""
+        return self.last(len(self))
+
+    def last(self, n: int) -> list[Episode]:
+        """Returns the last ``n`` episodes, or all if there are fewer, oldest first."""
+        width = len(COLUMNS)
+        first = max(len(self) - n, 0)
+        rows = [self._values[i : i + width] for i in range(first * width, len(self._values), width)]
+        return [
+            Episode(int(step), int(env), value, int(length), success, seconds)
+            for step, env, value, length, success, seconds in rows
+        ]
 
     def append(self, episode: Episode) -> None:
         """Adds one episode at the end."""
-        self.episodes.append(episode)
+        self._values.extend(episode)
+
+    def table(self) -> np.ndarray:
+        """Returns everything as one array, ``float64 (n_episodes, 6)``, its columns in the order of ``COLUMNS``."""
+        return np.array(self._values, np.float64).reshape(-1, len(COLUMNS))
+
+    def replace(self, table: np.ndarray) -> None:
+        """Puts what :meth:`table` returned in place of everything.
+
+        Raises:
+            ValueError: if it is no such table.
+        """
+        if table.dtype != np.float64 or table.shape[1:] != (len(COLUMNS),):
+            raise ValueError(f"a history is float64[n, {len(COLUMNS)}], got {table.dtype}{list(table.shape)}")
+        self._values = array("d", table.ravel())
 
     def moving_average(self, column: str = "return", window: int = 50) -> np.ndarray:
         """Returns the mean of each value and up to ``window - 1`` before it, NaN left out, ``(n_episodes,)``."""

@@ -407,9 +407,10 @@ class Agent(ABC):
 
     def _fill_windows(self) -> None:
         """Fills the windows of statistics from the history."""
-        episodes = self.history.episodes[-self.stats_window_size :]
+        episodes = self.history.last(self.stats_window_size)
         self.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
-        self.ep_success_buffer.extend(e.success for e in self.history.episodes if not math.isnan(e.success))
+        successes = self.history["success"]
+        self.ep_success_buffer.extend(successes[~np.isnan(successes)][-self.stats_window_size :].tolist())
 
     def _note_training_return(self) -> None:
         """Remembers the present weights if the mean of the last episodes' returns is the best so far."""

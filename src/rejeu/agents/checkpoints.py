@@ -38,7 +38,7 @@ from rejeu.core import PyTree
 from rejeu.envs import state as env_state
 from rejeu.envs.vector import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError, RunInUseError
-from rejeu.loops.host import Episode, Progress, Run
+from rejeu.loops.host import Progress, Run
 from rejeu.loops.packing import Readings
 from rejeu.replay.ring import Ring
 from rejeu.replay.rollout import RolloutBuffer
@@ -288,7 +288,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "td_errors": leaves(run.td_errors),
         "seconds": {key: float(value) for key, value in run.seconds.items()},
         "buffer": buffer_content(run),
-        "history": np.array(agent.history.episodes, np.float64).reshape(-1, 6),
+        "history": agent.history.table(),
         "best": best,
         "logger": [dict(agent.logger.name_to_value), dict(agent.logger._counts)],
         "n_predictions": agent._n_predictions,
@@ -422,10 +422,7 @@ def restore(
         put_envs_back(run, saved)
     elif saved["seed"] is not None:
         run.seed = files.whole_seed(saved["seed"])
-    agent.history.episodes = [
-        Episode(int(step), int(env), value, int(length), success, seconds)
-        for step, env, value, length, success, seconds in saved["history"].tolist()
-    ]
+    agent.history.replace(saved["history"])
     agent._fill_windows()
     if saved["best"] is not None:
         packed = compiled.pack(checkpoint.arrays_to_tree(compiled.shapes, best, path))
