@@ -304,3 +304,17 @@ def test_show_videos_works_without_ipython(tmp_path, monkeypatch):
     shown = show_videos(tmp_path)
     assert "<video" in shown.data
     assert shown._repr_html_() == shown.data
+
+
+def test_an_environment_of_envpool_is_filmed_though_its_package_was_not_imported(tmp_path):
+    pytest.importorskip("highway_env")
+    script = """if True:
+        import sys, rejeu
+        env = rejeu.make_vector("parking-v0", 2, "envpool", seed=0)
+        agent = rejeu.SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0)
+        assert "highway_env" not in sys.modules
+        print(rejeu.record_video(agent, sys.argv[1], max_steps=3))
+    """
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "film")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[-1]).stat().st_size > 1000

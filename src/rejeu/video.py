@@ -20,7 +20,7 @@ import numpy as np
 
 from rejeu.config import number, whole
 from rejeu.envs.masks import shown_to
-from rejeu.envs.registry import make_env
+from rejeu.envs.registry import make_env, provider, register
 from rejeu.envs.vec_env import VecEnvWrapper
 from rejeu.envs.vector import InProcess
 from rejeu.errors import MissingExtra
@@ -120,7 +120,7 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
             "them in a VecVideoRecorder, or give env="
         )
     spec = vector.envs[0].spec if isinstance(vector, InProcess) else None
-    if spec is None and vector.env_id not in gym.registry and ":" not in vector.env_id:
+    if spec is None and provider(vector.env_id) is None and not register(vector.env_id):
         raise ValueError(
             f"the agent's own environment {vector.env_id} is not registered, so no second one can be made; give "
             "env=, made with render_mode='rgb_array'"
