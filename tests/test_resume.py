@@ -309,6 +309,12 @@ def test_another_process_is_told_that_the_run_is_in_use(tmp_path):
     small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
 
 
+def test_what_a_process_that_died_was_writing_is_deleted(tmp_path):
+    (tmp_path / ".run_000000000010.safetensors.1a2b.tmp").write_bytes(b"half")
+    small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_the_folder_of_another_run_is_refused(tmp_path):
     agent = small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
     agent.learn(20, Checkpoint(tmp_path, every=10), reset_num_timesteps=False)  # the same run

@@ -155,6 +155,8 @@ class Checkpoint:
             ) from None
         try:
             self._check_owner(agent)
+            for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote
+                path.unlink(missing_ok=True)
             self._last_step, self._last_time = agent._run.step, time.monotonic()
             if not run_files(self.folder):
                 self.save(agent)
