@@ -21,8 +21,8 @@ from statistics import median
 import rejeu
 from rejeu.cli.run_folder import versions
 from rejeu.envs import measuring
+from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.measuring import Choice
-from rejeu.envs.vector import envpool_knows
 
 RESULT = Path(__file__).parent / "results" / "backends.json"
 CASES = {

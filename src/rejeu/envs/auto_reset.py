@@ -17,8 +17,8 @@ import jax
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
+from rejeu.envs.contract import VectorEnv
 from rejeu.envs.vec_env import Indices, StepResult, VecEnv, VecEnvWrapper, is_wrapped, tile
-from rejeu.envs.vector import VectorEnv
 from rejeu.video import VideoFile, check_renders, rgb_frame
 
 

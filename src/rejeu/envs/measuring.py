@@ -34,7 +34,7 @@ from gymnasium.vector.utils import batch_space
 from rejeu.envs import workers
 
 if TYPE_CHECKING:
-    from rejeu.envs.vector import VectorEnv
+    from rejeu.envs.contract import VectorEnv
 
 PREFERENCE = ("envpool", "gymnasium", "gymnasium-async")
 """What can be chosen; each against the one before only if it is faster by ``MARGIN``."""

@@ -9,9 +9,10 @@ import numpy as np
 
 from rejeu.envs import goals as goals_module
 from rejeu.envs.auto_reset import AutoResetView, DummyVecEnv
+from rejeu.envs.contract import Step, VectorEnv, success_of
+from rejeu.envs.in_process import InProcess
 from rejeu.envs.vec_env import VecEnv, is_vecenv_wrapped
 from rejeu.envs.vec_normalize import VecNormalize
-from rejeu.envs.vector import InProcess, Step, VectorEnv, success_of
 from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, leaves, plain

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from rejeu.envs.vector import success_of
+from rejeu.envs.contract import success_of
 from rejeu.play.keys import CONTROLS
 from rejeu.play.recording import Recording
 from rejeu.video import rgb_frame

@@ -1,0 +1,125 @@
+"""Environments of the EnvPool package, stepped by threads in C++."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.envs import goals as goals_module
+from rejeu.envs.contract import SUCCESS_KEYS, Step, VectorEnv, replaced
+from rejeu.envs.registry import make_env, provider, register, unknown_environment
+from rejeu.replay.hindsight import GoalFunctions
+from rejeu.spaces import cast, leaves
+
+
+class EnvPool(VectorEnv):
+    """Environments of the EnvPool package, stepped by C++ threads."""
+
+    backend = "envpool"
+
+    def __init__(self, env_id: str, n_envs: int, seed: int | None = None) -> None:
+        self.env_id = env_id
+        self.n_envs = n_envs
+        self._pool = self._make(seed)
+        self.observation_space = _bounded_rightly(self._pool.observation_space)
+        self.action_space = self._pool.action_space
+        self.max_episode_steps = int(self._pool.spec.config.max_episode_steps)
+        self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
+        self._leaves = leaves(self.observation_space)
+
+    def _make(self, seed: int | None) -> Any:
+        import envpool
+
+        seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        seed %= 2**31 - self.n_envs  # environment i gets seed + i, and EnvPool takes int32
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
+            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seed)
+            pool.observation_space, pool.action_space  # noqa: B018 - made when first asked for, and kept
+        return pool
+
+    def reset(self, seed: int | None = None) -> Any:
+        if seed is not None:
+            self._pool = self._make(seed)
+        self._obs = cast(self.observation_space, self._leaves, self._pool.reset()[0])
+        return self._obs
+
+    def _step_all(self, action: np.ndarray) -> Step:
+        obs, reward, terminated, truncated, info = self._pool.step(action)
+        self._obs = cast(self.observation_space, self._leaves, obs)
+        return Step(self._obs, np.asarray(reward, np.float32), terminated, truncated, info)
+
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        ids = np.flatnonzero(active).astype(np.int32)
+        obs, reward, terminated, truncated, info = self._pool.step(np.asarray(action)[ids], ids)  # rows in order of ids
+        self._obs = replaced(self._obs, ids, cast(self.observation_space, self._leaves, obs))
+
+        def spread(part: np.ndarray, dtype: Any) -> np.ndarray:
+            whole = np.zeros(self.n_envs, dtype)
+            whole[ids] = part
+            return whole
+
+        said = {key: spread(info[key], info[key].dtype) for key in SUCCESS_KEYS if key in info}
+        return Step(self._obs, spread(reward, np.float32), spread(terminated, bool), spread(truncated, bool), said)
+
+    def reset_done(self, done: np.ndarray) -> Any:
+        ended = np.flatnonzero(done).astype(np.int32)
+        fresh = cast(self.observation_space, self._leaves, self._pool.reset(ended)[0])
+        self._obs = replaced(self._obs, ended, fresh)
+        return self._obs
+
+    def success(self, step: Step, env: int) -> float:
+        value = step.info.get("is_success", step.info.get("success"))
+        return float("nan") if value is None else float(value[env])
+
+    def goals(self) -> GoalFunctions | None:
+        if "desired_goal" not in getattr(self.observation_space, "spaces", ()):
+            return None
+        if self.env_id == "parking-v0":
+            return GoalFunctions(goals_module.parking_reward)
+        return goals_module.goal_functions(make_env(self.env_id))
+
+    def close(self) -> None:
+        self._pool.close()
+
+
+def check_envpool_knows(env_id: str) -> None:
+    """Raises ``ValueError`` unless EnvPool has the environment, with the backend or the name to use instead."""
+    import envpool
+
+    if env_id not in envpool.list_all_envs():
+        known = register(env_id)
+        raise ValueError(f"EnvPool has no {env_id}; use backend='gymnasium'" if known else unknown_environment(env_id))
+
+
+def envpool_knows(env_id: str) -> bool:
+    """Returns whether EnvPool is installed and has the environment, and the id is not of a package of its own goals."""
+    try:
+        import envpool
+    except ImportError:
+        return False
+    if env_id not in envpool.list_all_envs():
+        return False
+    needs_package_for_goals = provider(env_id) is not None and env_id != "parking-v0"
+    return not needs_package_for_goals or register(env_id)
+
+
+def reward_threshold(env_id: str, declared: float | None) -> float | None:
+    """Returns the return at which Gymnasium counts an environment as solved, ``declared`` for one it does not know."""
+    if env_id in gym.registry:
+        return gym.registry[env_id].reward_threshold
+    return None if provider(env_id) is not None else declared
+
+
+def _bounded_rightly(space: gym.Space) -> gym.Space:
+    """Returns a space in which what EnvPool bounds by the least positive and the greatest float is unbounded."""
+    if isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({key: _bounded_rightly(part) for key, part in space.spaces.items()})
+    if isinstance(space, gym.spaces.Box) and space.dtype.kind == "f":
+        limits = np.finfo(space.dtype)
+        if (space.low == limits.tiny).all() and (space.high == limits.max).all():
+            return gym.spaces.Box(-np.inf, np.inf, space.shape, space.dtype.type)
+    return space
