@@ -51,7 +51,7 @@ def test_environments_in_processes_show_what_those_in_this_process_show():
         with pytest.raises(WorkerError, match=r"environment 0 raised an error:(.|\n)*unsupported operand"):
             env.step([0, 0])
         assert env.closed
-        assert not any(process.is_alive() for process in env.processes)
+        assert not any(worker.alive for worker in env.workers.workers)
     finally:
         env.close()
 

@@ -17,8 +17,10 @@ import jax
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
+from rejeu.envs import answers, conversions, faults
 from rejeu.envs.contract import VectorEnv
 from rejeu.envs.vec_env import Indices, StepResult, VecEnv, VecEnvWrapper, is_wrapped, tile
+from rejeu.errors import BadEnvironmentError
 from rejeu.video import VideoFile, check_renders, rgb_frame
 
 
@@ -54,14 +56,15 @@ class DummyVecEnv(VecEnv):
             raise ValueError("two functions of env_fns returned the same environment; each must make a new one")
         super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
         self.metadata, self.render_mode = self.envs[0].metadata, self.envs[0].render_mode
+        self.n_steps = 0
+        """How often all were stepped."""
         self._actions: Any = None
 
     def reset(self) -> Any:
         """Resets every environment, with the seeds and options set before, and returns the observations."""
         parts = []
         for i, env in enumerate(self.envs):
-            obs, self.reset_infos[i] = env.reset(seed=self._seeds[i], options=self._options[i])
-            parts.append(copy.deepcopy(obs))
+            parts.append(self._begin(i, env, self._seeds[i], self._options[i]))
         self._reset_seeds()
         self._reset_options()
         return self._stack(parts)
@@ -74,20 +77,31 @@ class DummyVecEnv(VecEnv):
 
     def step_wait(self) -> StepResult:
         """Takes the step of :meth:`step_async` and returns what :meth:`step` does."""
+        self.n_steps += 1
         parts, infos = [], []
         rewards, dones = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
         for i, env in enumerate(self.envs):
-            obs, rewards[i], terminated, truncated, info = env.step(self._actions[i])
+            answer = env.step(self._actions[i])
+            if (fault := faults.step_fault(answer, env.observation_space)) is not None:
+                raise BadEnvironmentError(faults.blamed(faults.id_of(env), i, self.n_steps, fault))
+            obs, rewards[i], terminated, truncated, info = conversions.numbers_of(answer)
             obs = copy.deepcopy(obs)  # an environment may write its next observation into the same array
-            info = {**info, "TimeLimit.truncated": bool(truncated and not terminated)}
+            info = {**info, "TimeLimit.truncated": truncated and not terminated}
             dones[i] = terminated or truncated
             if dones[i]:
                 info["terminal_observation"] = obs
-                obs, self.reset_infos[i] = env.reset()
-                obs = copy.deepcopy(obs)
+                obs = self._begin(i, env)
             parts.append(obs)
             infos.append(info)
         return self._stack(parts), rewards, dones, infos
+
+    def _begin(self, i: int, env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Resets one environment and returns a copy of its observation."""
+        try:
+            obs, self.reset_infos[i] = answers.reset(env, seed, options)
+        except BadEnvironmentError as error:
+            raise BadEnvironmentError(faults.blamed(faults.id_of(env), i, self.n_steps, str(error))) from error
+        return copy.deepcopy(obs)
 
     def _stack(self, parts: list[Any]) -> Any:
         space = self.observation_space

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from rejeu.envs.vec_env import VecEnv
+from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
 
 SUCCESS_KEYS = ("is_success", "success")
@@ -161,7 +162,15 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
 
 
 def success_of(info: dict[str, Any]) -> float:
-    """Returns 1.0 or 0.0 as an info dict says under ``is_success`` or ``success``, NaN if it says neither."""
+    """Returns 1.0 or 0.0 as an info dict says under ``is_success`` or ``success``, NaN if it says neither.
+
+    Raises:
+        BadEnvironmentError: if the info is no dict.
+    """
+    if not isinstance(info, dict):
+        raise BadEnvironmentError(
+            f"step returned the info {info!r:.80}, expected a dict; return {{}} if it says nothing"
+        )
     value = info.get("is_success", info.get("success"))
     return float("nan") if value is None else float(np.all(value))
 

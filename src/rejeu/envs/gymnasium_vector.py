@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -10,10 +11,11 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from rejeu.envs import goals as goals_module, workers
+from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.contract import SUCCESS_KEYS, Description, Step, VectorEnv, describe_spec, replaced
+from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.replay.hindsight import GoalFunctions
-from rejeu.spaces import cast, leaves, plain
+from rejeu.spaces import leaves, plain
 
 
 class GymnasiumVector(VectorEnv):
@@ -55,6 +57,8 @@ class GymnasiumVector(VectorEnv):
         """Which have terminated, and which were truncated, and were not reset since; none where they reset themselves."""
         self._strayed = np.zeros(self.n_envs, bool)
         """Which have moved on unseen and were not reset since."""
+        self.n_steps = 0
+        """How often the vector was stepped."""
 
     def reset(self, seed: int | None = None) -> Any:
         seed = self._seed if seed is None else seed
@@ -65,14 +69,18 @@ class GymnasiumVector(VectorEnv):
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
+        self.n_steps += 1
+        answer = self._called(self.env.step, action)
         try:
-            obs, reward, terminated, truncated, info = self.env.step(action)
-        except (EOFError, ConnectionError) as error:
-            self._blame_worker(error)
-            raise
-        if workers.FAILURE in info:
-            raise workers.failed(info)
-        obs = cast(self.observation_space, self._leaves, obs)
+            obs, reward, terminated, truncated, info = answer
+            obs = answers.batch(self.observation_space, self._leaves, self.n_envs, obs)
+            reward = answers.for_each("rewards", reward, self.n_envs, np.float32)
+            terminated = answers.for_each("terminated", terminated, self.n_envs, bool)
+            truncated = answers.for_each("truncated", truncated, self.n_envs, bool)
+        except ValueError:
+            raise self._bad(None, f"step returned {faults.described(answer)}, expected {faults.STEP_VALUES}") from None
+        except BadEnvironmentError as error:
+            raise self._bad(None, f"step returned {error}") from error.__cause__
         if self._same_step:
             self._after_reset = obs
             done = np.flatnonzero(terminated | truncated)
@@ -83,7 +91,7 @@ class GymnasiumVector(VectorEnv):
         else:
             self._flags = terminated, truncated
         self._obs = obs
-        return Step(obs, np.asarray(reward, np.float32), terminated, truncated, info)
+        return Step(obs, reward, terminated, truncated, info)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         rest = ~active
@@ -119,18 +127,35 @@ class GymnasiumVector(VectorEnv):
         return self._obs
 
     def _reset(self, **arguments: Any) -> Any:
+        answer = self._called(self.env.reset, **arguments)
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            raise self._bad(None, f"reset returned {faults.described(answer)}, expected (obs, info)")
         try:
-            obs, info = self.env.reset(**arguments)
-        except (EOFError, ConnectionError) as error:
-            self._blame_worker(error)
-            raise
-        if workers.FAILURE in info:
-            raise workers.failed(info)
-        return cast(self.observation_space, self._leaves, obs)
+            return answers.batch(self.observation_space, self._leaves, self.n_envs, answer[0])
+        except BadEnvironmentError as error:
+            raise self._bad(None, f"reset returned {error}") from error.__cause__
 
-    def _blame_worker(self, error: Exception) -> None:
-        if isinstance(self.env.unwrapped, AsyncVectorEnv):
-            raise workers.ended(self.env.unwrapped) from error
+    def _called(self, function: Callable[..., Any], *positional: Any, **arguments: Any) -> Any:
+        """Calls a method of the vector; what goes wrong in the vector itself is blamed on an environment in it.
+
+        It cannot be seen beforehand what the single environments answer. What they raise in this process is raised as
+        it is.
+        """
+        try:
+            return function(*positional, **arguments)
+        except (EOFError, ConnectionError) as error:
+            if isinstance(self.env.unwrapped, AsyncVectorEnv):
+                raise ended(self.env.unwrapped) from error
+            raise
+        except Exception as error:  # whatever a vector says of an answer that does not fit
+            if not in_machinery(error):
+                raise
+            env, fault = culprit(error, self.env.unwrapped)
+            advice = "see rejeu.check_env(env) for what it returns against its spaces"
+            raise self._bad(env, fault or f"{type(error).__name__}: {error}; {advice}") from error
+
+    def _bad(self, env: int | None, fault: str) -> BadEnvironmentError:
+        return BadEnvironmentError(faults.blamed(self.env_id, env, self.n_steps, fault))
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
@@ -149,6 +174,47 @@ class GymnasiumVector(VectorEnv):
 
     def close(self) -> None:
         self.env.close()
+
+
+def in_machinery(error: Exception) -> bool:
+    """Returns whether it was raised between the environments, by Gymnasium's vector classes or NumPy, not in one of them."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][1:]
+    machinery = ("gymnasium.vector.", "gymnasium.wrappers.vector.", "numpy")
+    return bool(frames) and all(frame.f_globals.get("__name__", "").startswith(machinery) for frame in frames)
+
+
+def culprit(error: Exception, vector: Any) -> tuple[int | None, str | None]:
+    """Returns which environment's answer made a vector raise, and what is wrong with it, as far as that can be told."""
+    if isinstance(vector, AsyncVectorEnv):
+        return next((i for i, pipe in enumerate(vector.parent_pipes) if pipe is None), None), None
+    for i, obs in enumerate(getattr(vector, "_env_obs", ())):
+        fault = None if obs is None else faults.observation_fault(vector.single_observation_space, obs)
+        if fault is not None:
+            return i, f"it returned {fault}"
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    number = frame.f_locals.get("i") if frame.f_locals.get("self") is vector else None
+    if not isinstance(number, int):
+        return None, None
+    if "unpack" in str(error) and frame.f_code.co_name == "step":
+        return number, f"{error}; step must return {faults.STEP_VALUES}; {faults.TERMINATED_AND_TRUNCATED}"
+    return number, None
+
+
+def ended(env: AsyncVectorEnv) -> WorkerError:
+    """Returns the error that says which worker is gone, after ending the others."""
+    gone = []
+    for i, process in enumerate(env.processes):
+        process.join(0.2)  # its pipe may close a moment before it is gone
+        if process.exitcode is not None:
+            gone.append(f"that of environment {i} with exit code {process.exitcode}")
+    for process in env.processes:
+        process.terminate()
+    for process in env.processes:
+        process.join()
+    env.closed = True  # closing it in the ordinary way would wait for answers
+    return WorkerError(
+        f"a worker process ended by itself: {'; '.join(gone) or 'unknown which'}; what it printed may say why"
+    )
 
 
 def _put(batch: Any, i: int, one: Any) -> None:

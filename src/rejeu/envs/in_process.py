@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import jax
 import numpy as np
+from numpy import ndarray
 
-from rejeu.envs import goals as goals_module
+from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
+from rejeu.envs.conversions import FLAGS, flag_of, reward_of
 from rejeu.envs.vec_env import VecEnv
+from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
-from rejeu.spaces import flat_keys, leaves, plain, structure
+from rejeu.spaces import leaves, structure
+
+FINITE_EVERY = 64
+"""Steps of the vector between two looks for observations that are not finite; there is one more where episodes end."""
 
 
 class InProcess(VectorEnv):
-    """Gymnasium environments stepped one after the other in this process."""
+    """Gymnasium environments stepped one after the other in this process.
+
+    What they answer is checked as it comes, for some nanoseconds: :class:`rejeu.errors.BadEnvironmentError` says which
+    environment answered what at which step. What an environment itself raises is raised as it is.
+    """
 
     backend = "gymnasium"
 
@@ -32,13 +43,19 @@ class InProcess(VectorEnv):
         self.observation_space = envs[0].observation_space
         self.action_space = envs[0].action_space
         self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(envs[0])
+        self.n_steps = 0
+        """How often the vector was stepped."""
+        self._all = range(self.n_envs)
         self._seed = seed
         self._leaves = leaves(self.observation_space)
-        stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
-        self._stores = stores
-        self._plain = isinstance(self.observation_space, gym.spaces.Box)
-        self._keys = flat_keys(structure(self.observation_space))
-        self._obs = jax.tree.unflatten(structure(self.observation_space), stores)
+        self._stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
+        self._put = answers.writer(self.observation_space, self._stores)
+        only = self._stores[0] if isinstance(self.observation_space, gym.spaces.Box) else None
+        self._hot = (self._put, only, math.prod(self._leaves[0].shape), self.observation_space.dtype)
+        """What every step needs, in one place; ``only`` is the store of observations that are one array."""
+        floats = [store.reshape(-1) for store in self._stores if store.dtype.kind == "f"]
+        self._watched = [(flat, np.zeros_like(flat)) for flat in floats]
+        self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
 
     def handed_on(self, wrap: Callable[[gym.Env], gym.Env], seed: int | None = None) -> InProcess:
         """Returns the same environments wrapped, as another vector that is to be used in place of this one.
@@ -52,30 +69,68 @@ class InProcess(VectorEnv):
         seed = self._seed if seed is None else seed
         self._seed = None
         for i, env in enumerate(self.envs):
-            obs, _ = env.reset(seed=None if seed is None else seed + i)
-            self._store(i, obs)
+            try:
+                self._put(i, answers.reset(env, None if seed is None else seed + i)[0])
+            except BadEnvironmentError as error:
+                raise self._bad(i, str(error), error) from error.__cause__
         return self._obs
 
-    def _step_all(self, action: np.ndarray) -> Step:
-        return self._step_each(range(self.n_envs), action)
-
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
-        return self._step_each(np.flatnonzero(active).tolist(), action)
+        return self._step_all(action, np.flatnonzero(active).tolist())
 
-    def _step_each(self, which: Iterable[int], action: np.ndarray) -> Step:
+    def _step_all(self, action: np.ndarray, which: Sequence[int] | None = None) -> Step:
+        """Steps the environments ``which``, None for all."""
         reward = np.zeros(self.n_envs, np.float32)
         terminated = np.zeros(self.n_envs, bool)
         truncated = np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
-        for i in which:
-            obs, reward[i], terminated[i], truncated[i], info[i] = self.envs[i].step(action[i])
-            self._store(i, obs)
+        envs = self.envs
+        put, only, size, dtype = self._hot
+        self.n_steps = n_steps = self.n_steps + 1
+        for i in self._all if which is None else which:
+            answer = envs[i].step(action[i])
+            try:
+                obs, gain, ended, cut, info[i] = answer
+                if only is not None and type(obs) is ndarray and obs.size == size and obs.dtype is dtype:
+                    only[i] = obs  # what put does, without the call
+                else:
+                    put(i, obs)
+                reward[i] = gain if type(gain) is float else reward_of(gain)
+                if ended is not False:
+                    terminated[i] = ended if type(ended) in FLAGS else flag_of(ended)
+                if cut is not False:
+                    truncated[i] = cut if type(cut) in FLAGS else flag_of(cut)
+            except Exception as error:  # whatever NumPy says of an answer that does not fit
+                raise self._bad(i, faults.step_fault(answer, self.observation_space), error) from error
+        if not n_steps % FINITE_EVERY:
+            self._check_finite()
         return Step(self._obs, reward, terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
+        self._check_finite()
+        envs, put = self.envs, self._put
         for i in np.flatnonzero(done).tolist():
-            self._store(i, self.envs[i].reset()[0])
+            answer = envs[i].reset()
+            try:
+                obs, info = answer
+                if type(answer) is not tuple or not isinstance(info, dict):
+                    raise TypeError("no tuple of an observation and a dict")
+                put(i, obs)
+            except Exception as error:  # whatever NumPy says of an answer that does not fit
+                raise self._bad(i, faults.reset_fault(answer, self.observation_space), error) from error
         return self._obs
+
+    def _check_finite(self) -> None:
+        for flat, zeros in self._watched:
+            if flat.dot(zeros) != 0.0:  # NaN for anything that is not finite, in a third of the time of isfinite
+                found = faults.finite_fault(self._leaves, self._stores)
+                assert found is not None
+                raise BadEnvironmentError(faults.blamed(self.env_id, found[0], self.n_steps, f"returned {found[1]}"))
+
+    def _bad(self, i: int, fault: str | None, error: Exception) -> BadEnvironmentError:
+        """Returns what is wrong with environment ``i``'s answer, be it only what NumPy said of it."""
+        said = fault or f"{type(error).__name__}: {error}"
+        return BadEnvironmentError(faults.blamed(self.env_id, i, self.n_steps, said))
 
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])
@@ -86,14 +141,3 @@ class InProcess(VectorEnv):
     def close(self) -> None:
         for env in self.envs:
             env.close()
-
-    def _store(self, i: int, obs: Any) -> None:
-        if self._plain:
-            self._stores[0][i] = obs
-            return
-        if self._keys is not None:
-            for key, store in zip(self._keys, self._stores, strict=True):
-                store[i] = obs[key]
-            return
-        for store, part in zip(self._stores, jax.tree.leaves(plain(self.observation_space, obs)), strict=True):
-            store[i] = part

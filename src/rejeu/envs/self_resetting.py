@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rejeu.envs import goals as goals_module
+from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.auto_reset import AutoResetView, DummyVecEnv
 from rejeu.envs.contract import Step, VectorEnv, success_of
 from rejeu.envs.in_process import InProcess
@@ -15,7 +15,7 @@ from rejeu.envs.vec_env import VecEnv, is_vecenv_wrapped
 from rejeu.envs.vec_normalize import VecNormalize
 from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
-from rejeu.spaces import cast, leaves, plain
+from rejeu.spaces import leaves, plain
 
 TERMINAL = "terminal_observation"
 """Where an info has what an episode ended in."""
@@ -50,6 +50,8 @@ class SelfResetting(VectorEnv):
         if (spec := _first_attr(venv, "spec")) is not None:
             self.env_id, self.max_episode_steps = spec.id, spec.max_episode_steps
             self.reward_threshold = spec.reward_threshold
+        self.n_steps = 0
+        """How often the vector was stepped."""
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
@@ -67,8 +69,16 @@ class SelfResetting(VectorEnv):
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
-        shown, reward, dones, infos = self.venv.step(action)
-        done = np.asarray(dones, bool)
+        self.n_steps += 1
+        answer = self.venv.step(action)
+        if not isinstance(answer, tuple) or len(answer) != 4:
+            raise self._bad(f"step returned {faults.described(answer)}, expected (obs, rewards, dones, infos)")
+        shown, reward, dones, infos = answer
+        try:
+            done = answers.for_each("dones", dones, self.n_envs, bool)
+            reward = answers.for_each("rewards", reward, self.n_envs, np.float32)
+        except BadEnvironmentError as error:
+            raise self._bad(f"step returned {error}") from error.__cause__
         truncated = np.array([bool(info.get(TIME_LIMIT, False)) for info in infos]) & done
         obs = self._after_reset = self._cast(shown)
         returns = None
@@ -79,7 +89,7 @@ class SelfResetting(VectorEnv):
                 self._put(obs, i, infos[i])
                 returns[i] = np.asarray(infos[i].get("episode", {}).get("r", np.nan)).item()
         self._obs = obs
-        return Step(obs, np.asarray(reward, np.float32), done & ~truncated, truncated, infos, returns)
+        return Step(obs, reward, done & ~truncated, truncated, infos, returns)
 
     def _put(self, obs: Any, i: int, info: dict[str, Any]) -> None:
         """Puts what the episode of environment ``i`` ended in into a batch of observations."""
@@ -153,7 +163,13 @@ class SelfResetting(VectorEnv):
         self.venv.close()
 
     def _cast(self, obs: Any) -> Any:
-        return cast(self.observation_space, self._leaves, obs)
+        try:
+            return answers.batch(self.observation_space, self._leaves, self.n_envs, obs)
+        except BadEnvironmentError as error:
+            raise self._bad(f"it returned {error}") from error.__cause__
+
+    def _bad(self, fault: str) -> BadEnvironmentError:
+        return BadEnvironmentError(faults.blamed(self.env_id, None, self.n_steps, fault))
 
 
 def _first_attr(venv: VecEnv, name: str) -> Any:

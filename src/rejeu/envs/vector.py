@@ -1,7 +1,8 @@
 """Many environments stepped as one: :func:`make_vector` chooses and makes the backend.
 
-Each backend has a module of its own: :mod:`rejeu.envs.in_process`, :mod:`rejeu.envs.gymnasium_vector`,
-:mod:`rejeu.envs.envpool` and :mod:`rejeu.envs.self_resetting`. What they have in common is :mod:`rejeu.envs.contract`.
+Each backend has a module of its own: :mod:`rejeu.envs.in_process`, :mod:`rejeu.envs.in_workers`,
+:mod:`rejeu.envs.envpool`, :mod:`rejeu.envs.gymnasium_vector` and :mod:`rejeu.envs.self_resetting`. What they have in common
+is :mod:`rejeu.envs.contract`.
 """
 
 from __future__ import annotations
@@ -11,18 +12,20 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
-from rejeu.envs import measuring, workers
-from rejeu.envs.contract import Step, VectorEnv, describe_spec
+from rejeu.envs import measuring
+from rejeu.envs.contract import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
+from rejeu.envs.in_workers import InWorkers
 from rejeu.envs.registry import maker
 from rejeu.envs.vec_env import VecEnv
+from rejeu.envs.workers import TIMEOUT, check_options
 
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
 
-__all__ = ["Backend", "EnvPool", "GymnasiumVector", "InProcess", "Step", "VectorEnv", "make_vector"]
+__all__ = ["Backend", "EnvPool", "GymnasiumVector", "InProcess", "InWorkers", "Step", "VectorEnv", "make_vector"]
 
 
 def make_vector(
@@ -30,6 +33,9 @@ def make_vector(
     n_envs: int = 1,
     backend: Backend = "auto",
     seed: int | None = None,
+    *,
+    worker_timeout: float | None = TIMEOUT,
+    restart_workers: int = 0,
     **env_kwargs: Any,
 ) -> VectorEnv:
     """Returns ``n_envs`` environments as one.
@@ -43,6 +49,11 @@ def make_vector(
             :mod:`rejeu.envs.measuring`); for a function, this process. The result's ``backend`` says which it is, its
             ``measured`` what it was chosen by.
         seed: seeds the environments, each differently, at their first reset. None draws one.
+        worker_timeout: seconds that worker processes have for a step or a reset before they count as hung; None: for
+            ever. Of no meaning on other backends.
+        restart_workers: how many worker processes that crashed or hung are started anew, with a warning, and their
+            episode counted as truncated there; after that, and by default, :class:`rejeu.errors.WorkerError` is raised.
+            Only for ``backend="gymnasium-async"``.
         env_kwargs: handed to ``gymnasium.make``.
 
     Raises:
@@ -58,6 +69,12 @@ def make_vector(
         raise ValueError(f"backend={backend!r} must be one of {', '.join(BACKENDS)}")
     if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
+    check_options(worker_timeout, restart_workers)
+    if restart_workers and (backend != "gymnasium-async" or not (isinstance(env, str) or is_maker(env))):
+        raise ValueError(
+            f"restart_workers={restart_workers} is for worker processes, got backend={backend!r} and an env of type "
+            f"{type(env).__name__}; use backend='gymnasium-async' and an id or a function"
+        )
     if isinstance(env, VectorEnv):
         return env
     if isinstance(env, VecEnv):
@@ -74,8 +91,7 @@ def make_vector(
         return InProcess([env], seed)
     if callable(env):
         if backend == "gymnasium-async":
-            one = env()
-            return GymnasiumVector(workers.start(env, one, n_envs), seed, env, describe_spec(one))
+            return InWorkers(env, n_envs, seed, worker_timeout, restart_workers)
         return InProcess([env() for _ in range(n_envs)], seed)
     if not isinstance(env, str):
         raise TypeError(
@@ -90,7 +106,7 @@ def make_vector(
             env_kwargs,
             lambda: not env_kwargs and envpool_knows(env),
         )
-        vector = make_vector(env, n_envs, choice.backend, seed, **env_kwargs)  # type: ignore[arg-type]
+        vector = make_vector(env, n_envs, choice.backend, seed, worker_timeout=worker_timeout, **env_kwargs)  # type: ignore
         vector.measured, vector.passed_over = choice.measured, choice.passed_over
         return vector
     if backend == "envpool":
@@ -98,4 +114,16 @@ def make_vector(
             raise ValueError(f"the envpool backend takes no environment arguments, got {env_kwargs}; use 'gymnasium'")
         check_envpool_knows(env)
         return EnvPool(env, n_envs, seed)
-    return make_vector(maker(env, **env_kwargs), n_envs, backend, seed)
+    return make_vector(
+        maker(env, **env_kwargs),
+        n_envs,
+        backend,
+        seed,
+        worker_timeout=worker_timeout,
+        restart_workers=restart_workers,
+    )
+
+
+def is_maker(env: Any) -> bool:
+    """Returns whether this is a function that makes environments, rather than environments."""
+    return callable(env) and not isinstance(env, gym.Env | gym.vector.VectorEnv | VecEnv | VectorEnv)

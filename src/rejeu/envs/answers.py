@@ -1,0 +1,119 @@
+"""What environments answer to reset and step, taken apart: written into batches, or refused in words.
+
+The loops pay for a few comparisons here; what to say where they fail is in :mod:`rejeu.envs.faults`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import jax
+import numpy as np
+from gymnasium import spaces
+
+from rejeu.envs.conversions import fitted, parts
+from rejeu.envs.faults import described, name_of, reset_fault, seed_fault
+from rejeu.errors import BadEnvironmentError
+from rejeu.spaces import Leaf, cast, flat_keys, leaves, plain, structure
+
+
+def writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, Any], None]:
+    """Returns ``put(i, observation)``, which writes one observation into row ``i`` of each of the ``stores``.
+
+    ``stores`` hold the leaves of ``space`` in the order of :func:`rejeu.spaces.leaves`, ``(n_envs, *leaf.shape)``, of the
+    kept dtypes. Numbers of another dtype are cast where that loses no more than precision. ``put`` raises anything for an
+    observation that does not fit; :func:`rejeu.envs.faults.observation_fault` then says why.
+    """
+    slots = [
+        (store, leaf.shape, math.prod(leaf.shape), part.dtype, np.ndarray)
+        for store, leaf, part in zip(stores, leaves(space), parts(space), strict=True)
+    ]
+    if isinstance(space, spaces.Box):
+        store, shape, size, dtype, array = slots[0]
+
+        def put_array(i: int, obs: Any) -> None:
+            # As many numbers as are expected can only be broadcast from shapes with leading ones, which is harmless.
+            if type(obs) is not array or obs.size != size or obs.dtype is not dtype:
+                obs = fitted(obs, shape, store.dtype)
+            store[i] = obs
+
+        return put_array
+    keys = flat_keys(structure(space))
+    if keys is not None:
+        keyed = [(key, *slot) for key, slot in zip(keys, slots, strict=True)]
+
+        def put_dict(i: int, obs: Any) -> None:
+            for key, store, shape, size, dtype, array in keyed:
+                part = obs[key]
+                if type(part) is not array or part.size != size or part.dtype is not dtype:
+                    part = fitted(part, shape, store.dtype)
+                store[i] = part
+
+        return put_dict
+
+    def put_tree(i: int, obs: Any) -> None:
+        for (store, shape, *_), part in zip(slots, jax.tree.leaves(plain(space, obs), is_leaf=_is_list), strict=True):
+            store[i] = fitted(part, shape, store.dtype)
+
+    return put_tree
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list)
+
+
+def reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    """Returns what ``env.reset`` returned; ``seed`` and ``options`` are handed over only if they are not None.
+
+    Raises:
+        BadEnvironmentError: if it does not take a seed, or returned something else than an observation of its space and a
+            dict.
+    """
+    arguments: dict[str, Any] = {} if seed is None else {"seed": seed}
+    if options is not None:
+        arguments["options"] = options
+    try:
+        answer = env.reset(**arguments)
+    except TypeError as error:
+        if seed is not None and (fault := seed_fault(env)) is not None:
+            raise BadEnvironmentError(fault) from error
+        raise
+    fault = reset_fault(answer, env.observation_space)
+    if fault is not None:
+        raise BadEnvironmentError(fault)
+    return answer
+
+
+def batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:
+    """Returns observations that a vector environment showed as :func:`rejeu.spaces.cast` does.
+
+    Raises:
+        BadEnvironmentError: with the words only, if they are not ``(n_envs, *leaf.shape)`` at every leaf.
+    """
+    try:
+        arrays = cast(space, space_leaves, obs)
+    except Exception as error:  # whatever NumPy says of what does not fit
+        raise BadEnvironmentError(f"observations as {described(obs)}, expected a batch of {space}: {error}") from error
+    for leaf, array in zip(space_leaves, jax.tree.leaves(arrays), strict=True):
+        if array.shape != (n_envs, *leaf.shape):
+            raise BadEnvironmentError(
+                f"{name_of(leaf.path)} of all environments of shape {array.shape}, expected {(n_envs, *leaf.shape)}; one "
+                "row for each environment"
+            )
+    return arrays
+
+
+def for_each(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
+    """Returns the rewards or flags that a vector environment returned, ``dtype (n_envs,)``.
+
+    Raises:
+        BadEnvironmentError: with the words only, if they are no numbers of that shape.
+    """
+    array = np.asarray(values)
+    if array.shape != (n_envs,) or array.dtype.kind not in ("fiub" if dtype == np.float32 else "iub"):
+        kind = "numbers" if dtype == np.float32 else "bools"
+        raise BadEnvironmentError(f"{name} as {described(values)}, expected {kind} of shape ({n_envs},)")
+    return array.astype(dtype, copy=False)

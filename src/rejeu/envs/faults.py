@@ -1,0 +1,246 @@
+"""What is wrong with what an environment returned, in words.
+
+Every function here that is called ``*_fault`` returns one sentence that says what was received, what was expected and what
+to do, or None where nothing is wrong. They run once something has failed, and in :func:`rejeu.check_env`.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from rejeu.envs.conversions import FLAGS, flag_of, keeps, parts, reward_of
+from rejeu.spaces import Leaf, leaves
+
+STEP_VALUES = "(obs, reward, terminated, truncated, info)"
+TERMINATED_AND_TRUNCATED = (
+    "terminated says that the task itself ended, truncated that a time limit cut the episode off; return both as bools"
+)
+
+
+def seed_fault(env: gym.Env) -> str | None:
+    """Says which of an environment and its wrappers cannot be reset with a seed."""
+    layer: Any = env
+    while layer is not None:
+        parameters = inspect.signature(layer.reset).parameters
+        if "seed" not in parameters and all(one.kind is not one.VAR_KEYWORD for one in parameters.values()):
+            return (
+                f"{type(layer).__name__}.reset({', '.join(parameters)}) takes no seed, expected "
+                "reset(*, seed=None, options=None); add the arguments, and call super().reset(seed=seed) in it"
+            )
+        layer = getattr(layer, "env", None) if isinstance(layer, gym.Wrapper) else None
+    return None
+
+
+def reset_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | None:
+    """Says what is wrong with what ``reset`` returned; for ``strict`` see :func:`observation_fault`."""
+    if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
+        only = observation_fault(space, answer) is None
+        what = "the observation only" if only else f"{described(answer)}"
+        return f"reset returned {what}, expected (obs, info); return obs, {{}} if there is nothing to say"
+    fault = observation_fault(space, answer[0], strict=strict)
+    return None if fault is None else f"reset returned {fault}"
+
+
+def step_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | None:
+    """Says what is wrong with what ``step`` returned; for ``strict`` see :func:`observation_fault`."""
+    if not isinstance(answer, tuple) or len(answer) != 5:
+        what = f"{len(answer)} values" if isinstance(answer, tuple) else described(answer)
+        old = " as in the old package gym" if isinstance(answer, tuple) and len(answer) == 4 else ""
+        return f"step returned {what}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
+    obs, reward, terminated, truncated, info = answer
+    fault = (
+        observation_fault(space, obs, strict=strict)
+        or reward_fault(reward, strict)
+        or flag_fault("terminated", terminated, strict)
+        or flag_fault("truncated", truncated, strict)
+    )
+    if fault is None and not isinstance(info, dict):
+        fault = f"the info {described(info)}, expected a dict; return {{}} if there is nothing to say"
+    return None if fault is None else f"step returned {fault}"
+
+
+def reward_fault(reward: Any, strict: bool = False) -> str | None:
+    """Says what is wrong with a reward; if ``strict``, an array of one number and what is not finite are wrong too.
+
+    The loops look at whether rewards are finite themselves, all of a step at once.
+    """
+    fix = "expected one finite number; return float(reward)"
+    if reward is None:
+        return "the reward None, expected one finite number; is a return value missing on some way through step?"
+    if np.size(reward) != 1 or (strict and np.ndim(reward) > 0):
+        hint = "sum or average it: float(reward.sum())" if np.size(reward) > 1 else "return float(reward[0])"
+        return f"a reward of shape {np.shape(reward)}, expected one finite number; {hint}"
+    try:
+        number = reward_of(reward)
+    except (TypeError, ValueError):
+        return f"the reward {described(reward)}, {fix}"
+    if strict and not np.isfinite(number):
+        return f"the reward {reward}, {fix}, and look for divisions by zero"
+    return None
+
+
+def flag_fault(name: str, flag: Any, strict: bool = False) -> str | None:
+    """Says what is wrong with ``terminated`` or ``truncated``; if ``strict``, zeros and ones are wrong too."""
+    try:
+        flag_of(flag)
+        fits = not strict or type(flag) in FLAGS
+    except (TypeError, ValueError):
+        fits = False
+    if fits:
+        return None
+    hint = " (is the info in its place, as in the old package gym?)" if isinstance(flag, dict) else ""
+    return f"{name}={flag!r:.80} of type {type(flag).__name__}{hint}, expected a bool; {TERMINATED_AND_TRUNCATED}"
+
+
+def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: bool = False) -> str | None:
+    """Says what is wrong with the structure, shape or dtype of one observation.
+
+    Args:
+        space: what is declared.
+        obs: what came.
+        path: where it sits in the whole observation.
+        strict: whether anything else than the declared dtype, a key too many or a list for an array is wrong as well; in
+            training these are cast, ignored and turned into arrays.
+    """
+    what = name_of(path)
+    if isinstance(space, spaces.Dict):
+        keys = sorted(space.spaces)
+        if not isinstance(obs, Mapping):
+            return f"{what} as {described(obs)}, expected a dict with the keys {', '.join(keys)}"
+        missing = [key for key in keys if key not in obs]
+        extra = [str(key) for key in obs if key not in space.spaces] if strict else []
+        if missing or extra:
+            fix = f"add {', '.join(missing)}" if missing else f"declare or leave out {', '.join(extra)}"
+            return f"{what} with the keys {', '.join(sorted(map(str, obs)))}, expected {', '.join(keys)}; {fix}"
+        inner = [(key, space.spaces[key], obs[key]) for key in keys]
+    elif isinstance(space, spaces.Tuple):
+        n = len(space.spaces)
+        if not isinstance(obs, tuple | list) or len(obs) != n:
+            got = f"{len(obs)} parts" if isinstance(obs, tuple | list) else described(obs)
+            return f"{what} as {got}, expected a tuple of {n} parts"
+        inner = [(str(i), part, one) for i, (part, one) in enumerate(zip(space.spaces, obs, strict=True))]
+    else:
+        return _array_fault(space, obs, what, strict)
+    faults = (observation_fault(part, one, f"{path}.{key}".lstrip("."), strict) for key, part, one in inner)
+    return next((fault for fault in faults if fault is not None), None)
+
+
+def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str | None:
+    """Says what is wrong with one array of an observation."""
+    (leaf,) = leaves(space)
+    try:
+        array = np.asarray(obs)
+    except ValueError:
+        return f"{what} as {described(obs)}, expected an array of shape {leaf.shape}"
+    if array.dtype.kind not in "fiub":
+        return f"{what} as {described(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
+    if array.shape != leaf.shape:
+        fix = f"return it with .reshape({leaf.shape})" if array.size == _size(leaf) else "return the declared shape"
+        return f"{what} of shape {array.shape}, expected {leaf.shape}; {fix}, or declare {array.shape} in the space"
+    if not keeps(array, leaf.dtype):
+        with np.errstate(invalid="ignore", over="ignore"):
+            at = tuple(np.argwhere(array.astype(leaf.dtype) != array)[0].tolist())
+        fix = "multiply by 255 first if the numbers lie in [0, 1], or " if leaf.kind == "image" else ""
+        return (
+            f"{what} of dtype {array.dtype}, expected {space.dtype}, which cannot hold {array[at]}{_place(at)}; {fix}"
+            f"declare Box(..., dtype=np.{'float32' if array.dtype.kind == 'f' else array.dtype})"
+        )
+    if strict and isinstance(space, spaces.Box) and array.dtype != space.dtype:
+        return f"{what} of dtype {array.dtype}, expected {space.dtype}; return it with .astype(np.{space.dtype})"
+    if strict and not isinstance(space, spaces.Discrete) and not isinstance(obs, np.ndarray | np.generic):
+        return f"{what} as {described(obs)}, expected an array; return np.array(..., np.{space.dtype})"
+    return None
+
+
+def bounds_fault(space: spaces.Space, obs: Any, path: str = "") -> str | None:
+    """Says which number of an observation of the right structure is not finite, or lies outside of the declared bounds."""
+    for leaf, part, value in zip(leaves(space, path), parts(space), _values(space, obs), strict=True):
+        array, what = np.asarray(value), name_of(leaf.path)
+        if (fault := _finite_fault(array, what)) is not None:
+            return fault
+        if isinstance(part, spaces.Box):
+            low, high = part.low, part.high
+        elif leaf.kind == "categorical":
+            low = np.reshape(leaf.starts, leaf.shape)
+            high = low + np.reshape(leaf.sizes, leaf.shape) - 1
+        else:
+            low, high = np.zeros(leaf.shape), np.ones(leaf.shape)
+        outside = np.argwhere((array < low) | (array > high))
+        if len(outside):
+            at = tuple(outside[0].tolist())
+            more = f" (and {len(outside) - 1} more)" if len(outside) > 1 else ""
+            return (
+                f"{what} with {array[at]}{_place(at)}{more}, outside of the declared bounds [{low[at]}, {high[at]}]; "
+                "declare the bounds that it really has, or np.inf, or clip it"
+            )
+    return None
+
+
+def finite_fault(space_leaves: Sequence[Leaf], stores: Sequence[np.ndarray]) -> tuple[int, str] | None:
+    """Returns the environment and the sentence for the first number in a batch of observations that is not finite."""
+    for leaf, store in zip(space_leaves, stores, strict=True):
+        if store.dtype.kind == "f" and not np.isfinite(store).all():
+            env = int(np.argwhere(~np.isfinite(store))[0][0])
+            return env, f"{_finite_fault(store[env], name_of(leaf.path))}"
+    return None
+
+
+def _finite_fault(array: np.ndarray, what: str) -> str | None:
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return None
+    at = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+    return f"{what} with {array[at]}{_place(at)}, expected finite numbers; look for divisions by zero and overflows"
+
+
+def _values(space: spaces.Space, obs: Any) -> list[Any]:
+    if isinstance(space, spaces.Dict):
+        return [value for key in sorted(space.spaces) for value in _values(space.spaces[key], obs[key])]
+    if isinstance(space, spaces.Tuple):
+        return [value for part, one in zip(space.spaces, obs, strict=True) for value in _values(part, one)]
+    return [obs]
+
+
+def _size(leaf: Leaf) -> int:
+    return int(np.prod(leaf.shape, dtype=int))
+
+
+def _place(at: tuple[int, ...]) -> str:
+    return f" at index {at[0] if len(at) == 1 else at}" if at else ""
+
+
+def name_of(path: str) -> str:
+    """Returns what a leaf of an observation is called in a message."""
+    return f"the observation under {path!r}" if path else "the observation"
+
+
+def described(value: Any) -> str:
+    """Returns a value as it is told to a user: type, and shape or beginning."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape} and dtype {value.dtype}"
+    if isinstance(value, tuple | list):
+        return f"a {type(value).__name__} of {len(value)} values"
+    if isinstance(value, Mapping):
+        return f"a dict with the keys {', '.join(map(str, value))}"
+    return "None" if value is None else f"{value!r:.80} of type {type(value).__name__}"
+
+
+def blamed(env_id: str, env: int | None, n_steps: int, fault: str) -> str:
+    """Returns a message that names the environment, its number in the vector (None: unknown), and the step.
+
+    >>> blamed("Walk", 2, 7, "step returned 4 values")
+    'Walk, environment 2, step 7: step returned 4 values'
+    """
+    which = "one of the environments" if env is None else f"environment {env}"
+    when = f"step {n_steps}" if n_steps else "the first reset"
+    return f"{env_id}, {which}, {when}: {fault}"
+
+
+def id_of(env: gym.Env) -> str:
+    """Returns the id of an environment, or the name of its class."""
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
