@@ -7,9 +7,10 @@
 """
 
 from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
+from rejeu.envs.checker import check_env
 from rejeu.envs.monitor import Monitor
 from rejeu.envs.vector import make_vector
-from rejeu.errors import CheckpointError, MissingExtra
+from rejeu.errors import BadEnvironmentError, CheckpointError, MissingExtra, WorkerError
 from rejeu.evaluation import Evaluation, evaluate_policy
 from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from rejeu.exploration.parameter_space import ParameterNoise
@@ -30,6 +31,7 @@ __all__ = [
     "SAC",
     "TD3",
     "TQC",
+    "BadEnvironmentError",
     "CheckpointError",
     "CrossQ",
     "Evaluation",
@@ -45,6 +47,8 @@ __all__ = [
     "ParameterNoise",
     "RecurrentPPO",
     "ReplayBuffer",
+    "WorkerError",
+    "check_env",
     "evaluate_policy",
     "load",
     "make_vector",

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from rejeu.cli import evaluate, list as listing, play, record, resume, train, watch
+from rejeu.cli import check, evaluate, list as listing, play, record, resume, train, watch
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "record": (record.Record, record.run),
     "play": (play.Play, play.run),
     "watch": (watch.Watch, watch.run),
+    "check": (check.Check, check.run),
     "list": (listing.List, listing.run),
 }
 """Each command's arguments, and the function that takes them and returns the exit status."""

@@ -51,6 +51,8 @@ class Train:
     """Environments stepped at once; by default the preset's, else 1."""
     backend: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto: the fastest, measured once."""
+    restart_workers: Annotated[int, arg(metavar="N")] = 0
+    """With --backend gymnasium-async: how many worker processes that crashed or hung are started anew."""
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Seeds everything; one is drawn if none is given."""
     assignments: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
@@ -173,7 +175,8 @@ def make_env(arguments: Train, preset: Preset | None, seed: int) -> VectorEnv:
 
     n_envs = arguments.envs or (preset.n_envs if preset else 1)
     backend = arguments.backend or (preset.backend if preset else "auto")
-    return make_vector(arguments.env, n_envs, backend, seed)  # type: ignore[arg-type]
+    restarts = arguments.restart_workers
+    return make_vector(arguments.env, n_envs, backend, seed, restart_workers=restarts)  # type: ignore[arg-type]
 
 
 def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
@@ -288,7 +291,7 @@ def train(
             evaluate.run(agent, agent.num_timesteps)
         if not evaluate.results:
             agent.save(folder.best)
-    except errors.BadEnvironmentError:
+    except (errors.BadEnvironmentError, errors.WorkerError):
         agent.save(folder.agent)
         raise
     finally:

@@ -5,6 +5,7 @@ The loops pay for a few comparisons here; what to say where they fail is in :mod
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -85,6 +86,18 @@ def reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None 
     if fault is not None:
         raise BadEnvironmentError(fault)
     return answer
+
+
+def kept(space: spaces.Space, obs: Any) -> Any:
+    """Returns a copy of an observation of the right structure, in which every leaf can be cast to the dtype declared."""
+    if isinstance(space, spaces.Dict):
+        return {key: kept(part, obs[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(kept(part, one) for part, one in zip(space.spaces, obs, strict=True))
+    dtype = np.dtype(space.dtype)
+    if isinstance(obs, np.ndarray) and np.can_cast(obs.dtype, dtype, "same_kind"):
+        return obs.copy()
+    return copy.deepcopy(obs) if np.isscalar(obs) else np.asarray(obs).astype(dtype)
 
 
 def batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:

@@ -6,7 +6,6 @@ ended in is never hidden from learning.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -85,7 +84,9 @@ class DummyVecEnv(VecEnv):
             if (fault := faults.step_fault(answer, env.observation_space)) is not None:
                 raise BadEnvironmentError(faults.blamed(faults.id_of(env), i, self.n_steps, fault))
             obs, rewards[i], terminated, truncated, info = conversions.numbers_of(answer)
-            obs = copy.deepcopy(obs)  # an environment may write its next observation into the same array
+            obs = answers.kept(
+                env.observation_space, obs
+            )  # an environment may write its next observation into the same array
             info = {**info, "TimeLimit.truncated": truncated and not terminated}
             dones[i] = terminated or truncated
             if dones[i]:
@@ -101,7 +102,7 @@ class DummyVecEnv(VecEnv):
             obs, self.reset_infos[i] = answers.reset(env, seed, options)
         except BadEnvironmentError as error:
             raise BadEnvironmentError(faults.blamed(faults.id_of(env), i, self.n_steps, str(error))) from error
-        return copy.deepcopy(obs)
+        return answers.kept(env.observation_space, obs)
 
     def _stack(self, parts: list[Any]) -> Any:
         space = self.observation_space

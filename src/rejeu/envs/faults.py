@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -158,26 +158,34 @@ def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str 
     return None
 
 
-def bounds_fault(space: spaces.Space, obs: Any, path: str = "") -> str | None:
-    """Says which number of an observation of the right structure is not finite, or lies outside of the declared bounds."""
-    for leaf, part, value in zip(leaves(space, path), parts(space), _values(space, obs), strict=True):
-        array, what = np.asarray(value), name_of(leaf.path)
-        if (fault := _finite_fault(array, what)) is not None:
-            return fault
+def finite_fault_of(space: spaces.Space, obs: Any) -> str | None:
+    """Says which number of one observation of the right structure is not finite."""
+    named = zip(leaves(space), _values(space, obs), strict=True)
+    said = (_finite_fault(np.asarray(value), name_of(leaf.path)) for leaf, value in named)
+    return next((fault for fault in said if fault is not None), None)
+
+
+def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warning"], str] | None:
+    """Says which number of one observation of the right structure lies outside of the declared bounds.
+
+    A warning for a Box, whose bounds networks never see; an error for choices and bits, which would have no place in one.
+    """
+    for leaf, part, value in zip(leaves(space), parts(space), _values(space, obs), strict=True):
+        array = np.asarray(value)
         if isinstance(part, spaces.Box):
             low, high = part.low, part.high
         elif leaf.kind == "categorical":
             low = np.reshape(leaf.starts, leaf.shape)
             high = low + np.reshape(leaf.sizes, leaf.shape) - 1
         else:
-            low, high = np.zeros(leaf.shape), np.ones(leaf.shape)
+            low, high = np.zeros(leaf.shape, int), np.ones(leaf.shape, int)
         outside = np.argwhere((array < low) | (array > high))
         if len(outside):
             at = tuple(outside[0].tolist())
             more = f" (and {len(outside) - 1} more)" if len(outside) > 1 else ""
-            return (
-                f"{what} with {array[at]}{_place(at)}{more}, outside of the declared bounds [{low[at]}, {high[at]}]; "
-                "declare the bounds that it really has, or np.inf, or clip it"
+            return "warning" if leaf.kind in ("continuous", "image") else "error", (
+                f"{name_of(leaf.path)} with {array[at]}{_place(at)}{more}, outside of the declared bounds "
+                f"[{low[at]}, {high[at]}]; declare the bounds that it really has, or clip it"
             )
     return None
 

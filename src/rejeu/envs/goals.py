@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.envs.faults import described
+from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
 
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
@@ -50,11 +52,21 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
 
     At the first call with two rows or more, it is called once with the whole batch and once for each of the first eight
     rows; if the two agree it is taken to be vectorised from then on, otherwise it is called row by row.
+
+    Raises:
+        BadEnvironmentError: by the function that is returned, if what ``function`` gives of one goal is no number.
     """
     vectorised: bool | None = None
 
     def by_row(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        return np.array([function(a, d, {}) for a, d in zip(achieved, desired, strict=True)], dtype)
+        rows = [function(a, d, {}) for a, d in zip(achieved, desired, strict=True)]
+        if any(row is None or np.shape(row) != () for row in rows):
+            wrong = next(row for row in rows if row is None or np.shape(row) != ())
+            name = getattr(function, "__name__", "the function of goals")
+            raise BadEnvironmentError(
+                f"{name} returned {described(wrong)} of one goal, expected one number; rejeu.check_env(env) says more"
+            )
+        return np.array(rows, dtype)
 
     def call(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
         nonlocal vectorised

@@ -179,7 +179,7 @@ class GymnasiumVector(VectorEnv):
 def in_machinery(error: Exception) -> bool:
     """Returns whether it was raised between the environments, by Gymnasium's vector classes or NumPy, not in one of them."""
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][1:]
-    machinery = ("gymnasium.vector.", "gymnasium.wrappers.vector.", "numpy")
+    machinery = ("gymnasium.vector.", "gymnasium.wrappers.vector.", "numpy", "functools")
     return bool(frames) and all(frame.f_globals.get("__name__", "").startswith(machinery) for frame in frames)
 
 

@@ -98,6 +98,8 @@ def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None
     """Returns what the environment answers, or how it failed."""
     try:
         answer = _answer(env, *request)
+        if put is None and request[0] in ("step and reset", "reset"):
+            return answers.kept(env.observation_space, answer[0]), *answer[1:]
         if put is None or request[0] not in ("step", "reset"):
             return answer
         put(number, answer[0])
@@ -152,6 +154,6 @@ def _step_and_reset(env: gym.Env, action: Any) -> tuple[Any, float, bool, dict[s
     info = {**info, "TimeLimit.truncated": truncated and not terminated}
     reset_info: dict[str, Any] = {}
     if terminated or truncated:
-        info["terminal_observation"] = obs
+        info["terminal_observation"] = answers.kept(env.observation_space, obs)
         obs, reset_info = answers.reset(env)
     return obs, reward, terminated or truncated, info, reset_info

@@ -1,0 +1,352 @@
+"""Environments that each do one thing wrong; :data:`EVERY` says what is to be said of it.
+
+``checked`` are words of an error or warning of ``rejeu.check_env``, ``trained`` those of the ``BadEnvironmentError`` that ends
+training, or None where training goes on, because the fault is mended on the way or cannot be seen there.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tests.environments import Reach
+
+
+class Good(gym.Env):
+    """Nothing is wrong with it: a walk of ten steps, the observation a number drawn, the time and the place."""
+
+    observation_space: spaces.Space = spaces.Box(-20.0, 20.0, (3,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        self.time, self.place, self.drawn = 0, 0.0, float(self.np_random.uniform())
+        return self.observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict]:
+        self.time += 1
+        self.place += float(action[0])
+        return self.observe(), self.place, False, self.time == 10, {}
+
+    def observe(self) -> Any:
+        return np.array([self.drawn, self.time, self.place], np.float32)
+
+    @property
+    def late(self) -> bool:
+        """Whether the fault is to show: not before the third step."""
+        return self.time >= 3
+
+
+class FloatAsImage(Good):
+    observation_space = spaces.Box(0, 255, (2, 2, 3), np.uint8)
+
+    def observe(self):
+        return np.full((2, 2, 3), 0.5 if self.late else 0.0)
+
+
+class Double(Good):
+    def observe(self):
+        return super().observe().astype(np.float64)
+
+
+class AsList(Good):
+    def observe(self):
+        return super().observe().tolist()
+
+
+class Scalar(Good):
+    """One number, which NumPy would write into all three places."""
+
+    def observe(self):
+        return np.float32(1.0) if self.late else super().observe()
+
+
+class TooLong(Good):
+    def observe(self):
+        return np.zeros(4, np.float32) if self.late else super().observe()
+
+
+class NestedShape(Good):
+    observation_space = spaces.Dict(
+        {"arm": spaces.Dict({"angles": spaces.Box(-1, 1, (2,), np.float32)}), "step": spaces.Discrete(11)}
+    )
+
+    def observe(self):
+        return {"arm": {"angles": np.zeros(3 if self.late else 2, np.float32)}, "step": self.time}
+
+
+class TupleShape(Good):
+    observation_space = spaces.Tuple([spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(11)])
+
+    def observe(self):
+        return np.zeros(2, np.float32), np.zeros(2, int) if self.late else 1
+
+
+class MissingKey(Good):
+    observation_space = spaces.Dict({key: spaces.Box(-1, 1, (2,), np.float32) for key in ("left", "right")})
+
+    def observe(self):
+        left = {"left": np.zeros(2, np.float32)}
+        return left if self.late else {**left, "right": np.zeros(2, np.float32)}
+
+
+class NothingSeen(Good):
+    def observe(self):
+        return None if self.late else super().observe()
+
+
+class NanSeen(Good):
+    def observe(self):
+        return np.array([0.0, np.nan, 0.0], np.float32) if self.late else super().observe()
+
+
+class OutOfBounds(Good):
+    observation_space = spaces.Dict({"speed": spaces.Box(-1.0, 1.0, (2,), np.float32)})
+
+    def observe(self):
+        return {"speed": np.array([0.0, 7.5 if self.late else 0.0], np.float32)}
+
+
+class Answering(Good):
+    """Answers a step with :meth:`answer` from the third on."""
+
+    def step(self, action):
+        answer = super().step(action)
+        return self.answer(*answer) if self.late else answer
+
+    def answer(self, obs, reward, terminated, truncated, info):
+        raise NotImplementedError
+
+
+class FourValues(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, reward, terminated or truncated, info
+
+
+class NoReward(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, None, terminated, truncated, info
+
+
+class NanReward(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, float("nan"), terminated, truncated, info
+
+
+class RewardArray(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, np.array([reward, reward]), terminated, truncated, info
+
+
+class RewardOfOne(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, np.array([reward]), terminated, truncated, info
+
+
+class RewardText(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, str(reward), terminated, truncated, info
+
+
+class TerminatedNone(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, reward, None, truncated, info
+
+
+class TruncatedText(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, reward, terminated, "no", info
+
+
+class TerminatedInfo(Answering):
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, reward, truncated, info, {}
+
+
+class Zeros(Answering):
+    """Flags as 0 and 1."""
+
+    def answer(self, obs, reward, terminated, truncated, info):
+        return obs, reward, int(terminated), np.float32(truncated), info
+
+
+class OnlyObservation(Good):
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0]
+
+
+class TwoKeysOnly(MissingKey):
+    """Returns a dict of two keys, which can be taken apart as a pair."""
+
+    late = False
+
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0]
+
+
+class NoSeed(Good):
+    def reset(self):
+        return super().reset()
+
+
+class Unrepeatable(Good):
+    def reset(self, *, seed=None, options=None):
+        return super().reset(options=options)
+
+
+class FoldedLimit(Good):
+    """Calls its time limit the end of the task."""
+
+    _max_episode_steps = 10
+
+    def step(self, action):
+        obs, reward, _, truncated, info = super().step(action)
+        return obs, reward, truncated, False, info
+
+
+class FoldedInInfo(Good):
+    def step(self, action):
+        obs, reward, _, truncated, _ = super().step(action)
+        return obs, reward, truncated, False, {"TimeLimit.truncated": truncated}
+
+
+class Endless(Good):
+    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+    def step(self, action):
+        obs, reward, _, _, info = super().step(action)
+        return obs, reward, False, False, info
+
+
+class SameArray(Good):
+    """Writes every observation into one array."""
+
+    def observe(self):
+        self.__dict__.setdefault("array", np.zeros(3, np.float32))[:] = super().observe()
+        return self.array
+
+
+class Line(Reach):
+    """A goal environment with nothing wrong."""
+
+    def _observe(self):
+        return {key: np.array(value) for key, value in super()._observe().items()}
+
+
+class OddReward(Line):
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward - 1.0 * (self.time > 3), terminated, truncated, info
+
+
+class RewardNeedsInfo(Line):
+    def compute_reward(self, achieved, desired, info):
+        return super().compute_reward(achieved, desired, info) + 0.0 * info.get("scale", np.nan)
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, -1.0 if np.isnan(reward) else reward, terminated, truncated, {**info, "scale": 1.0}
+
+
+class MeanReward(Line):
+    """Of many goals at once it gives to each the mean of all."""
+
+    def compute_reward(self, achieved, desired, info):
+        reward = super().compute_reward(achieved, desired, info)
+        return reward if reward.ndim == 0 else np.full_like(reward, reward.mean())
+
+
+class RowReward(Line):
+    """Takes one goal at a time."""
+
+    def compute_reward(self, achieved, desired, info):
+        return -float(np.linalg.norm(achieved - desired) >= 0.5)
+
+
+class RewardWithAxis(Line):
+    """Of one goal it gives an array."""
+
+    def compute_reward(self, achieved, desired, info):
+        return super().compute_reward(achieved, desired, info)[..., None]
+
+    def step(self, action):
+        self.position = self.position + action
+        self.time += 1
+        reward = self.compute_reward(self.position, self.goal, {})[0]
+        return self._observe(), float(reward), False, self.time == 10, {}
+
+
+class OddTerminated(Line):
+    def compute_terminated(self, achieved, desired, info):
+        return np.ones(np.shape(achieved)[:-1], bool)
+
+
+class Fault(NamedTuple):
+    """What is to be said of an environment."""
+
+    make: Any
+    level: str
+    checked: str
+    trained: str | None
+    """What ends training; None if it goes on."""
+
+
+EVERY: dict[str, Fault] = {
+    "float as image": Fault(
+        FloatAsImage,
+        "error",
+        "dtype float64, expected uint8, which cannot hold 0.5 at index .*multiply by 255",
+        "the observation of dtype float64, expected uint8, which cannot hold 0.5",
+    ),
+    "double": Fault(Double, "error", r"the observation of dtype float64, expected float32; .*astype", None),
+    "list": Fault(AsList, "error", "the observation .*expected", None),
+    "scalar": Fault(Scalar, "error", r"of shape \(\), expected \(3,\)", r"step 3: .* of shape \(\), expected \(3,\)"),
+    "too long": Fault(TooLong, "error", r"of shape \(4,\), expected \(3,\)", r"step 3: .* of shape \(4,\), expected"),
+    "nested shape": Fault(
+        NestedShape, "error", r"'arm.angles' of shape \(3,\), expected \(2,\)", r"'arm.angles' of shape \(3,\), exp"
+    ),
+    "tuple shape": Fault(
+        TupleShape, "error", r"under '1' of shape \(2,\), expected \(\)", r"under '1' of shape \(2,\), expected \(\)"
+    ),
+    "missing key": Fault(
+        MissingKey, "error", "expected left, right; add right", "keys left, expected left, right; add"
+    ),
+    "nothing seen": Fault(NothingSeen, "error", "observation as None", "step 3: .*the observation as None"),
+    "nan seen": Fault(NanSeen, "error", "the observation with nan at index 1", "the observation with nan at index 1"),
+    "out of bounds": Fault(
+        OutOfBounds, "warning", r"under 'speed' with 7.5 at index 1, outside of the declared bounds \[-1.0, 1.0\]", None
+    ),
+    "four values": Fault(
+        FourValues, "error", "4 values as in the old package gym", "4 values .* expected .*terminated, truncated"
+    ),
+    "no reward": Fault(NoReward, "error", "the reward None", "the reward None, expected one finite number"),
+    "nan reward": Fault(NanReward, "error", "the reward nan, expected one finite", "returned the reward nan in env"),
+    "reward array": Fault(RewardArray, "error", r"a reward of shape \(2,\)", r"a reward of shape \(2,\).*sum or av"),
+    "reward of one": Fault(RewardOfOne, "error", r"a reward of shape \(1,\).*float\(reward\[0\]\)", None),
+    "reward text": Fault(RewardText, "error", "the reward '.*' of type str", "the reward '.*' of type str, expected"),
+    "terminated None": Fault(TerminatedNone, "error", "terminated=None of type None", "terminated=None .* a bool"),
+    "truncated text": Fault(TruncatedText, "error", "truncated='no' of type str", "truncated='no' .*expected a bool"),
+    "terminated info": Fault(
+        TerminatedInfo, "error", "truncated={} .*is the info", "truncated={} .*is the info in its"
+    ),
+    "zeros": Fault(Zeros, "error", "terminated=0 of type int, expected a bool", None),
+    "only observation": Fault(
+        OnlyObservation, "error", "reset returned the observation only", "the observation only, expected .obs, info"
+    ),
+    "two keys only": Fault(TwoKeysOnly, "error", "the observation only", "the observation only, expected .obs, info"),
+    "no seed": Fault(NoSeed, "error", r"NoSeed.reset\(\) takes no seed", r"NoSeed.reset\(\) takes no seed, expected"),
+    "unrepeatable": Fault(Unrepeatable, "warning", "two resets with one seed .*super", None),
+    "folded limit": Fault(FoldedLimit, "warning", "terminated at its time limit of 10 steps.*truncated=True", None),
+    "folded in info": Fault(FoldedInInfo, "error", "'TimeLimit.truncated'.* truncated=False", None),
+    "endless": Fault(Endless, "warning", r"no episode ended in .* steps; .*max_episode_steps", None),
+    "same array": Fault(SameArray, "warning", "same array .*rejeu copies .*return a copy", None),
+    "odd reward": Fault(OddReward, "error", "step gave the reward .* compute_reward .* they must agree", None),
+    "reward needs info": Fault(RewardNeedsInfo, "error", "with an empty info", None),
+    "mean reward": Fault(MeanReward, "error", "of many goals at once .* of the same goals one by one", None),
+    "row reward": Fault(RowReward, "warning", r"compute_reward .*\(.*rejeu then calls it row by row", None),
+    "reward with axis": Fault(RewardWithAxis, "error", r"compute_reward .* shape \(1,\) of one goal", None),
+    "odd terminated": Fault(OddTerminated, "error", "compute_terminated .* True .* step .*terminated=False", None),
+}

@@ -1,0 +1,7 @@
+"""Registers an environment when it is imported, as packages of environments do."""
+
+import gymnasium as gym
+
+from tests.bad_environments import Scalar
+
+gym.register("Bad-v0", Scalar)
