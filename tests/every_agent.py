@@ -94,10 +94,10 @@ def shared_functions(kind: Kind) -> Iterator[None]:
         settings.append((_of_gradients(config), spaces.leaves(observation_space), actions))
         return make(config, observation_space, action_space)
 
-    def compile_once(algorithm: Any, noise: Any) -> Compiled:
-        key = settings.pop(), noise
+    def compile_once(algorithm: Any, noise: Any, skips: bool) -> Compiled:
+        key = settings.pop(), noise, skips
         if key not in _compiled:
-            _compiled[key] = Compiled(algorithm, noise)
+            _compiled[key] = Compiled(algorithm, noise, skips)
         return copy.copy(_compiled[key])
 
     with (

@@ -17,6 +17,7 @@ from rejeu import agents, spaces
 from rejeu.algorithms import sac
 from rejeu.core import Algorithm
 from rejeu.loops.compiled import Compiled
+from rejeu.loops.packing import Readings
 
 _algorithms: dict[Any, Algorithm] = {}
 _compiled: dict[Any, Compiled] = {}
@@ -61,7 +62,7 @@ def count_updates(agent: rejeu.SAC) -> list[int]:
 
     def update(leaves: Any, batches: Any, clock: Any) -> tuple[Any, dict, None]:
         calls.append(1 if batches.reward.ndim == 1 else len(batches.reward))
-        return leaves, {}, None
+        return leaves, Readings((), np.zeros(1)), None
 
     agent._compiled.update = update
     return calls

@@ -16,6 +16,7 @@ from rejeu import spaces
 from rejeu.algorithms import actor_critic
 from rejeu.core import Rollout
 from rejeu.envs.vector import InProcess
+from rejeu.loops.packing import Readings
 from rejeu.replay.rollout import RolloutBuffer, advantages
 from tests.environments import Counter
 
@@ -381,7 +382,7 @@ def recorded(n_envs, total, lengths, ends, n_steps=4):
 
     def update(state, rollout, clock):
         rollouts.append(jax.tree.map(np.copy, rollout))
-        return state, {}, None
+        return state, Readings((), np.zeros(1)), None
 
     agent._compiled.update = update
     return rollouts, agent.learn(total)

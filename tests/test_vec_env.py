@@ -15,6 +15,7 @@ from rejeu.envs.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped, unwrap_
 from rejeu.envs.vec_normalize import RunningMeanStd, VecNormalize, sync_envs_normalization
 from rejeu.envs.vec_wrappers import VecCheckNan, VecFrameStack, VecMonitor, VecTransposeImage
 from rejeu.errors import BadEnvironmentError, CheckpointError
+from rejeu.loops.packing import Readings
 from tests.environments import Reach
 from tests.golden.vec_env_script import Walk
 from tests.test_video import Lamp
@@ -120,7 +121,7 @@ def taught(agent):
 
     def update(state, batch, clock):
         rollouts.append([jax.tree.map(np.array, part) for part in batch[:5]])
-        return state, {}, None
+        return state, Readings((), np.zeros(1)), None
 
     agent._compiled.update = update
     return rollouts

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Literal, TypeVar
 
-from rejeu import running_stats, schedules
+from rejeu import finite, running_stats, schedules
 from rejeu.errors import CheckpointError
 from rejeu.exploration import noise as action_noises
 from rejeu.networks import PolicyConfig
@@ -72,6 +72,9 @@ class OffPolicyConfig:
     normalize: NormalizationConfig | None = None
     """Scale observations and rewards by what has been seen: True, or a dict with ``norm_obs``, ``norm_reward``,
     ``clip_obs``, ``clip_reward``. The statistics are learnt and saved with the agent, which takes raw observations."""
+    nonfinite: finite.Nonfinite = "stop"
+    """What to do when an update leaves a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
+    it and saves the batch, or ``"skip"`` that update as if its batch had never been drawn, and count it."""
     policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
     (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``) or a ``torso`` of your
@@ -107,6 +110,7 @@ class OffPolicyConfig:
         if self.frame_stack is not None:
             put("frame_stack", whole("frame_stack", self.frame_stack, least=1))
         put("normalize", running_stats.parse(self.normalize))
+        put("nonfinite", finite.parse(self.nonfinite))
         put("policy_kwargs", nested("policy_kwargs", PolicyConfig, self.policy_kwargs))
         self._parse_replay()
 

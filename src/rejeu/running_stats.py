@@ -93,9 +93,16 @@ def nothing(shape: tuple[int, ...]) -> Moments:
 
 
 def merged(moments: Moments, values: Array, weight: Array) -> Moments:
-    """Returns the moments after ``values`` ``(batch, *shape)`` have been seen; those with ``weight`` 0 have not."""
+    """Returns the moments after ``values`` ``(batch, *shape)`` have been seen; those with ``weight`` 0 have not.
+
+    Values that are not finite, or whose square is not, are as if they had not been seen either.
+    """
+    shape = (-1, *[1] * moments.mean.ndim)
+    is_finite = jnp.isfinite(values).reshape(values.shape[0], -1).all(axis=1)
+    values = jnp.where(is_finite.reshape(shape), values, 0.0)
+    weight = jnp.where(is_finite, weight, 0.0)
     n = jnp.sum(weight)
-    spread = weight.reshape(-1, *[1] * moments.mean.ndim)
+    spread = weight.reshape(shape)
     mean = jnp.sum(values * spread, axis=0) / jnp.maximum(n, 1.0)
     variance = jnp.sum(jnp.square(values - mean[None]) * spread, axis=0) / jnp.maximum(n, 1.0)
     total = moments.n_seen + n
@@ -105,7 +112,8 @@ def merged(moments: Moments, values: Array, weight: Array) -> Moments:
     old = jnp.where(first, 0.0, moments.variance)
     after = (1.0 - share) * old + share * variance + (1.0 - share) * share * jnp.square(delta)
     seen = Moments(moments.mean + share * delta, after, jnp.minimum(total, MOST))
-    return jax.tree.map(lambda new, before: jnp.where(n > 0, new, before), seen, moments)
+    counts = (n > 0) & jnp.isfinite(seen.mean).all() & jnp.isfinite(seen.variance).all()
+    return jax.tree.map(lambda new, before: jnp.where(counts, new, before), seen, moments)
 
 
 class Statistics(NamedTuple):

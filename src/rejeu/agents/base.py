@@ -21,7 +21,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import checkpoint, compilation, config as configs, spaces, summary
+from rejeu import checkpoint, compilation, config as configs, finite, spaces, summary
 from rejeu.agents import checkpoints, files
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import Checkpoint, Resumed, RowFiles
@@ -31,6 +31,7 @@ from rejeu.envs.masks import split
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vec_normalize import VecNormalize, unwrap_vec_normalize
 from rejeu.envs.vector import Backend, InProcess, VectorEnv
+from rejeu.errors import NonFiniteError
 from rejeu.evaluation import Evaluation, evaluate
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
@@ -74,6 +75,10 @@ class Agent(ABC):
     """The module with ``Config`` and ``make``."""
     _learning: bool = False
     """Whether ``learn`` is under way."""
+    report_folder: Path | None = None
+    """Where a batch that broke something is saved; None: see :func:`rejeu.finite.folder_of`."""
+    last_saved: Path | None = None
+    """The newest file that :meth:`save` wrote."""
 
     def __init__(
         self,
@@ -159,7 +164,7 @@ class Agent(ABC):
         if self.config.normalize is not None:
             explorer = exploration.make(algorithm, noise)
             algorithm = normalised(algorithm, explorer, self._obs_leaves, self.config.normalize)
-        self._compiled = Compiled(algorithm, noise)
+        self._compiled = Compiled(algorithm, noise, self.config.nonfinite == "skip")
         compilation.start_device(self._work(n_envs))
 
     def _work(self, n_envs: int) -> float:
@@ -232,7 +237,8 @@ class Agent(ABC):
 
     @property
     def state(self) -> Any:
-        """Everything learnt, as the algorithm's own class; a copy."""
+        """Everything learnt, as the algorithm's own class; a copy. Waits for the updates under way."""
+        finite.settle(self)
         return self._compiled.state(self._run.state)
 
     @property
@@ -335,6 +341,11 @@ class Agent(ABC):
             try:
                 with Interrupt() as interrupt:
                     self._iterate(call, callbacks, hooks, savers, outputs, interrupt)
+                finite.settle(self)
+            except finite.Broken as broken:
+                raise finite.reported(self, broken) from None
+            except NonFiniteError:
+                raise
             except Exception as error:
                 for saver in savers:
                     saver.save_after(error, self)
@@ -427,6 +438,7 @@ class Agent(ABC):
         """
         if self.best is not None and self.best.by == by and score <= self.best.score:  # type: ignore[operator]
             return False
+        finite.settle(self)
         self._put_best(score, by, self._run.step, self._compiled.copy(self._run.state))
         return True
 
@@ -463,6 +475,8 @@ class Agent(ABC):
             row[f"time/{part}_share"] = seconds[part] / max(seconds["total"], 1e-9)
         row["time/compile_seconds"] = compilation.seconds()
         row["train/n_updates"] = self._run.n_updates
+        if self._compiled.skips:
+            row["train/skipped_updates"] = self._run.watch.n_skipped
         for key, value in (self._run.metrics or {}).items():
             row[f"train/{key}"] = float(value)
         return row
@@ -533,6 +547,7 @@ class Agent(ABC):
 
         ``memory`` None stands for episodes that have not begun, as ``ended`` does for each.
         """
+        finite.settle(self)
         packed, n = self._run.state, len(ended)
         has_memory = self._compiled.algorithm.recall is not None
         if deterministic and not has_memory:
@@ -692,7 +707,8 @@ class Agent(ABC):
         ``.safetensors`` is added to a path without a suffix. The file holds everything learnt, the hyper-parameters, the
         spaces and the counters. An older file at that path is replaced only once the new one is complete.
         """
-        return checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), files.header(self))
+        self.last_saved = checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), files.header(self))
+        return self.last_saved
 
     @classmethod
     def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from filelock import FileLock, Timeout
 
-from rejeu import checkpoint, plain, spaces
+from rejeu import checkpoint, finite, plain, spaces
 from rejeu.agents import files
 from rejeu.agents.call import Call
 from rejeu.config import number, whole
@@ -160,6 +160,8 @@ class Checkpoint:
             self._last_step, self._last_time = agent._run.step, time.monotonic()
             if not run_files(self.folder):
                 self.save(agent)
+            if agent.report_folder is None:
+                agent.report_folder = self.folder
             yield
         finally:
             lock.release()
@@ -194,8 +196,10 @@ class Checkpoint:
 
         Raises:
             OSError: if that is impossible; what was saved before stays as it is.
+            NonFiniteError: if the last update left numbers that are not finite; nothing is saved then.
         """
         began = time.monotonic()
+        finite.settle(agent)
         run = agent._run
         if self._saved == (run.step, run.n_updates) and not reason:
             return None
@@ -206,7 +210,7 @@ class Checkpoint:
             header, arrays = content(agent, reason)
             header["rows"] = [name for name, _ in row_files.files]
             path = checkpoint.write(self.folder / f"run_{run.step:012d}.safetensors", "run", arrays, header)
-            self._named[path] = header["rows"]
+            self._named[path], agent.last_saved = header["rows"], path
         except OSError as error:
             left = run_files(self.folder)
             raise OSError(
@@ -287,6 +291,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "seed": run.seed,
         "reason": "" if run.seed is not None and run.obs is None else reason,
         "metrics": None if run.metrics is None else {key: np.asarray(value) for key, value in run.metrics.items()},
+        "n_skipped": run.watch.n_skipped,
         "td_errors": leaves(run.td_errors),
         "seconds": {key: float(value) for key, value in run.seconds.items()},
         "buffer": buffer_content(run),
@@ -413,8 +418,8 @@ def restore(
     run.rng.bit_generator.state = saved["rng"]
     run.carry = like(compiled.initial_carry(n_envs), saved["carry"], "carry")
     if saved["metrics"] is not None:
-        names = tuple(saved["metrics"])
-        run.metrics = Readings(names, jnp.asarray([float(saved["metrics"][name]) for name in names], jnp.float32))
+        run.metrics = Readings.of({key: jnp.float32(value) for key, value in saved["metrics"].items()})
+    run.watch.n_skipped = whole("n_skipped", saved["n_skipped"], least=0)
     run.td_errors = [jnp.asarray(array) for array in saved["td_errors"]]
     run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
     for key in PER_ENV:

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu import running_stats, schedules
+from rejeu import finite, running_stats, schedules
 from rejeu.config import nested, number, whole
 from rejeu.core import Clock, Explorer, Masked, PyTree, Rollout
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, sum_of
@@ -120,6 +120,9 @@ class OnPolicyConfig:
     normalize: NormalizationConfig | None = None
     """Scale observations and rewards by what has been seen: True, or a dict with ``norm_obs``, ``norm_reward``,
     ``clip_obs``, ``clip_reward``. The statistics are learnt and saved with the agent, which takes raw observations."""
+    nonfinite: finite.Nonfinite = "stop"
+    """What to do when an update leaves a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
+    it and saves the rollout, or ``"skip"`` that update as if its rollout had never been played, and count it."""
     policy_kwargs: ActorCriticConfig = dataclasses.field(default_factory=ActorCriticConfig)
     """Shape of the networks: ``net_arch`` (also ``dict(pi=[...], vf=[...])``), ``activation_fn``, ``ortho_init``,
     ``log_std_init``, ``share_layers``, ``squash_output``, ``state_dependent_std``, ``layer_norm``, ``architecture`` or a
@@ -149,6 +152,7 @@ class OnPolicyConfig:
         if self.sde_sample_freq == 0:
             raise ValueError("sde_sample_freq=0 would draw no noise; use 1 or more, or -1 for once an episode")
         put("normalize", running_stats.parse(self.normalize))
+        put("nonfinite", finite.parse(self.nonfinite))
         put("policy_kwargs", nested("policy_kwargs", ActorCriticConfig, self.policy_kwargs))
         if self.critic_learning_rate is not None and self.policy_kwargs.share_layers:
             raise ValueError(

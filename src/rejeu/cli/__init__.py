@@ -67,7 +67,8 @@ def expected_errors() -> tuple[type[Exception], ...]:
 
     from rejeu import errors
 
-    own = (errors.BadEnvironmentError, errors.RunInUseError, errors.WorkerError, gymnasium.error.Error)
+    own: tuple[type[Exception], ...] = (errors.BadEnvironmentError, errors.NonFiniteError)
+    own += (errors.RunInUseError, errors.WorkerError, gymnasium.error.Error)
     return ValueError, TypeError, ImportError, OSError, MemoryError, *own
 
 

@@ -266,6 +266,7 @@ def train(
     from rejeu.callbacks import Checkpoint, Evaluate, Film
     from rejeu.logging import CsvFile
 
+    agent.report_folder = folder.path
     up_to = None if anew else agent.num_timesteps
     metrics, table = CsvFile(folder.metrics, up_to), CsvFile(folder.evaluations, up_to)
     evaluate = Evaluate(
@@ -291,7 +292,7 @@ def train(
             evaluate.run(agent, agent.num_timesteps)
         if not evaluate.results:
             agent.save(folder.best)
-    except (errors.BadEnvironmentError, errors.WorkerError):
+    except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
         agent.save(folder.agent)
         raise
     finally:

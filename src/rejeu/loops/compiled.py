@@ -11,9 +11,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from rejeu.core import TD_ERROR, Algorithm, Clock, PyTree, Rollout, Transition, copy as copied
+from rejeu import finite
+from rejeu.checkpoint import names
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Rollout, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
 from rejeu.loops.packing import HostPacker, Packing, Readings
@@ -26,11 +29,14 @@ PackedState = list[Array]
 class Compiled:
     """The pure functions of one algorithm, compiled; holds no state of its own."""
 
-    def __init__(self, algorithm: Algorithm, noise: Noise | None) -> None:
+    def __init__(self, algorithm: Algorithm, noise: Noise | None, skips: bool = False) -> None:
         self.algorithm = algorithm
+        self.skips = skips
+        """Whether an update that leaves numbers that are not finite is undone."""
         self.shapes = jax.eval_shape(algorithm.init, jax.ShapeDtypeStruct((2,), jnp.uint32))
         """The state, of shapes in place of arrays."""
-        packing = Packing(self.shapes)
+        self._packing = packing = Packing(self.shapes)
+        telling = frozenset(i for i, name in enumerate(names(self.shapes)) if not finite.is_averaged(name))
         self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
         self._recall_packer, self._observe_packer = HostPacker(), HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
@@ -62,20 +68,47 @@ class Compiled:
             assert algorithm.observe is not None
             return packing.pack(algorithm.observe(packing.unpack(state), *plan.unpack(vectors)))
 
+        def is_sound(after: PackedState, metrics: Metrics) -> Array:
+            return finite.all_finite(packing.pick(after, telling)) & finite.losses_finite(metrics)
+
+        def learnt(state: PackedState, batch: Transition | Rollout, clock: Clock) -> tuple[PackedState, Metrics, Array]:
+            after, metrics = algorithm.update(packing.unpack(state), batch, clock)
+            # Without the barrier XLA would compute the whole step of the optimizer once more for the check.
+            packed = jax.lax.optimization_barrier(packing.pack(after))
+            sound = is_sound(packed, metrics)
+            return packed, metrics, sound
+
+        def learnt_or_skipped(state: PackedState, batch: Transition | Rollout, clock: Clock) -> tuple[Any, Any]:
+            after, metrics, sound = learnt(state, batch, clock)
+            if TD_ERROR in metrics:  # NaN leaves the priorities as they are
+                metrics[TD_ERROR] = jnp.where(sound, metrics[TD_ERROR], jnp.nan)
+            return [jnp.where(sound, new, old) for new, old in zip(after, state, strict=True)], (metrics, sound)
+
         @partial(jax.jit, donate_argnums=0, static_argnums=2)
         def update(
             state: PackedState, vectors: list[Array], plan: Packing
         ) -> tuple[PackedState, Readings, Array | None]:
             batches, clock = plan.unpack(vectors)
-            if isinstance(batches, Rollout) or batches.reward.ndim == 1:
-                after, metrics = algorithm.update(packing.unpack(state), batches, clock)
+            is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
+            if skips and is_one:
+                packed, (metrics, sound) = learnt_or_skipped(state, batches, clock)
+            elif skips:
+                packed, (metrics, sound) = jax.lax.scan(lambda s, one: learnt_or_skipped(s, one, clock), state, batches)
+            elif is_one:
+                packed, metrics, sound = learnt(state, batches, clock)
             else:
                 after, metrics = jax.lax.scan(
                     lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
                 )
+                packed = jax.lax.optimization_barrier(packing.pack(after))
+                sound = is_sound(packed, metrics)  # what is broken stays so
             td_error = metrics.pop(TD_ERROR, None)
             wanted = isinstance(batches, Transition) and batches.weight is not None
-            return packing.pack(after), Readings.of(jax.tree.map(jnp.mean, metrics)), td_error if wanted else None
+            if skips and not is_one:
+                means = {name: jnp.mean(value, where=sound) for name, value in metrics.items()}
+            else:
+                means = jax.tree.map(jnp.mean, metrics)
+            return packed, Readings.of(means, jnp.sum(~sound)), td_error if wanted else None
 
         self.init = init
         """``init(key) -> state``, packed."""
@@ -121,6 +154,13 @@ class Compiled:
         """
         weighted = isinstance(batches, Transition) and batches.weight is not None
         return self._update(state, *self._update_packer((batches, clock), (batches.reward.shape, weighted)))
+
+    def bad_leaves(self, state: PackedState) -> list[str]:
+        """Returns the names of the leaves of a state that hold a number that is not finite; waits for it."""
+        arrays = [np.asarray(array) for array in state]
+        if all(array.dtype.kind != "f" or np.isfinite(array).all() for array in arrays):
+            return []
+        return finite.bad_leaves(self._packing.unpack(arrays))
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""

@@ -6,6 +6,7 @@ iterates them decides what else happens.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -16,8 +17,13 @@ from jax import Array
 
 from rejeu.core import Clock, PyTree
 from rejeu.envs.vector import Step, VectorEnv
-from rejeu.errors import BadEnvironmentError
+from rejeu.errors import BadEnvironmentError, NonFiniteError
+from rejeu.finite import Watch
 from rejeu.loops.compiled import Compiled, PackedState
+from rejeu.spaces import leaves
+
+VDOT_SIZE = 2**13
+"""Number of elements up to which an array is looked at by its square; beyond it BLAS would call up its threads."""
 
 
 class Episode(NamedTuple):
@@ -101,12 +107,15 @@ class Run:
     """Of the newest updates, on their way to the priorities of the replay buffer, which get them one turn later."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("env", "replay", "update", "total"), 0.0))
     """Wall time by what it went into; ``update`` is the time that the loop waited for the device."""
+    watch: Watch = field(default_factory=Watch)
+    """Looks after the updates: whether what they leave is finite."""
 
 
 def restart(run: Run) -> None:
     """Resets every environment; their running episodes are given up."""
     n_envs = run.env.n_envs
     run.obs = run.env.reset(run.seed)
+    check_obs(run, run.obs, run.step, "reset returned")
     run.seed = None
     run.ended = np.ones(n_envs, bool)
     run.episode_return = np.zeros(n_envs)
@@ -175,13 +184,81 @@ def last_of(run: Run, step: Step) -> PyTree:
     return jax.tree.map(np.copy, step.obs) if run.ended.any() else None
 
 
-def check_rewards(step: Step, env: VectorEnv, taken: int) -> None:
-    """Raises ``BadEnvironmentError`` if a reward is NaN or infinite: nothing can be learnt from it."""
-    if not np.isfinite(step.reward).all():
+def reset_done(run: Run, done: np.ndarray) -> PyTree:
+    """Begins new episodes where ``done`` and returns the observations of all environments.
+
+    Raises:
+        BadEnvironmentError: if one of them is not finite.
+    """
+    obs = run.env.reset_done(done)
+    check_obs(run, obs, run.step, "reset returned")
+    return obs
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Returns whether all numbers are finite. The square of a small array is much the fastest look at it."""
+    if array.dtype.kind != "f":
+        return True
+    if array.size <= VDOT_SIZE and math.isfinite(np.vdot(array, array)):
+        return True
+    return bool(np.isfinite(array).all())
+
+
+def check_finite(run: Run, step: Step, taken: int) -> None:
+    """Raises ``BadEnvironmentError`` if a reward or an observation is NaN or infinite: nothing can be learnt from it.
+
+    Raises:
+        NonFiniteError: if the agent's own action was not finite, so that the environment is not to blame.
+    """
+    if not is_finite(step.reward):
         which = int(np.flatnonzero(~np.isfinite(step.reward))[0])
+        _check_action(run, taken)
         raise BadEnvironmentError(
-            f"{env.env_id} returned the reward {step.reward[which]} in environment {which} after {taken} steps; rewards "
+            f"{run.env.env_id} returned the reward {step.reward[which]} in environment {which} after {taken} steps; rewards "
             "must be finite numbers: mend the environment, or wrap it with gymnasium.wrappers.TransformReward"
+        )
+    check_obs(run, step.obs, taken, "returned")
+
+
+def check_obs(run: Run, obs: PyTree, taken: int, what: str) -> None:
+    """Raises ``BadEnvironmentError`` if an observation ``(n_envs, ...)`` is NaN or infinite; see :func:`check_finite`."""
+    for i, array in enumerate(jax.tree.leaves(obs)):
+        if not is_finite(array):
+            _check_action(run, taken)
+            where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+            path = leaves(run.env.observation_space)[i].path
+            at = ", ".join(map(str, where[1:]))
+            raise BadEnvironmentError(
+                f"{run.env.env_id}: {what} an observation with {array[where]}{f' at [{at}]' if at else ''}"
+                f"{f' of {path!r}' if path else ''} in environment {where[0]} after {taken} steps; observations must be "
+                "finite numbers: mend the environment, or wrap it with gymnasium.wrappers.TransformObservation and "
+                "np.nan_to_num"
+            )
+
+
+def _check_action(run: Run, taken: int) -> None:
+    if run.action is not None and not is_finite(run.action):
+        which = int(np.argwhere(~np.isfinite(run.action))[0][0])
+        raise NonFiniteError(
+            f"the policy chose the action {run.action[which]} in environment {which} after {taken} steps, and "
+            f"{run.env.env_id} answered with numbers that are not finite. The weights are finite, what they compute is not: "
+            "they or the observations are too large; lower learning_rate, or set normalize=True",
+            names=("action",),
+            step=taken,
+            n_updates=run.n_updates,
+        )
+
+
+def check_state(run: Run, compiled: Compiled) -> None:
+    """Raises ``NonFiniteError`` if the state is not finite before anything is learnt; waits for it."""
+    if bad := compiled.bad_leaves(run.state):
+        more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
+        raise NonFiniteError(
+            f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
+            f"{run.n_updates}); it came so from set_parameters or from a file: give it finite numbers, or load another model",
+            names=[text.split(" ")[0] for text in bad],
+            step=run.step,
+            n_updates=run.n_updates,
         )
 
 

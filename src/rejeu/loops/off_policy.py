@@ -25,7 +25,19 @@ from jax import Array
 from rejeu.config import OffPolicyConfig
 from rejeu.core import Clock
 from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, last_of, restart
+from rejeu.loops.host import (
+    Progress,
+    Run,
+    book,
+    check_finite,
+    check_state,
+    choose,
+    clock_of,
+    counted,
+    last_of,
+    reset_done,
+    restart,
+)
 from rejeu.spaces import action_scaler, random_action
 
 
@@ -42,12 +54,15 @@ def off_policy(
         progress: gives the fraction of the run that is done after so many steps of it; schedules follow it.
 
     Raises:
-        BadEnvironmentError: if a reward is not a finite number.
+        BadEnvironmentError: if a reward or an observation is not finite.
+        NonFiniteError: if the state is not finite to begin with.
+        Broken: if an update leaves numbers that are not finite.
     """
     env, n_envs, scale = run.env, run.env.n_envs, action_scaler(run.env.action_space)
     first, last = run.step, None if n_steps is None else run.step + n_steps
     began = time.perf_counter() - run.seconds["total"]
     per_turn = updates_per_turn(config, n_envs)
+    check_state(run, compiled)
     if run.obs is None:
         restart(run)
         run.replay.begin(run.obs)
@@ -60,7 +75,7 @@ def off_policy(
         action = scale(run.action)
         step = env.step(action)
         t1 = time.perf_counter()
-        check_rewards(step, env, run.step)
+        check_finite(run, step, run.step)
         if compiled.observe is not None:
             run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
         run.replay.add(run.action, step.reward, step.terminated, step.obs, active)
@@ -70,13 +85,13 @@ def off_policy(
         episodes = book(run, step, None if active is None else np.arange(n_envs) < taken)
         t2 = time.perf_counter()
         last_obs = last_of(run, step)
-        run.obs = step.obs if last_obs is None else env.reset_done(run.ended)
+        run.obs = step.obs if last_obs is None else reset_done(run, run.ended)
         t3 = time.perf_counter()
         if run.ended.any():
             run.replay.begin(run.obs, np.flatnonzero(run.ended))
 
         if compiled.observe is not None:
-            run.state = compiled.observe(run.state, run.obs, run.running_return)
+            run.watch.observe(run, compiled)
         done = progress(run.step - first)
         n_updates = due(run, config, taken, len(episodes))
         sizes = chunks(n_updates, per_turn)
@@ -89,12 +104,14 @@ def off_policy(
         t6 = time.perf_counter()
         run.replay.reprioritise(run.td_errors)
         run.td_errors = []
+        n_before = len(run.watch)
         for batch in samples:
-            run.state, run.metrics, td_error = compiled.update(run.state, batch, clock)
+            td_error = run.watch.update(run, compiled, batch, clock)
             if td_error is not None:
                 run.td_errors.append(td_error)
         run.n_updates += n_updates
         run.action = np.asarray(chosen)
+        run.watch.read(run, n_before)  # the actions came after them
         t7 = time.perf_counter()
         run.seconds["env"] += (t1 - t0) + (t3 - t2)
         run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)

@@ -20,7 +20,19 @@ from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.core import PyTree
 from rejeu.envs.vector import Step
 from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import Progress, Run, book, check_rewards, choose, clock_of, counted, last_of, restart
+from rejeu.loops.host import (
+    Progress,
+    Run,
+    book,
+    check_finite,
+    check_state,
+    choose,
+    clock_of,
+    counted,
+    last_of,
+    reset_done,
+    restart,
+)
 from rejeu.spaces import action_scaler
 
 
@@ -39,11 +51,14 @@ def on_policy(
         progress: gives the fraction of the run that is done after so many steps of it; schedules follow it.
 
     Raises:
-        BadEnvironmentError: if a reward is not a finite number.
+        BadEnvironmentError: if a reward or an observation is not finite.
+        NonFiniteError: if the state is not finite to begin with.
+        Broken: if an update leaves numbers that are not finite.
     """
     env, n_envs, scale, rollout = run.env, run.env.n_envs, action_scaler(run.env.action_space), run.replay
     first, last = run.step, None if n_steps is None else run.step + n_steps
     began = time.perf_counter() - run.seconds["total"]
+    check_state(run, compiled)
     if run.obs is None:
         restart(run)
         if rollout.length and config.n_episodes is None:
@@ -53,13 +68,14 @@ def on_policy(
     while last is None or run.step < last:
         t0 = time.perf_counter()
         run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
+        run.watch.read(run)  # while the rollout that it learnt from still stands
         rollout.observe(run.obs)
         t1 = time.perf_counter()
         stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
         action = scale(run.action)
         step = env.step(action, stepped)
         t2 = time.perf_counter()
-        check_rewards(step, env, run.step)
+        check_finite(run, step, run.step)
         counts = which_count(run, stepped, last)
         run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
         valid = True if counts is None else counts
@@ -77,7 +93,8 @@ def on_policy(
         if is_done:
             clock = clock_of(run, progress(run.step - first))
             n_updates = config.gradient_steps(rollout.size())
-            run.state, run.metrics, _ = compiled.update(run.state, rollout.rollout(), clock)
+            run.watch.update(run, compiled, rollout.rollout(), clock)
+            assert run.metrics is not None
             run.n_updates += int(run.metrics["gradient_steps"]) if config.stops_early else n_updates
             begin(run, config)
         t5 = time.perf_counter()
@@ -110,10 +127,10 @@ def renewed(run: Run, step: Step, config: OnPolicyConfig, is_done: bool) -> PyTr
     Where rollouts are whole episodes, an environment that has played its share waits, and all begin anew together.
     """
     if config.n_episodes is None:
-        return run.env.reset_done(run.ended) if run.ended.any() else step.obs
+        return reset_done(run, run.ended) if run.ended.any() else step.obs
     if is_done:
         run.ended = np.ones(run.env.n_envs, bool)
         run.episode_return[:], run.episode_length[:] = 0.0, 0  # of episodes that the update cut off
-        return run.env.reset_done(run.ended)
+        return reset_done(run, run.ended)
     renew = run.ended & (run.playing > 0)
-    return run.env.reset_done(renew) if renew.any() else step.obs
+    return reset_done(run, renew) if renew.any() else step.obs

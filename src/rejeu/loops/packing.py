@@ -8,7 +8,7 @@ batch with its clock some ten; packed, they are five. Inside the compiled code t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Container, Hashable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -54,6 +54,20 @@ class Packing:
         vectors = [concatenate([leaves[i].reshape(-1) for i in group]) for group in self.groups]
         return vectors + [leaves[i] for i in self.large]
 
+    def pick(self, arrays: list[Array], wanted: Container[int]) -> list[Array]:
+        """Returns the parts of :meth:`pack`'s vectors that hold the ``wanted`` leaves, in as few pieces as they lie."""
+        pieces = []
+        for vector, group, ends in zip(arrays, self.groups, self.ends, strict=False):
+            runs: list[list[int]] = []
+            for i, begin, end in zip(group, [0, *ends], ends, strict=False):
+                if i in wanted and runs and runs[-1][1] == begin:
+                    runs[-1][1] = end
+                elif i in wanted:
+                    runs.append([begin, end])
+            pieces += [vector[begin:end] for begin, end in runs]
+        large = zip(self.large, arrays[len(self.groups) :], strict=True)
+        return pieces + [array for i, array in large if i in wanted]
+
     def unpack(self, arrays: list[Any]) -> PyTree:
         """Returns the tree again: the inverse of :meth:`pack`."""
         leaves: list[Any] = [None] * len(self.shapes)
@@ -67,16 +81,24 @@ class Packing:
 
 @jax.tree_util.register_pytree_node_class
 class Readings(Mapping[str, Array]):
-    """Named scalars that are on the device as one vector; reading one waits for it."""
+    """Named scalars that are on the device as one vector; reading one waits for it.
+
+    Its last element has no name: of how many of its steps the update left numbers that are not finite.
+    """
 
     def __init__(self, names: tuple[str, ...], vector: Array) -> None:
         self.names = names
         self.vector = vector
 
     @classmethod
-    def of(cls, scalars: Mapping[str, Array]) -> Readings:
-        """Packs scalars, inside compiled code."""
-        return cls(tuple(scalars), jnp.stack(list(scalars.values())))
+    def of(cls, scalars: Mapping[str, Array], n_bad: Array | int = 0) -> Readings:
+        """Packs scalars and the number of steps that left something not finite, inside compiled code."""
+        return cls(tuple(scalars), jnp.stack([*scalars.values(), jnp.asarray(n_bad, jnp.float32)]))
+
+    @property
+    def n_bad(self) -> int:
+        """How many of its steps broke something (one that did breaks those after it, unless it is skipped)."""
+        return int(np.asarray(self.vector)[-1])
 
     def __getitem__(self, name: str) -> Array:
         if name not in self.names:

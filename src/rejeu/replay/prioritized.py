@@ -123,17 +123,21 @@ class Priorities:
         return Rows(env, time), weight.astype(np.float32)
 
     def update(self, td_errors: Iterable[np.ndarray]) -> None:
-        """Takes the absolute TD errors of the oldest draws; of steps overwritten since then they are passed over."""
+        """Takes the absolute TD errors of the oldest draws; of steps overwritten since then they are passed over.
+
+        So are those that are not finite: such a step keeps the priority that it has. One NaN would make all sums NaN.
+        """
         for td_error in td_errors:
             index, time = self._drawn.popleft()
             if not len(index):  # drawn from what the ring held before it was restored
                 continue
             priority = (np.asarray(td_error, np.float64).ravel() + self.config.epsilon) ** self.config.alpha
             head = self.ring.head[index // self.ring.rows]
-            kept = (time > head - self.ring.rows) & (self.tree[index] > 0)
+            finite = np.isfinite(priority)
+            kept = (time > head - self.ring.rows) & (self.tree[index] > 0) & finite
             if kept.any():
                 self.tree.set(index[kept], priority[kept])
-            self.largest = max(self.largest, float(priority.max()))
+            self.largest = max(self.largest, float(priority.max(where=finite, initial=0.0)))
 
     def state(self) -> dict[str, Any]:
         """Returns everything, for :meth:`restore`."""

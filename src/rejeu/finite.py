@@ -1,0 +1,399 @@
+"""Numbers stay finite: what broke, at which step, by which batch.
+
+Every compiled update says whether what it left is finite (:func:`all_finite`), beside its metrics, and the loop looks
+one turn later, when it waits for the device anyway. So that the culprit can be named then, a :class:`Watch` keeps a
+copy of the state from some updates ago and what went into each update since: from these the state before the one
+that broke is made again, bit for bit, and the agent is left in it. That costs one copy in :data:`STRETCH` updates,
+where a guard in every update would cost some per cent.
+
+With ``nonfinite="skip"`` an update that breaks something is undone on the device at once, and counted.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu import checkpoint, spaces
+from rejeu.core import Clock, Masked, Metrics, PyTree, Rollout, Transition
+from rejeu.errors import CheckpointError, NonFiniteError
+
+if TYPE_CHECKING:
+    from rejeu.agents import Agent
+    from rejeu.loops.compiled import Compiled, PackedState
+    from rejeu.loops.host import Run
+    from rejeu.loops.packing import Readings
+
+Nonfinite = Literal["stop", "skip"]
+CHOICES: tuple[Nonfinite, ...] = ("stop", "skip")
+"""What can be done about an update that breaks something."""
+STRETCH = 64
+"""Most calls of the update between two copies of the state."""
+STRETCH_BYTES = 32 * 2**20
+"""Most bytes of batches kept for them."""
+MOST_SKIPPED = 100
+"""Skipped updates in a row after which it is an error all the same: nothing is being learnt."""
+PREFIX = "nonfinite_batch_"
+"""Of the files with offending batches."""
+WIDTH = 16
+
+
+def parse(value: Any) -> Nonfinite:
+    """Returns what ``nonfinite`` asks for.
+
+    Raises:
+        ValueError: unless it is ``"stop"`` or ``"skip"``.
+
+    >>> parse("skip")
+    'skip'
+    """
+    if value not in CHOICES:
+        raise ValueError(f"nonfinite={value!r} must be 'stop' or 'skip'")
+    return value
+
+
+def is_averaged(name: str) -> bool:
+    """Returns whether a leaf of a state averages what other leaves hold, so that it is finite as long as they are.
+
+    Those are target networks, and Adam's first moments: of gradients whose squares are in the second.
+
+    >>> [is_averaged(name) for name in ("target_critics.head.bias", "optimizer.mu.head.bias", "optimizer.nu.head.bias")]
+    [True, True, False]
+    """
+    parts = name.split(".")
+    return "mu" in parts or any(part.startswith("target") for part in parts)
+
+
+def is_loss(name: str) -> bool:
+    """Returns whether a metric must be finite; others may be NaN, as ``explained_variance`` where all returns are equal."""
+    return name.endswith("loss")
+
+
+def all_finite(vectors: list[Array]) -> Array:
+    """Returns whether every number of every vector is finite, ``bool[]``; vectors of whole numbers are.
+
+    Inside compiled code. ``0 x`` is NaN where x is not finite; sixteen stretches of a vector are summed side by side, since
+    XLA adds up a single one on a CPU number by number.
+    """
+    left = [_folded(vector.reshape(-1)) for vector in vectors if jnp.issubdtype(vector.dtype, jnp.floating)]
+    return jnp.isfinite(jnp.sum(jnp.concatenate(left))) if left else jnp.bool(True)
+
+
+def _folded(x: Array) -> Array:
+    """Returns few numbers that are 0 or NaN: NaN somewhere if and only if ``x`` holds a number that is not finite."""
+    zero = jnp.zeros((), x.dtype)
+    while x.size > 4 * WIDTH:
+        n = x.size // WIDTH
+        total = x[:n] * zero
+        for i in range(1, WIDTH):
+            total = total + x[i * n : (i + 1) * n] * zero
+        x = jnp.concatenate([total, x[WIDTH * n :] * zero])
+    return (x * zero).astype(jnp.float32)
+
+
+def losses_finite(metrics: Metrics) -> Array:
+    """Returns whether all losses among the metrics are, over the last axis if they have one, ``bool[]``."""
+    losses = [jnp.isfinite(value).all() for name, value in metrics.items() if is_loss(name)]
+    return jnp.stack(losses).all() if losses else jnp.bool(True)
+
+
+def bad_leaves(tree: PyTree) -> list[str]:
+    """Returns the dotted names of the leaves that hold a number that is not finite, each with the first such number."""
+    found = []
+    for name, leaf in zip(checkpoint.names(tree), jax.tree.leaves(tree), strict=True):
+        array = np.asarray(leaf)
+        if array.dtype.kind == "f" and not (ok := np.isfinite(array)).all():
+            found.append(f"{name} ({array[~ok].ravel()[0]})")
+    return found
+
+
+class Broken(Exception):
+    """An update left numbers that are not finite; :func:`reported` makes of it what users see."""
+
+    def __init__(self, batches: Transition | Rollout, clock: Clock, in_a_row: int = 1) -> None:
+        super().__init__("an update left numbers that are not finite")
+        self.batches, self.clock, self.in_a_row = batches, clock, in_a_row
+
+
+class Stretch:
+    """A state, and what has been done to it since."""
+
+    def __init__(self, start: PackedState) -> None:
+        self.start = start
+        """A copy of its own."""
+        self.done: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+        """Functions that took the state and these arguments, and returned it, alone or first of a tuple."""
+        self.n_updates = 0
+
+    def before(self, i: int) -> PackedState:
+        """Returns the state before the i-th of what was done; uses up ``start``."""
+        state = self.start
+        for function, arguments in self.done[:i]:
+            after = function(state, *arguments)
+            state = after[0] if isinstance(after, tuple) else after
+        return state
+
+
+class Unread(NamedTuple):
+    """An update whose outcome is still on the device."""
+
+    readings: Readings
+    batches: Transition | Rollout
+    clock: Clock
+    stretch: Stretch | None
+    """None where updates that break something undo themselves."""
+    place: int
+    """Which of what was done in that stretch it is."""
+
+
+class Watch:
+    """Looks after the updates of a run. Mutable."""
+
+    def __init__(self) -> None:
+        self.n_skipped = 0
+        """Updates that were skipped, in all."""
+        self._in_a_row = 0
+        self._unread: deque[Unread] = deque()
+        self._stretch: Stretch | None = None
+        self._most = STRETCH
+        self._newest: PackedState | None = None
+        """The state that the present stretch has led to."""
+
+    def __len__(self) -> int:
+        """Returns the number of updates whose outcome was not looked at."""
+        return len(self._unread)
+
+    def update(self, run: Run, compiled: Compiled, batches: Transition | Rollout, clock: Clock) -> Array | None:
+        """Learns from batches as :meth:`Compiled.update` does, puts state and metrics into ``run``, returns TD errors."""
+        stretch = None if compiled.skips else self._on(run, compiled, batches)
+        place = 0 if stretch is None else len(stretch.done)
+        run.state, run.metrics, td_error = compiled.update(run.state, batches, clock)
+        self._unread.append(Unread(run.metrics, batches, clock, stretch, place))
+        if stretch is not None:
+            stretch.done.append((compiled.update, (batches, clock)))
+            stretch.n_updates += 1
+        self._newest = run.state
+        return td_error
+
+    def observe(self, run: Run, compiled: Compiled) -> None:
+        """Lets the state take in the present observations, if it has a use for them."""
+        if compiled.observe is None:
+            return
+        is_known = run.state is self._newest
+        run.state = compiled.observe(run.state, run.obs, run.running_return)
+        if is_known and self._stretch is not None:
+            self._stretch.done.append((compiled.observe, (jax.tree.map(np.copy, run.obs), run.running_return)))
+            self._newest = run.state
+
+    def _on(self, run: Run, compiled: Compiled, batches: Transition | Rollout) -> Stretch:
+        """Returns the present stretch, or a new one where that is long or something else has changed the state."""
+        most = 1 if isinstance(batches, Rollout) else STRETCH
+        if self._stretch is not None and self._stretch.n_updates == 1 and most > 1:
+            size = sum(leaf.nbytes for leaf in jax.tree.leaves(batches))
+            self._most = max(1, min(most, STRETCH_BYTES // max(size, 1)))
+        if self._stretch is None or run.state is not self._newest or self._stretch.n_updates >= self._most:
+            self._stretch, self._most = Stretch(compiled.copy(run.state)), most
+        return self._stretch
+
+    def read(self, run: Run, n: int | None = None) -> None:
+        """Looks at the oldest ``n`` updates (None: all); waits for them.
+
+        Raises:
+            Broken: if one of them left numbers that are not finite; ``run.state`` is then what it was before.
+        """
+        for _ in range(len(self._unread) if n is None else n):
+            one = self._unread.popleft()
+            n_bad = one.readings.n_bad
+            if not n_bad:
+                self._in_a_row = 0
+                continue
+            if one.stretch is not None:
+                run.state = one.stretch.before(one.place)
+            else:
+                self.n_skipped += n_bad
+                self._in_a_row += n_bad
+                if self._in_a_row < MOST_SKIPPED:
+                    continue
+            in_a_row, self._in_a_row = self._in_a_row, 0
+            self._unread.clear()
+            self._stretch = self._newest = None
+            run.td_errors = []
+            raise Broken(one.batches, one.clock, in_a_row)
+
+
+class Found(NamedTuple):
+    """What one batch does to a state."""
+
+    batch: list[str]
+    """Its own parts that are not finite, each with a number, such as ``reward (nan)``."""
+    losses: list[str]
+    """Losses that are not, likewise."""
+    leaves: list[str]
+    """Leaves of the state after the update that are not, likewise."""
+
+    def __bool__(self) -> bool:
+        return bool(self.losses or self.leaves)
+
+
+def effect(compiled: Compiled, state: PyTree, batch: Transition | Rollout, clock: Clock) -> tuple[PyTree, Found]:
+    """Returns the state after an update on one batch, and what of it is not finite."""
+    after, metrics = jax.jit(compiled.algorithm.update)(state, batch, clock)
+    losses = bad_leaves({name: value for name, value in metrics.items() if is_loss(name)})
+    return after, Found(bad_leaves(batch._asdict()), losses, bad_leaves(after))
+
+
+def settle(agent: Agent) -> None:
+    """Waits for the updates under way and looks at them.
+
+    Raises:
+        NonFiniteError: if one of them left numbers that are not finite.
+    """
+    try:
+        agent._run.watch.read(agent._run)
+    except Broken as broken:
+        raise reported(agent, broken) from None
+
+
+def reported(agent: Agent, broken: Broken) -> NonFiniteError:
+    """Saves the batch that broke something and returns the error that says what, where and why."""
+    run, compiled, clock = agent._run, agent._compiled, broken.clock
+    state, found, batch = agent._compiled.state(run.state), Found([], [], []), broken.batches
+    for one in _one_by_one(broken.batches):
+        after, found = effect(compiled, state, one, clock)
+        if found:
+            batch = one
+            break
+        state = after
+    names = [text.split(" ")[0] for text in (*found.losses, *found.leaves)]
+    saved = _save(agent, batch, clock, names)
+    what = _said(found)
+    if broken.in_a_row >= MOST_SKIPPED:
+        what = f"{broken.in_a_row} updates in a row were skipped, so nothing is learnt any more; in the last of them {what}"
+    checkpoint_text = f"; last saved model: {agent.last_saved}" if agent.last_saved is not None else ""
+    message = (
+        f"{what}, at environment step {int(clock.step)}, update {run.n_updates}. The agent is as it was before that update. "
+        f"{saved[1]}{checkpoint_text}. {_advice(agent, found, batch)}"
+    )
+    return NonFiniteError(message, names=names, step=int(clock.step), n_updates=run.n_updates, batch=saved[0])
+
+
+def _one_by_one(batches: Transition | Rollout) -> list[Any]:
+    if isinstance(batches, Rollout) or batches.reward.ndim == 1:
+        return [batches]
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], batches) for i in range(len(batches.reward))]
+
+
+def _said(found: Found) -> str:
+    if found.batch:
+        return f"the batch held {', '.join(found.batch[:3])}"
+    said = [f"{', '.join(found.losses)}"] if found.losses else []
+    if found.leaves:
+        more = len(found.leaves) - 1
+        said.append(f"{found.leaves[0]} of the state" + (f" and {more} more of its arrays" if more else ""))
+    return " and ".join(said) + " became no finite number" if said else "an update left numbers that are not finite"
+
+
+def _advice(agent: Agent, found: Found, batch: Transition | Rollout) -> str:
+    if "reward" in str(found.batch):
+        return "Look into the environment's reward function; of hindsight's goals rewards are compute_reward's"
+    config, advice = agent.config, []
+    rewards = np.asarray(batch.reward)[np.isfinite(batch.reward)]
+    largest = float(np.abs(rewards).max()) if rewards.size else 0.0
+    if largest > 1e3:
+        advice.append(f"scale the rewards down (the largest of this batch is {largest:.3g})")
+    advice.append(f"lower learning_rate (it is {config.learning_rate!r})")
+    if "max_grad_norm" in vars(config):
+        advice.append(f"set max_grad_norm (it is {config.max_grad_norm!r})")
+    if config.normalize is None:
+        advice.append("set normalize=True")
+    if config.nonfinite == "stop":
+        advice.append('or pass over such updates with nonfinite="skip"')
+    return "Try to " + ", ".join(advice)
+
+
+def folder_of(agent: Agent) -> Path:
+    """Returns where an offending batch is put: beside the run, the newest model or the logs, else where Python runs."""
+    if agent.report_folder is not None:
+        return Path(agent.report_folder)
+    if agent.last_saved is not None:
+        return agent.last_saved.parent
+    return Path.cwd() if agent.tensorboard_log is None else Path(agent.tensorboard_log)
+
+
+def _save(agent: Agent, batch: Transition | Rollout, clock: Clock, names: list[str]) -> tuple[Path | None, str]:
+    """Returns where the batch was written and a sentence about it; None where it could not be."""
+    run, step = agent._run, int(clock.step)
+    header = {
+        "algorithm": agent.name,
+        "env_id": None if run.env is None else run.env.env_id,
+        "clock": {"step": step, "episode": int(clock.episode), "progress": float(clock.progress)},
+        "n_updates": run.n_updates,
+        "names": names,
+    }
+    try:
+        folder = folder_of(agent)
+        folder.mkdir(parents=True, exist_ok=True)
+        path = _reserved(folder, step)
+        checkpoint.write(path, "batch", checkpoint.tree_to_arrays(batch), header)
+    except OSError as error:
+        return None, f"The batch could not be saved ({' '.join(str(error).split())})"
+    return path, f"The batch is saved in {path} (rejeu.finite.examine(agent, path) tries it again)"
+
+
+def _reserved(folder: Path, step: int) -> Path:
+    """Returns the path of a new, empty file, of a name that no file had."""
+    for i in range(1, 10_000):
+        path = folder / f"{PREFIX}{step}{'' if i == 1 else f'_{i}'}{checkpoint.SUFFIX}"
+        try:
+            path.touch(exist_ok=False)
+        except FileExistsError:
+            continue
+        return path
+    raise OSError(f"{folder} is full of batches of step {step}")
+
+
+def load_batch(agent: Agent, path: str | Path) -> tuple[Transition | Rollout, Clock]:
+    """Returns a saved batch and where the run stood, as ``agent``'s algorithm takes them.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it holds no batch, or none of such an agent.
+    """
+    header, arrays = checkpoint.read(path, "batch")
+    structure = spaces.structure(agent.observation_space)
+    obs: Any = jax.tree.unflatten(structure, [0] * structure.num_leaves)
+    expected: Any
+    if "ended" in arrays:
+        obs = Masked(obs, 0) if agent.takes_masks else obs
+        carry = jax.tree.map(lambda leaf: 0, agent._compiled.initial_carry(1))
+        expected = Rollout(obs, 0, 0, obs, 0, 0, 0, 0, 0, carry)
+    else:
+        expected = Transition(obs, 0, 0, obs, 0, 0 if "weight" in arrays else None)
+    names = checkpoint.names(expected)
+    if header.get("algorithm") != agent.name or {*names} != {*arrays}:
+        raise CheckpointError(
+            f"{path} holds a batch of {str(header.get('algorithm'))[:40]} with {', '.join(sorted(arrays))[:200]}; "
+            f"this is {agent.name}, whose batches have {', '.join(sorted(names))}"
+        )
+    try:
+        clock = header["clock"]
+        clock = Clock(np.uint32(clock["step"]), np.uint32(clock["episode"]), np.float32(clock["progress"]))
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise CheckpointError(f"{path}: the header is damaged") from None
+    return jax.tree.unflatten(jax.tree.structure(expected), [arrays[name] for name in names]), clock
+
+
+def examine(agent: Agent, path: str | Path) -> Found:
+    """Returns what a saved batch breaks in an agent, which is not changed.
+
+    Empty, and false, where everything stays finite: with other weights or other hyper-parameters, say.
+    """
+    batch, clock = load_batch(agent, path)
+    return effect(agent._compiled, agent.state, batch, clock)[1]
