@@ -1,0 +1,62 @@
+"""Files of every schema that was ever written are read, and hold what they held."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu import checkpoint
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
+from tests.environments import Counter
+from tests.golden import record_files
+
+GOLDEN = Path(record_files.__file__).parent
+FOLDERS = [GOLDEN / f"schema{n}" for n in range(1, checkpoint.SCHEMA + 1)]
+MODELS = ("sac", "td3", "dqn", "ppo")
+
+
+@pytest.fixture(params=FOLDERS, ids=lambda path: path.name)
+def folder(request):
+    """A folder of recorded files."""
+    return request.param
+
+
+def recorded(folder):
+    with np.load(folder / "expected.npz") as file:
+        return dict(file)
+
+
+def test_there_are_files_of_every_schema():
+    assert sorted(path.name for path in GOLDEN.glob("schema*")) == [path.name for path in FOLDERS]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_holds_what_it_held_and_predicts_what_it_predicted(folder, name):
+    expected = recorded(folder)
+    agent = rejeu.load(folder / f"{name}.safetensors")
+    np.testing.assert_array_equal(record_files.flat(agent), expected[f"{name}.parameters"])
+    predictions = agent.predict(record_files.observations(name), deterministic=True)[0]
+    np.testing.assert_allclose(predictions, expected[f"{name}.predictions"], rtol=1e-4, atol=1e-6)
+
+
+def test_a_replay_buffer_holds_what_it_held(folder):
+    expected = recorded(folder)
+    agent = record_files.replay_agent()
+    agent.load_replay_buffer(folder / "replay.safetensors")
+    assert agent.replay_buffer.size() == 23
+    arrays = agent.replay_buffer.arrays()
+    assert {f"replay.{name}" for name in arrays} == {name for name in expected if name.startswith("replay.")}
+    for name, value in arrays.items():
+        np.testing.assert_array_equal(value, expected[f"replay.{name}"], err_msg=name)
+
+
+def test_the_statistics_of_a_wrapper_are_what_they_were(folder):
+    expected = recorded(folder)
+    env = VecNormalize.load(folder / "vec_normalize.safetensors", DummyVecEnv([lambda: Counter((5,))]))
+    assert (env.clip_obs, env.clip_reward, env.norm_obs_keys) == (7.0, 10.0, None)
+    for key, moments in (("obs", env.obs_rms), ("returns", env.ret_rms)):
+        for part in ("mean", "var", "count"):
+            np.testing.assert_array_equal(getattr(moments, part), expected[f"vec_normalize.{key}.{part}"])
