@@ -9,6 +9,7 @@ import pytest
 
 import rejeu
 from rejeu import checkpoint
+from rejeu.errors import CheckpointError
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests.environments import Counter
 from tests.golden import record_files
@@ -60,3 +61,32 @@ def test_the_statistics_of_a_wrapper_are_what_they_were(folder):
     for key, moments in (("obs", env.obs_rms), ("returns", env.ret_rms)):
         for part in ("mean", "var", "count"):
             np.testing.assert_array_equal(getattr(moments, part), expected[f"vec_normalize.{key}.{part}"])
+
+
+def test_every_older_schema_has_a_way_to_the_present_one():
+    assert sorted(checkpoint.MIGRATIONS) == list(range(1, checkpoint.SCHEMA))
+    for schema, migrate in checkpoint.MIGRATIONS.items():
+        before = {"schema": schema, "kind": "agent"}
+        assert migrate(before)["schema"] == schema + 1
+        assert before == {"schema": schema, "kind": "agent"}
+
+
+def test_headers_pass_through_every_schema_in_turn(tmp_path, monkeypatch):
+    path = checkpoint.write(tmp_path / "old", "rows", {"a": np.arange(3)}, {"rows": 3})
+    steps = {
+        2: lambda header: {**header, "schema": 3, "n_rows": header["rows"]},
+        3: lambda header: {**header, "schema": 4, "n_rows": header["n_rows"] + 1},
+    }
+    monkeypatch.setattr(checkpoint, "MIGRATIONS", steps)
+    monkeypatch.setattr(checkpoint, "SCHEMA", 4)
+    header, arrays = checkpoint.read(path, "rows")
+    assert header == checkpoint.read_header(path, "rows") == {"schema": 4, "kind": "rows", "rows": 3, "n_rows": 4}
+    assert arrays["a"].tolist() == [0, 1, 2]
+
+
+def test_an_old_header_that_cannot_be_brought_up_to_date_is_damaged(tmp_path, monkeypatch):
+    path = checkpoint.write(tmp_path / "old", "rows", {}, {})
+    monkeypatch.setattr(checkpoint, "MIGRATIONS", {2: lambda header: {**header, "schema": 3, "n_rows": header["rows"]}})
+    monkeypatch.setattr(checkpoint, "SCHEMA", 3)
+    with pytest.raises(CheckpointError, match="the header of schema 2 is damaged: 'rows'"):
+        checkpoint.read(path, "rows")

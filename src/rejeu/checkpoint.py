@@ -1,35 +1,53 @@
 """Files: arrays by name and a JSON header in one safetensors file, written atomically, read without running anything.
 
 Reading builds every object from rejeu's own classes and from the caller's expectations; the file supplies numbers and
-plain JSON values only, and names, shapes and dtypes must match. There is no second, laxer way to read.
+plain JSON values only, and names, shapes and dtypes must match. There is no second, laxer way to read. What a file holds
+and what is promised of it is said in ``docs/files.md``.
+
+Checksums tell damage by chance: any few bits that flip are noticed. They are no protection against someone who changes a
+file on purpose and the checksums with it; against that, nothing in a file is ever run.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import secrets
-from collections.abc import Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import jax
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
+from rejeu import atomic, tensors
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError
+from rejeu.memory import physical_memory
+from rejeu.tensors import DTYPES, Entry, Malformed, Table, shown
 
 SUFFIX = ".safetensors"
 FOREIGN = (".zip", ".pkl")
 """Suffixes that Stable-Baselines3 gives its files; where a script asks for one, ours of that name is read."""
-SCHEMA = 1
-"""Version of the header's layout; raised when it changes."""
-HEADER_KEY = "rejeu"
-MAX_HEADER_BYTES = 16 * 2**20
-DTYPES = {"F32": "float32", "F64": "float64", "I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8"}
-DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BOOL": "bool"}
+SCHEMA = 2
+"""Version of the header's layout; raised when it changes, with a function in ``MIGRATIONS``."""
+HEADER_KEY, CHECKSUM_KEY = "rejeu", "crc32"
+"""Where the header, and the checksum of its text, stand among the file's metadata."""
+CHECKSUMS = "checksums"
+"""Where the header holds the checksum of each array, by name."""
+RESERVED = ("schema", "kind", CHECKSUMS)
+
+Header = dict[str, Any]
+
+
+def _from_1(header: Header) -> Header:
+    """Schema 2 added the checksums, which are checked before a header comes here; the rest is as it was."""
+    return {**header, "schema": 2}
+
+
+MIGRATIONS: dict[int, Callable[[Header], Header]] = {1: _from_1}
+"""For every older schema, a pure function from its header to that of the next one."""
 
 
 def resolve(path: str | Path) -> Path:
@@ -38,84 +56,166 @@ def resolve(path: str | Path) -> Path:
     return path if path.suffix else path.with_name(path.name + SUFFIX)
 
 
-def write(path: str | Path, kind: str, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> Path:
+def write(path: str | Path, kind: str, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Path:
     """Writes one file and returns its path; what stood there before is replaced only once all is on disk.
 
+    Args:
+        path: where; ``.safetensors`` is added if it has no suffix, and missing folders are made.
+        kind: what it holds, which :func:`read` asks for.
+        arrays: numbers by name, of any dtype among ``DTYPES``.
+        header: JSON values by name; finite numbers only.
+
     Raises:
-        OSError: if the folder cannot be written; the old file is then untouched.
+        OSError: if it cannot be written, with the reason and what to do; the old file is then untouched.
+        ValueError: if the header holds what is no JSON, or more than is read again.
+        TypeError: likewise, and for arrays of other dtypes.
     """
     path = resolve(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"schema": SCHEMA, "kind": kind, **header}, allow_nan=False)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        temporary.touch()
-        mode = temporary.stat().st_mode
-        save_file({key: np.asarray(value, order="C") for key, value in arrays.items()}, temporary, {HEADER_KEY: text})
-        temporary.chmod(mode)  # safetensors makes files that only their owner may read
-        with temporary.open("r+b") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    if taken := [key for key in RESERVED if key in header]:
+        raise ValueError(f"the header may not have a {taken[0]!r} of its own; name it otherwise")
+    sums = {name: _checksum(tensors.plain(name, value)) for name, value in arrays.items()}
+    text = json.dumps({"schema": SCHEMA, "kind": kind, **header, CHECKSUMS: sums}, allow_nan=False)
+    tensors.parse_json(text)
+    entries = tensors.layout(arrays)
+    start = tensors.table_bytes(entries, {HEADER_KEY: text, CHECKSUM_KEY: _text_checksum(text)})
+    with atomic.replacing(path) as file:
+        file.write(start)
+        for entry in entries:
+            file.write(tensors.as_bytes(tensors.plain(entry.name, arrays[entry.name])))
     return path
 
 
-def read(path: str | Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Returns header and arrays of a file of that ``kind`` (``"agent"``, ``"replay"`` or ``"vec_normalize"``).
+def read(path: str | Path, kind: str) -> tuple[Header, dict[str, np.ndarray]]:
+    """Returns header and arrays of a file of that ``kind``; headers of older schemas come as those of the present one.
 
     For ``model.zip``, where there is none, ``model.safetensors`` is read.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        CheckpointError: if it is not a complete rejeu file of that kind and schema.
+        CheckpointError: if it is not a complete, undamaged rejeu file of that kind; it says what is wrong, and of damaged
+            arrays which.
     """
+    with _opened(path) as (path, file, size):
+        header, sums, table = _head(path, file, size, kind)
+        memory = physical_memory()
+        if memory is not None and size > memory:
+            raise CheckpointError(f"{path} has {size / 2**30:.1f} GiB and the machine {memory / 2**30:.1f} GiB")
+        arrays = {}
+        for entry in table.entries:
+            array = tensors.read_array(file, entry)
+            if sums is not None and sums[entry.name] != _checksum(tensors.plain(entry.name, array)):
+                raise CheckpointError(
+                    f"{path}: the array {shown(entry.name)} is damaged (its checksum differs); restore the file from a "
+                    "copy"
+                )
+            arrays[entry.name] = array
+    return _migrated(path, header), arrays
+
+
+def read_header(path: str | Path, kind: str) -> Header:
+    """Returns the header alone of a file of that ``kind``: as :func:`read`, but the arrays are not looked at."""
+    with _opened(path) as (path, file, size):
+        header, _, _ = _head(path, file, size, kind)
+    return _migrated(path, header)
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path) -> Iterator[tuple[Path, BinaryIO, int]]:
+    """Gives the path that is read, its open file and size, and says of whatever goes wrong within which file it was."""
     path = resolve(path)
     if path.suffix in FOREIGN and not path.exists() and path.with_suffix(SUFFIX).exists():
         path = path.with_suffix(SUFFIX)
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
+    if not path.is_file():
+        raise CheckpointError(f"{path} is no file but a folder or a device; give the path of a file")
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = _header(path, kind, (file.metadata() or {}).get(HEADER_KEY))
-            arrays = {}
-            for name in file.keys():  # noqa: SIM118 - the handle is no dict
-                if file.get_slice(name).get_dtype() not in DTYPES:
-                    raise CheckpointError(f"{path}: {name} has a dtype that rejeu does not write")
-                arrays[name] = file.get_tensor(name)
-    except (SafetensorError, OSError, ValueError, OverflowError) as error:
-        if isinstance(error, CheckpointError):
-            raise
+        with path.open("rb") as file:
+            yield path, file, os.fstat(file.fileno()).st_size
+    except Malformed as error:
         raise CheckpointError(
             f"{path} is not a complete safetensors file ({error}); it was cut short or is of another program"
         ) from None
-    return header, arrays
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from None
+    except MemoryError:
+        raise CheckpointError(f"{path} holds more than there is memory for") from None
 
 
-def _header(path: Path, kind: str, text: str | None) -> dict[str, Any]:
+def _head(path: Path, file: BinaryIO, size: int, kind: str) -> tuple[Header, dict[str, int] | None, Table]:
+    """Returns header, the arrays' checksums (None of schema 1, which has none) and the table, all checked."""
+    table = tensors.read_table(file, size)
+    text = table.metadata.get(HEADER_KEY)
     if text is None:
         raise CheckpointError(f"{path} is a safetensors file, but not one that rejeu wrote: its header is missing")
-    if len(text) > MAX_HEADER_BYTES:
-        raise CheckpointError(f"{path}: the header is larger than {MAX_HEADER_BYTES} bytes")
-    try:
-        header = json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError):
-        raise CheckpointError(f"{path}: the header is damaged") from None
-    if not isinstance(header, dict) or not isinstance(header.get("schema"), int):
-        raise CheckpointError(f"{path}: the header is damaged")
-    if header["schema"] != SCHEMA:
-        raise CheckpointError(
-            f"{path} has schema {header['schema']} and this rejeu reads schema {SCHEMA}; "
-            + ("upgrade rejeu" if header["schema"] > SCHEMA else "it is of an unreleased version")
-        )
+    for entry in table.entries:
+        if entry.dtype not in DTYPES:
+            raise CheckpointError(f"{path}: {shown(entry.name)} has a dtype that rejeu does not write")
+    header = _header(path, text, table.metadata.get(CHECKSUM_KEY))
     if header.get("kind") != kind:
-        raise CheckpointError(f"{path} holds {str(header.get('kind'))[:40]!r}, expected {kind!r}")
+        raise CheckpointError(f"{path} holds {shown(header.get('kind'))!r}, expected {kind!r}")
+    sums = header.pop(CHECKSUMS, None)
+    if header["schema"] == 1:
+        return header, None, table
+    _check_named(path, table.entries, sums)
+    return header, sums, table
+
+
+def _header(path: Path, text: str, checksum: str | None) -> Header:
+    def damaged(how: str) -> CheckpointError:
+        return CheckpointError(f"{path}: the header is damaged ({how}); restore the file from a copy")
+
+    try:
+        header = tensors.parse_json(text)
+    except Malformed as error:
+        raise damaged(str(error)) from None
+    if not isinstance(header, dict) or type(schema := header.get("schema")) is not int:
+        raise damaged("it has no schema")
+    if schema > SCHEMA or schema < 1:
+        raise CheckpointError(
+            f"{path} has schema {schema} and this rejeu reads schemas 1 to {SCHEMA}; "
+            + ("upgrade rejeu" if schema > SCHEMA else "it is of an unreleased version")
+        )
+    if (schema > 1 or checksum is not None) and checksum != _text_checksum(text):
+        raise damaged("its checksum differs")
     return header
 
 
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON number")
+def _check_named(path: Path, entries: list[Entry], sums: Any) -> None:
+    if not isinstance(sums, dict) or not all(type(value) is int for value in sums.values()):
+        raise CheckpointError(f"{path}: the header holds no checksums; restore the file from a copy")
+    if differing := {entry.name for entry in entries} ^ sums.keys():
+        raise CheckpointError(f"{path}: {shown(min(differing))} is among the arrays or the checksums, but not in both")
+
+
+def _migrated(path: Path, header: Header) -> Header:
+    """Returns a header of the present schema from one of any that was released."""
+    try:
+        while header["schema"] < SCHEMA:
+            header = MIGRATIONS[header["schema"]](header)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise CheckpointError(f"{path}: the header of schema {header['schema']} is damaged: {shown(error)}") from None
+    return header
+
+
+def _checksum(array: np.ndarray) -> int:
+    """Returns the CRC-32 of an array's dtype, shape and contiguous bytes."""
+    kind = f"{array.dtype.name}{list(array.shape)}".encode()
+    return zlib.crc32(tensors.as_bytes(array), zlib.crc32(kind))
+
+
+def _text_checksum(text: str) -> str:
+    return f"{zlib.crc32(text.encode('utf-8', 'surrogatepass')):08x}"
+
+
+def require_finite(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
+    """Raises ``CheckpointError``, with the name, if an array holds infinities or what is no number."""
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise CheckpointError(
+                f"{path}: {shown(name)} holds numbers that are not finite: training had diverged when it was saved; "
+                "load an earlier file"
+            )
 
 
 def names(tree: PyTree) -> list[str]:
@@ -148,6 +248,6 @@ def arrays_to_tree(expected: PyTree, arrays: Mapping[str, np.ndarray], path: str
             )
     if extra := sorted(set(arrays) - set(keys)):
         raise CheckpointError(
-            f"{path} has {extra[0]}, which this agent has not; it was saved with another configuration"
+            f"{path} has {shown(extra[0])}, which this agent has not; it was saved with another configuration"
         )
     return jax.tree.unflatten(jax.tree.structure(expected), [arrays[key] for key in keys])

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from rejeu.memory import physical_memory
 from rejeu.spaces import Leaf, flat_keys
 
 STEP, TERMINATED, LAST = 0, 1, 2
@@ -285,6 +286,9 @@ class Ring:
                     f"{name} in the replay file is {arrays[name].dtype}{list(arrays[name].shape)} and this buffer "
                     f"expects {array.dtype}{list(expected)}; it was saved with another environment or buffer_size"
                 )
+        for name in ("action", "reward"):
+            if not np.isfinite(arrays[name]).all():
+                raise ValueError(f"{name} in the replay file holds what is not finite, which no environment may return")
         if not self._consistent(head, n_steps, arrays["kind"], arrays["since_start"], arrays["until_end"]):
             raise ValueError("the replay file's counters are damaged")
         for name, array in own.items():
@@ -393,13 +397,8 @@ def is_stack(leaf: Leaf, frame_stack: int | None) -> bool:
 
 def check_memory(nbytes: int, capacity: int) -> None:
     """Raises ``MemoryError``, with the numbers, if ``nbytes`` exceed the machine's physical memory."""
-    try:
-        import os
-
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # not on Windows: there the allocation itself says no
-        return
-    if nbytes > memory:
+    memory = physical_memory()
+    if memory is not None and nbytes > memory:
         fits = int(capacity * 0.5 * memory / nbytes)
         raise MemoryError(
             f"buffer_size={capacity} takes {nbytes / 2**30:.1f} GiB for this environment and the machine has "
