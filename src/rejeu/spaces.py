@@ -12,8 +12,13 @@ import numpy as np
 from gymnasium import spaces
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
-LARGEST_BOX = 2**28
-"""Most numbers that a Box read from a file may hold: a damaged file must not exhaust the memory."""
+LARGEST = 2**20
+"""Most numbers and choices, together, of a space that is read from a file, unless the file is itself large enough to hold
+networks for more: a damaged file must not exhaust the memory."""
+MOST_LEAVES = 1024
+"""Most arrays that an observation read from a file may consist of."""
+BOX_DTYPES = ("float16", "float32", "float64", "int8", "int16", "int32", "uint8", "uint16", "uint32")
+"""What :func:`describe` calls the dtypes of a Box."""
 
 
 @dataclass(frozen=True)
@@ -273,35 +278,86 @@ def describe(space: spaces.Space) -> Any:
     raise TypeError(f"cannot describe the space {space}")
 
 
-def rebuild(description: Any) -> spaces.Space:
+def rebuild(description: Any, largest: int = LARGEST) -> spaces.Space:
     """Returns the space that :func:`describe` described: the inverse, over a fixed set of names.
 
+    Args:
+        description: JSON values.
+        largest: most numbers and choices that it may have, over all its parts.
+
     Raises:
-        ValueError: if the description is not one that :func:`describe` writes.
+        ValueError: if the description is not one that :func:`describe` writes, or is of a larger space.
     """
     try:
-        (kind, body), *others = description.items()
-        if others:
-            raise ValueError("more than one space")
-        if kind == "Dict":
-            return spaces.Dict({str(key): rebuild(part) for key, part in body.items()})
-        if kind == "Tuple":
-            return spaces.Tuple([rebuild(part) for part in body])
-        if kind == "Box":
-            dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
-            if dtype.kind not in "fiu" or math.prod(shape) > LARGEST_BOX:
-                raise ValueError(f"dtype {dtype}, shape {shape}")
-            low, high = (np.asarray(body[end], np.float64).astype(dtype) for end in ("low", "high"))
-            return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
-        if kind == "Discrete":
-            return spaces.Discrete(body["n"], start=body["start"])
-        if kind == "MultiDiscrete":
-            return spaces.MultiDiscrete(body["nvec"], start=body["start"])
-        if kind == "MultiBinary":
-            return spaces.MultiBinary(body["shape"])
-    except (AttributeError, KeyError, TypeError, ValueError, AssertionError, OverflowError) as error:
+        sizes = _sizes(description)
+        if sum(sizes) > largest or len(sizes) > MOST_LEAVES:
+            raise ValueError(
+                f"{sum(sizes)} numbers in {len(sizes)} arrays, expected {largest} in {MOST_LEAVES} at most"
+            )
+        return _rebuild(description)
+    except (AttributeError, LookupError, TypeError, ValueError, AssertionError, ArithmeticError) as error:
         raise ValueError(f"not the description of a space: {error}") from None
-    raise ValueError(f"not the description of a space: {kind!r}")
+
+
+def _rebuild(description: Any) -> spaces.Space:
+    ((kind, body),) = description.items()
+    if kind == "Dict":
+        return spaces.Dict({key: _rebuild(part) for key, part in body.items()})
+    if kind == "Tuple":
+        return spaces.Tuple([_rebuild(part) for part in body])
+    if kind == "Box":
+        dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
+        low, high = (_bound(body[end], dtype) for end in ("low", "high"))
+        return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
+    if kind == "Discrete":
+        return spaces.Discrete(body["n"], start=body["start"])
+    if kind == "MultiDiscrete":
+        return spaces.MultiDiscrete(body["nvec"], start=body["start"])
+    return spaces.MultiBinary(body["shape"])
+
+
+def _sizes(description: Any) -> list[int]:
+    """Returns how many numbers or choices each array of a described space has; nothing of that size is made.
+
+    Raises:
+        ValueError: for what no description holds, or another of what :func:`rebuild` catches.
+    """
+    ((kind, body),) = description.items()
+    if kind in ("Dict", "Tuple"):
+        parts = body.values() if kind == "Dict" else body
+        return [size for part in parts for size in _sizes(part)]
+    if kind == "Box":
+        if body["dtype"] not in BOX_DTYPES:
+            raise ValueError(f"a Box of {str(body['dtype'])[:40]!r}")
+        return [math.prod(_integers(body["shape"]))]
+    if kind in ("Discrete", "MultiDiscrete"):
+        _integers(_flat(body["start"]), least=-(2**62))
+        return [sum(_integers(_flat(body["n" if kind == "Discrete" else "nvec"])))]
+    if kind == "MultiBinary":
+        return [math.prod(_integers(body["shape"]))]
+    raise ValueError(f"{str(kind)[:40]!r}")
+
+
+def _integers(value: Any, least: int = 0) -> list[int]:
+    if not isinstance(value, list) or not all(type(n) is int and least <= n < 2**62 for n in value):
+        raise ValueError(f"{str(value)[:40]} in place of whole numbers")
+    return value
+
+
+def _flat(value: Any) -> list[Any]:
+    return [leaf for part in value for leaf in _flat(part)] if isinstance(value, list) else [value]
+
+
+def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
+    """Returns a bound of a Box from JSON, of 64-bit integers that were halved clipped to what is left."""
+    for number in _flat(value):
+        if type(number) not in (int, float) and number not in ("inf", "-inf"):
+            raise ValueError(f"the bound {str(number)[:40]!r}")
+    bound = np.asarray(value, np.float64)
+    if dtype.kind != "f":
+        bound = bound.clip(np.iinfo(dtype).min, np.iinfo(dtype).max)
+    with np.errstate(over="raise", invalid="raise"):
+        return bound.astype(dtype)
 
 
 def _bounds(bounds: np.ndarray) -> Any:

@@ -19,9 +19,8 @@ AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent i
 
 def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
     """Returns the agent of a model file, whichever algorithm it is of; see :meth:`Agent.load`."""
-    header, _ = checkpoint.read(path, "agent")
-    name = header.get("algorithm")
-    if name not in AGENTS:
+    name = checkpoint.read_header(path, "agent").get("algorithm")
+    if not isinstance(name, str) or name not in AGENTS:
         raise CheckpointError(f"{path} holds an agent of {str(name)[:40]!r}; this rejeu has {', '.join(AGENTS)}")
     return AGENTS[name].load(path, env, **changes)
 

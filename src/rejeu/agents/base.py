@@ -25,7 +25,8 @@ from rejeu import checkpoint, compilation, config as configs, finite, spaces, su
 from rejeu.agents import checkpoints, files
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import Checkpoint, Resumed, RowFiles
-from rejeu.agents.files import AGENT_ARGUMENTS, whole_seed
+from rejeu.agents.files import AGENT_ARGUMENTS
+from rejeu.agents.loading import whole_seed
 from rejeu.envs.auto_reset import AutoResetView, around
 from rejeu.envs.masks import split
 from rejeu.envs.vec_env import VecEnv
@@ -694,7 +695,9 @@ class Agent(ABC):
         """
         source = load_path_or_dict
         if isinstance(source, str | Path):
-            _, source = checkpoint.read(source, "agent")
+            path = source
+            _, source = checkpoint.read(path, "agent")
+            checkpoint.require_finite(source, path)
         arrays = {key: np.asarray(value) for key, value in source.items()}
         if not exact_match:
             arrays = self.get_parameters() | arrays

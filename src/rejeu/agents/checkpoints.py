@@ -31,7 +31,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rejeu import checkpoint, finite, plain, spaces
-from rejeu.agents import files
+from rejeu.agents import files, loading
 from rejeu.agents.call import Call
 from rejeu.config import number, whole
 from rejeu.core import PyTree
@@ -169,7 +169,7 @@ class Checkpoint:
     def _check_owner(self, agent: Agent) -> None:
         for path in run_files(self.folder):
             try:
-                header, _ = checkpoint.read(path, "run")
+                header = checkpoint.read_header(path, "run")
             except CheckpointError:
                 continue
             if header.get("run_id") != agent._run_id:
@@ -253,7 +253,7 @@ class Checkpoint:
         """Returns the files of rows that a checkpoint names; none, if it is damaged."""
         if path not in self._named:
             try:
-                self._named[path] = [str(name) for name in checkpoint.read(path, "run")[0]["rows"]]
+                self._named[path] = [str(name) for name in checkpoint.read_header(path, "run")["rows"]]
             except (CheckpointError, KeyError, TypeError):
                 self._named[path] = []
         return self._named[path]
@@ -428,7 +428,7 @@ def restore(
     if saved["envs"] is not None:
         put_envs_back(run, saved)
     elif saved["seed"] is not None:
-        run.seed = files.whole_seed(saved["seed"])
+        run.seed = loading.whole_seed(saved["seed"])
     agent.history.replace(saved["history"])
     agent._fill_windows()
     if saved["best"] is not None:

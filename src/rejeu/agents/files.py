@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from rejeu import checkpoint, config as configs, spaces
+from rejeu.agents import loading
 from rejeu.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ AGENT_ARGUMENTS = {
     "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
 }
 """What every agent takes beside its hyper-parameters, with its meaning."""
-COUNTERS = ("step", "steps_before", "episode", "n_updates")
-"""What a model file counts; all below 2^32."""
 
 
 def header(agent: Agent) -> dict[str, Any]:
@@ -83,47 +82,30 @@ def load(
         other = str(header.get("algorithm"))[:40]
         raise CheckpointError(f"{path} holds a {other} agent, not {name}; use rejeu.load(path) or rejeu.{other}.load")
     own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
+    given = {key: own.pop(key) for key in loading.GIVEN if key in own}
     try:
-        config = configs.rebuild(cls.algorithm.Config, header["config"], changes)
-        observation_space = spaces.rebuild(header["observation_space"])
-        action_space = spaces.rebuild(header["action_space"])
-        counters = {key: configs.whole(key, header["counters"][key], 0, 2**32 - 1) for key in COUNTERS}
-        rng = {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")}
-        seed = whole_seed(own.pop("seed", header["seed"]))
-        threshold = own.pop("success_threshold", header.get("success_threshold"))
-        threshold = None if threshold is None else configs.number("success_threshold", threshold)
-        window = configs.whole("stats_window_size", own.pop("stats_window_size", header["stats_window_size"]), 1)
-        policy = own.pop("policy", header["policy"])
-        cls._check_policy(policy, observation_space)
+        saved = loading.interpret(header, arrays, cls.algorithm.Config, cls._check_policy, given, changes)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        if changes and not isinstance(error, KeyError):
-            raise
-        raise CheckpointError(f"{path}: the header is damaged or of another version: {error}") from None
+    checkpoint.require_finite(arrays, path)
 
     agent = cls.__new__(cls)
     agent._set_up(
-        policy, config, seed, own.pop("verbose", 0), own.pop("tensorboard_log", None), window, threshold
+        saved.policy, saved.config, saved.seed, own.pop("verbose", 0), own.pop("tensorboard_log", None),
+        saved.stats_window_size, saved.success_threshold,
     )  # fmt: skip
     try:
-        agent._build(observation_space, action_space, 1)
-    except (TypeError, ValueError, MemoryError, OverflowError) as error:
-        raise CheckpointError(f"{path}: {error}") from None
+        agent._build(saved.observation_space, saved.action_space, 1)
+    except loading.WRONG as error:
+        raise CheckpointError(f"{path}: {loading.brief(error)}") from None
     state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
     vector = make_env(agent)
     if vector is not None:
         agent._check_spaces(vector, "the given environment")
-    agent._stand(vector, state, counters, rng)
+    try:
+        agent._stand(vector, state, saved.counters, saved.rng)
+    except (ArithmeticError, MemoryError, ValueError) as error:
+        if changes.keys() & {"buffer_size", "n_steps", "n_episodes"}:
+            raise
+        raise CheckpointError(f"{path}: {loading.brief(error)}") from None
     return agent
-
-
-def whole_seed(seed: Any) -> int:
-    """Returns a seed as an int in [0, 2^32).
-
-    Raises:
-        ValueError: otherwise.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
-    return int(seed)

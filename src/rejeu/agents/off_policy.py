@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 
 from rejeu import checkpoint, spaces
@@ -51,12 +52,13 @@ class OffPolicyAgent(Agent):
                 when the next begins, so hindsight uses them as far as they went.
 
         Raises:
-            CheckpointError: if the file is damaged, or of another environment or buffer size.
+            CheckpointError: if the file is damaged, or of another environment or buffer size; nothing is then changed.
         """
         if self._run.replay is None:
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
         _, arrays = checkpoint.read(path, "replay")
         try:
+            _check_actions(arrays.get("action"), self.action_space)
             self._run.replay.restore(arrays)
         except ValueError as error:
             raise CheckpointError(f"{path}: {error}") from None
@@ -156,3 +158,11 @@ class CrossQ(OffPolicyAgent):
     """SAC with batch renormalisation instead of target networks (Bhatt et al. 2024), for continuous actions."""
 
     algorithm: ClassVar[ModuleType] = crossq
+
+
+def _check_actions(action: np.ndarray | None, space: gym.Space) -> None:
+    """Raises ``ValueError`` if a file's Discrete actions are none of the space's, which nothing later would notice."""
+    if action is None or not isinstance(space, gym.spaces.Discrete) or not action.size:
+        return
+    if action.min() < 0 or action.max() >= space.n:
+        raise ValueError(f"the replay file has actions from {action.min()} to {action.max()}, expected {space}")

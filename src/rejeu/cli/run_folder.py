@@ -200,15 +200,17 @@ def find_model(run: Path, which: Which) -> Path:
 
 
 def environment_of(model: Path) -> str:
-    """Returns the id of the environment that a model file was trained on.
+    """Returns the id of the environment that a model file was trained on: of one that is registered here.
+
+    Gymnasium imports the module before a colon in an id. No id that was saved holds one, and none is taken from a file: what
+    is imported must not be a file's choice.
 
     Raises:
         CheckpointError: if the file does not say, or is no model.
     """
     from rejeu import checkpoint
 
-    header, _ = checkpoint.read(model, "agent")
-    env_id = header.get("env_id")
-    if not isinstance(env_id, str):
+    env_id = checkpoint.read_header(model, "agent").get("env_id")
+    if not isinstance(env_id, str) or not re.fullmatch(r"[\w./-]{1,200}", env_id):
         raise CheckpointError(f"{model} does not say which environment it is for; load it in Python: rejeu.load(path)")
     return env_id

@@ -10,6 +10,7 @@ at 1e-4 with mean 0 and variance 1, as in Stable-Baselines3.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ KIND = "vec_normalize"
 FIRST_COUNT = 1e-4
 """How many values the mean 0 and the variance 1 at the beginning count for."""
 NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
+MOST = dict.fromkeys(NUMBERS, math.inf) | {"gamma": 1.0}
 SWITCHES = ("training", "norm_obs", "norm_reward")
 
 
@@ -244,12 +246,15 @@ class VecNormalize(VecEnvWrapper):
         Raises:
             CheckpointError: if they are damaged, or of an environment with other observations.
         """
-        _restore(self.ret_rms, arrays, "returns", path)
+        left = dict(arrays)
+        _restore(self.ret_rms, left, "returns", path)
         if isinstance(self.obs_rms, dict):
             for i, moments in enumerate(self.obs_rms.values()):
-                _restore(moments, arrays, f"obs.{i}", path)
+                _restore(moments, left, f"obs.{i}", path)
         elif self.obs_rms is not None:
-            _restore(self.obs_rms, arrays, "obs", path)
+            _restore(self.obs_rms, left, "obs", path)
+        if left:
+            raise CheckpointError(f"{path} has {checkpoint.shown(min(left))}, for which these settings have no use")
 
     def save(self, save_path: str | Path) -> Path:
         """Writes statistics and settings to one safetensors file and returns its path; the environments are not in it.
@@ -274,10 +279,10 @@ class VecNormalize(VecEnvWrapper):
         """
         header, arrays = checkpoint.read(load_path, KIND)
         try:
-            settings = {key: number(key, header["settings"][key]) for key in NUMBERS}
-            switches = {key: header["settings"][key] is True for key in SWITCHES}
-            new = VecNormalize(venv, **switches, **settings, norm_obs_keys=header["keys"])  # type: ignore[arg-type]
-        except (KeyError, TypeError, ValueError) as error:
+            settings = {key: number(key, header["settings"][key], least=0, most=MOST[key]) for key in NUMBERS}
+            switches = {key: _check_switch(key, header["settings"][key]) for key in SWITCHES}
+            new = VecNormalize(venv, **switches, **settings, norm_obs_keys=_check_keys(header["keys"]))  # type: ignore[arg-type]
+        except (LookupError, TypeError, ValueError) as error:
             raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
         new.put_statistics(arrays, load_path)
         return new
@@ -311,14 +316,34 @@ def _arrays(moments: RunningMeanStd) -> dict[str, np.ndarray]:
     return {"mean": moments.mean, "var": moments.var, "count": np.array(moments.count, np.float64)}
 
 
-def _restore(moments: RunningMeanStd, arrays: Mapping[str, np.ndarray], name: str, path: str | Path) -> None:
+def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, path: str | Path) -> None:
+    """Takes moments out of a file's arrays.
+
+    Raises:
+        CheckpointError: if they are not there, or not numbers that moments may be.
+    """
+    found = {}
     for part, shape in (("mean", moments.mean.shape), ("var", moments.mean.shape), ("count", ())):
-        found = arrays.get(f"{name}.{part}")
-        if found is None or found.shape != shape or not np.isfinite(found).all():
-            got = "nothing" if found is None else f"the shape {found.shape}"
-            raise CheckpointError(f"{path}: {name}.{part} has {got}, expected finite numbers of the shape {shape}")
-    moments.mean, moments.var = arrays[f"{name}.mean"].copy(), arrays[f"{name}.var"].copy()
-    moments.count = float(arrays[f"{name}.count"])
+        array = arrays.pop(f"{name}.{part}", None)
+        if array is None or array.shape != shape or array.dtype != np.float64 or not np.isfinite(array).all():
+            got = "nothing" if array is None else f"{array.dtype}{list(array.shape)}"
+            raise CheckpointError(f"{path}: {name}.{part} has {got}, expected finite float64 of the shape {shape}")
+        if part != "mean" and (array < 0).any():
+            raise CheckpointError(f"{path}: {name}.{part} has negative numbers, which it cannot have")
+        found[part] = array
+    moments.mean, moments.var, moments.count = found["mean"], found["var"], float(found["count"])
+
+
+def _check_keys(keys: Any) -> list[str] | None:
+    if keys is not None and not (isinstance(keys, list) and all(isinstance(key, str) for key in keys)):
+        raise ValueError(f"the keys are {str(keys)[:40]}, expected names or null")
+    return keys
+
+
+def _check_switch(key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{key}={str(value)[:40]} must be true or false")
+    return value
 
 
 def _check_box(space: spaces.Space, key: str | None) -> None:

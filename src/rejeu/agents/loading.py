@@ -1,0 +1,155 @@
+"""What the header of a model file says, checked against the arrays of the file before anything is built from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu import config as configs, spaces
+from rejeu.errors import CheckpointError
+
+COUNTERS = ("step", "steps_before", "episode", "n_updates")
+"""What a model file counts; all below 2^32."""
+GIVEN = ("policy", "seed", "success_threshold", "stats_window_size")
+"""Constructor arguments that a model file keeps, and that may be given otherwise when it is loaded."""
+SIZES = ("n_critics", "n_quantiles")
+"""Hyper-parameters outside ``policy_kwargs`` that networks grow with."""
+MOST_LAYERS = 256
+"""Most layers of any kind that the networks of a file may have: each costs time to build, even if it is empty."""
+SMALL = 2**16
+"""Widths up to here cost nothing to look at, whatever arrays a file has."""
+WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
+"""What Python raises where values of a file are not what they should be."""
+
+
+class Saved(NamedTuple):
+    """What a model file says beside its arrays."""
+
+    config: Any
+    """The algorithm's configuration."""
+    observation_space: gym.Space
+    action_space: gym.Space
+    counters: dict[str, int]
+    rng: dict[str, int]
+    """State of the NumPy generator."""
+    policy: str
+    seed: int
+    success_threshold: float | None
+    stats_window_size: int
+
+
+def interpret(
+    header: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    kind: type,
+    check_policy: Callable[[str, gym.Space], None],
+    given: Mapping[str, Any],
+    changes: Mapping[str, Any],
+) -> Saved:
+    """Returns what a header says, with some of it changed; builds nothing larger than the file.
+
+    Args:
+        header: JSON values of schema ``checkpoint.SCHEMA``.
+        arrays: of the same file; of them only the sizes are used.
+        kind: class of the algorithm's configuration.
+        check_policy: raises unless the name of a policy fits a space.
+        given: some of ``GIVEN`` as the user has them.
+        changes: hyper-parameters as the user has them.
+
+    Raises:
+        CheckpointError: where the file is at fault.
+        TypeError, ValueError: where ``given`` or ``changes`` are.
+    """
+    try:
+        return _interpret({**header, **given}, arrays, kind, check_policy, changes)
+    except WRONG as error:
+        own = _torso(changes)
+        others = given or changes.keys() - own.keys()
+        if isinstance(error, CheckpointError) or (others and _is_sound(header, arrays, kind, check_policy, own)):
+            raise
+        raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
+
+
+def _is_sound(*arguments: Any) -> bool:
+    try:
+        _interpret(*arguments)
+    except WRONG:
+        return False
+    return True
+
+
+def brief(error: BaseException) -> str:
+    """Returns what an error says on one line, cut where it repeats values of a file at length."""
+    text = " ".join((str(error) or type(error).__name__).split())
+    return text if len(text) <= 400 else text[:397] + "..."
+
+
+def whole_seed(seed: Any) -> int:
+    """Returns a seed as an int in [0, 2^32).
+
+    Raises:
+        ValueError: otherwise.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
+    return int(seed)
+
+
+def _interpret(
+    header: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    kind: type,
+    check_policy: Callable[[str, gym.Space], None],
+    changes: Mapping[str, Any],
+) -> Saved:
+    try:
+        config: Any = configs.rebuild(kind, header["config"], changes)
+        check_sizes(config, arrays)
+        largest = max(spaces.LARGEST, sum(array.nbytes for array in arrays.values()))
+        observation_space = spaces.rebuild(header["observation_space"], largest)
+        threshold = header.get("success_threshold")
+        policy = header["policy"]
+        check_policy(policy, observation_space)
+        return Saved(
+            config,
+            observation_space,
+            spaces.rebuild(header["action_space"], largest),
+            {key: configs.whole(key, header["counters"][key], 0, 2**32 - 1) for key in COUNTERS},
+            {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")},
+            policy,
+            whole_seed(header["seed"]),
+            None if threshold is None else configs.number("success_threshold", threshold),
+            configs.whole("stats_window_size", header["stats_window_size"], 1),
+        )
+    except KeyError as error:
+        raise CheckpointError(f"the header is damaged or of another version: {brief(error)} is missing") from None
+
+
+def check_sizes(config: Any, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises ``CheckpointError`` where a configuration asks for networks larger than all arrays together.
+
+    Every layer of that width, or ensemble of that number, would have at least as many numbers. So what is built to
+    compare shapes is no larger than what was read.
+    """
+    largest = max(SMALL, sum(array.size for array in arrays.values()))
+    policy = config.policy_kwargs
+    widths = {key: value for key, value in vars(policy).items() if isinstance(value, tuple)}
+    numbers = {key: value for key, value in vars(policy).items() if type(value) is int}
+    numbers |= {key: value for key, value in vars(config).items() if key in SIZES}
+    for key, layers in {**widths, "n_blocks": range(policy.n_blocks)}.items():
+        if len(layers) > MOST_LAYERS:
+            raise CheckpointError(f"{key} has {len(layers)} layers, expected {MOST_LAYERS} at most")
+    for key, value in [*numbers.items(), *((key, max(layers, default=0)) for key, layers in widths.items())]:
+        if value > largest:
+            raise CheckpointError(f"{key}={value} is larger than all that the file holds; it has other networks")
+
+
+def _torso(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns of the changes only a torso, without which a file that has one cannot be judged."""
+    policy = changes.get("policy_kwargs")
+    if isinstance(policy, Mapping) and "torso" in policy:
+        return {"policy_kwargs": {"torso": policy["torso"]}}
+    return {}

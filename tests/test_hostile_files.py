@@ -1,0 +1,238 @@
+"""Whatever a file holds, reading it ends soon, in little memory, with rejeu's own error, and changes nothing."""
+
+from __future__ import annotations
+
+import os
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu import checkpoint
+from rejeu.errors import CheckpointError
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
+from tests import hostile_files
+from tests.environments import Counter
+from tests.golden import record_files
+from tests.test_schemas import FOLDERS
+
+SECONDS = 2.0
+"""Longest that any file may take."""
+MEGABYTES = 64
+"""Most memory that any file may take, beyond what was in use."""
+FILES = {"agent": "sac", "replay": "replay", "vec_normalize": "vec_normalize"}
+"""A valid file of each kind."""
+CONTENTS = {kind: (FOLDERS[-1] / f"{name}.safetensors").read_bytes() for kind, name in FILES.items()}
+SPECIAL = {
+    "agent": hostile_files.bad_models,
+    "replay": hostile_files.bad_buffers,
+    "vec_normalize": hostile_files.bad_statistics,
+}
+
+
+@pytest.fixture(scope="module")
+def loaders():
+    """For every kind of file what reads it, and returns what it may not have changed."""
+    agent = record_files.replay_agent().learn(7)
+    env = DummyVecEnv([lambda: Counter((5,))])
+
+    def load_replay(path):
+        agent.load_replay_buffer(path)
+
+    def load_statistics(path):
+        VecNormalize.load(path, env)
+
+    def state():
+        return {**agent.replay_buffer.arrays(), **agent.get_parameters()}
+
+    return {"agent": rejeu.load, "replay": load_replay, "vec_normalize": load_statistics}, state
+
+
+def all_variants(kind):
+    yield from hostile_files.variants(CONTENTS[kind])
+    yield from SPECIAL[kind](CONTENTS[kind])
+
+
+def same(one, other):
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_the_parts_put_together_are_a_valid_file(kind, loaders, tmp_path):
+    """Else every variant would be refused for what is wrong with all of them."""
+    path = tmp_path / "whole.safetensors"
+    path.write_bytes(hostile_files.put_together(hostile_files.take_apart(CONTENTS[kind])))
+    loaders[0][kind](path)
+
+
+def attempt(load, path):
+    """What became of a file: ``refused`` with our own error on one line, ``read``, or what else was raised."""
+    try:
+        load(path)
+    except CheckpointError as error:
+        text = str(error)
+        return "refused" if "\n" not in text and len(text) < 1000 else f"refused at length: {text[:300]}"
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:300]}"
+    return "read"
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_hostile_file_is_refused_soon_and_changes_nothing(kind, loaders, tmp_path):
+    load, state = loaders[0][kind], loaders[1]
+    path = tmp_path / "hostile.safetensors"
+    before, wrong, n = state(), [], 0
+    for variant in all_variants(kind):
+        path.write_bytes(variant.content)
+        began = time.perf_counter()
+        outcome = attempt(load, path)
+        seconds = time.perf_counter() - began
+        n += 1
+        if outcome != "refused" or seconds > SECONDS:
+            wrong.append((variant.kind, variant.name, outcome, round(seconds, 1)))
+    assert not wrong
+    assert n > 200
+    assert same(before, state())
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_hostile_file_takes_little_memory(kind, loaders, tmp_path):
+    """Those that speak of large things, and that are large themselves."""
+    path = tmp_path / "hostile.safetensors"
+    kinds = ("huge", "shape", "places", "length", "json", "header text", "deep", "buffer", "duplicate", "table")
+    tracemalloc.start()
+    try:
+        for variant in all_variants(kind):
+            if variant.kind not in kinds:
+                continue
+            path.write_bytes(variant.content)
+            tracemalloc.reset_peak()
+            before = tracemalloc.get_traced_memory()[0]
+            attempt(loaders[0][kind], path)
+            taken = tracemalloc.get_traced_memory()[1] - before
+            assert taken < MEGABYTES * 2**20, f"{variant.kind}, {variant.name}: {taken / 2**20:.0f} MB"
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_refused_file_leaves_the_parameters_as_they_were(tmp_path):
+    """The same for ``set_parameters``, which gets behind the header: only the arrays count there."""
+    agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")
+    before, path = agent.get_parameters(), tmp_path / "hostile.safetensors"
+    for variant in hostile_files.bad_arrays(CONTENTS["agent"]):
+        path.write_bytes(variant.content)
+        assert attempt(agent.set_parameters, path) == "refused", variant.name
+        assert same(before, agent.get_parameters())
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_file_cut_short_at_any_byte_is_refused(kind, tmp_path):
+    content, path = CONTENTS[kind], tmp_path / "cut.safetensors"
+    path.write_bytes(content)
+    for length in reversed(range(len(content))):
+        os.truncate(path, length)
+        assert attempt(lambda p: checkpoint.read(p, kind), path) == "refused", length
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_single_bit_that_flips_is_noticed(kind, tmp_path):
+    """A sample of them, the length and what follows it whole; ``trials/hostile.py`` flips every one."""
+    content, path = CONTENTS[kind], tmp_path / "flipped.safetensors"
+    path.write_bytes(content)
+    rng = np.random.default_rng(0)
+    with path.open("r+b", buffering=0) as file:
+        for bit in [*range(512), *rng.integers(512, 8 * len(content), 1000).tolist()]:
+            for value in (content[bit // 8] ^ 1 << bit % 8, content[bit // 8]):
+                file.seek(bit // 8)
+                file.write(bytes([value]))
+                outcome = attempt(lambda p: checkpoint.read(p, kind), path)
+                assert outcome == ("read" if value == content[bit // 8] else "refused"), bit
+
+
+def test_a_damaged_array_is_named(tmp_path):
+    path = tmp_path / "damaged.safetensors"
+    content = bytearray(CONTENTS["replay"])
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="the array kind is damaged"):
+        checkpoint.read(path, "replay")
+
+
+# What is no file at all.
+
+
+def test_a_folder_is_named_as_one(tmp_path):
+    (tmp_path / "model.safetensors").mkdir()
+    with pytest.raises(CheckpointError, match=r"model\.safetensors is no file but a folder"):
+        rejeu.load(tmp_path / "model")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_named_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "model.safetensors")
+    with pytest.raises(CheckpointError, match="is no file but"):
+        rejeu.load(tmp_path / "model")
+
+
+def test_a_symbolic_link_to_itself_is_no_file(tmp_path):
+    path = tmp_path / "model.safetensors"
+    try:
+        path.symlink_to(path)
+    except (OSError, NotImplementedError):
+        pytest.skip("symbolic links cannot be made here")
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        rejeu.load(path)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")
+def test_a_file_larger_than_the_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    text = '{"schema": 2, "kind": "agent", "checksums": {"a": 0}}'
+    table = hostile_files.table_of({}, {}, text)
+    table["a"] = {"dtype": "U8", "shape": [2**32], "data_offsets": [0, 2**32]}
+    path = tmp_path / "sparse.safetensors"
+    path.write_bytes(content := hostile_files.join(table, b""))
+    os.truncate(path, len(content) + 2**32)
+    monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**31)
+    with pytest.raises(CheckpointError, match=r"has 4\.0 GiB and the machine 2\.0 GiB"):
+        checkpoint.read(path, "agent")
+
+
+@pytest.mark.parametrize("env_id", ["evil:Env-v0", "os:system", "../x:y", "", "a" * 1000, "a b", 3, None])
+def test_the_environment_of_a_file_is_only_looked_for_among_those_that_are_registered(env_id, tmp_path):
+    """Gymnasium imports the module that an id names before a colon, which no file may choose."""
+    from rejeu.cli.run_folder import environment_of
+
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(hostile_files.changed(CONTENTS["agent"], lambda h, a: h.update(env_id=env_id)))
+    with pytest.raises(CheckpointError, match="does not say which environment"):
+        environment_of(path)
+    path.write_bytes(hostile_files.changed(CONTENTS["agent"], lambda h, a: h.update(env_id="rejeu/Ball-v0")))
+    assert environment_of(path) == "rejeu/Ball-v0"
+
+
+def test_what_the_caller_gives_is_not_blamed_on_the_file():
+    path = FOLDERS[-1] / "sac.safetensors"
+    with pytest.raises(ValueError, match="gamma=7 must be") as caught:
+        rejeu.load(path, gamma=7)
+    assert not isinstance(caught.value, CheckpointError)
+    with pytest.raises(ValueError, match="seed=-1 must be") as caught:
+        rejeu.load(path, seed=-1)
+    assert not isinstance(caught.value, CheckpointError)
+
+
+def test_a_bad_file_is_blamed_whatever_the_caller_gives(tmp_path):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(hostile_files.changed(CONTENTS["agent"], lambda h, a: h["config"].update(gamma=7)))
+    with pytest.raises(CheckpointError, match="gamma=7"):
+        rejeu.load(path, seed=1, batch_size=2)
+
+
+def test_a_buffer_larger_than_the_memory_is_refused_only_where_there_is_to_be_one(tmp_path):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(hostile_files.changed(CONTENTS["agent"], lambda h, a: h["config"].update(buffer_size=10**15)))
+    assert rejeu.load(path).config.buffer_size == 10**15
+    with pytest.raises(CheckpointError, match=r"buffer_size=1000000000000000 takes|allocate"):
+        rejeu.load(path, env=Counter((5,)))
+    assert rejeu.load(path, env=Counter((5,)), buffer_size=50).replay_buffer.size() == 0
