@@ -326,7 +326,8 @@ def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, 
     for part, shape in (("mean", moments.mean.shape), ("var", moments.mean.shape), ("count", ())):
         array = arrays.pop(f"{name}.{part}", None)
         if array is None or array.shape != shape or array.dtype != np.float64 or not np.isfinite(array).all():
-            got = "nothing" if array is None else f"{array.dtype}{list(array.shape)}"
+            same = array is not None and array.shape == shape
+            got = "nothing" if array is None else "other numbers" if same else f"the shape {array.shape}"
             raise CheckpointError(f"{path}: {name}.{part} has {got}, expected finite float64 of the shape {shape}")
         if part != "mean" and (array < 0).any():
             raise CheckpointError(f"{path}: {name}.{part} has negative numbers, which it cannot have")

@@ -1,0 +1,210 @@
+"""Reads every damaged and hostile file there is to make, and records what came of each.
+
+The larger version of ``tests/test_hostile_files.py``: truncation at every byte and a flip of every bit, of every kind of
+file and both schemas, beside the corpus of ``tests/hostile_files.py``::
+
+    python trials/hostile.py --sb3-python path/to/python/with/stable-baselines3
+
+The last argument adds an attempt to run code: a model file of Stable-Baselines3's own format, in which one object is a
+pickle that makes an empty file when it is opened, is given to Stable-Baselines3's ``load``; the same bytes are put into
+every place of a rejeu file that holds a text, and given to ours. Results go to ``trials/results/hostile.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import collections
+import json
+import os
+import pickle
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import rejeu
+from rejeu import checkpoint
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
+from tests import hostile_files
+from tests.environments import Counter
+from tests.golden import record_files
+
+ROOT = Path(__file__).parents[1]
+KINDS = {"agent": "sac", "replay": "replay", "vec_normalize": "vec_normalize"}
+SPECIAL = {
+    "agent": hostile_files.bad_models,
+    "replay": hostile_files.bad_buffers,
+    "vec_normalize": hostile_files.bad_statistics,
+}
+
+
+def main() -> None:
+    """Makes and reads the files, and writes the result."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--sb3-python", type=Path, help="Python of an environment that has stable-baselines3")
+    arguments = parser.parse_args()
+    result: dict[str, Any] = {"date": time.strftime("%Y-%m-%d"), "python": platform.python_version()}
+    result["system"] = platform.system()
+    before = peak_memory()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "file.safetensors"
+        loaders = readers()
+        for schema in range(1, checkpoint.SCHEMA + 1):
+            for kind, name in KINDS.items():
+                content = (ROOT / "tests" / "golden" / f"schema{schema}" / f"{name}.safetensors").read_bytes()
+                found = result[f"schema {schema}, {kind}"] = {
+                    "bytes": len(content),
+                    "cut short at every byte": count(cuts(content), lambda p, k=kind: checkpoint.read(p, k), path),
+                    "every bit flipped": count(flips(content), lambda p, k=kind: checkpoint.read(p, k), path),
+                }
+                if schema == checkpoint.SCHEMA:
+                    found["hostile"] = by_kind(kind, content, loaders[kind], path)
+                print(f"schema {schema}, {kind}", json.dumps(found), flush=True)
+        result["megabytes that reading all of them took"] = round((peak_memory() - before) / 2**20)
+        result["code in a rejeu file"] = code_in_ours(Path(folder))
+        if arguments.sb3_python is not None:
+            result["code in a Stable-Baselines3 file"] = code_in_theirs(arguments.sb3_python, Path(folder))
+    target = ROOT / "trials" / "results" / "hostile.json"
+    target.parent.mkdir(exist_ok=True)
+    target.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps({key: value for key, value in result.items() if key.startswith(("code", "mega"))}, indent=1))
+
+
+def readers() -> dict[str, Callable[[Path], object]]:
+    """Returns what reads a file of each kind."""
+    agent = record_files.replay_agent().learn(7)
+    env = DummyVecEnv([lambda: Counter((5,))])
+    return {
+        "agent": rejeu.load,
+        "replay": agent.load_replay_buffer,
+        "vec_normalize": lambda path: VecNormalize.load(path, env),
+    }
+
+
+def outcome(read: Callable[[Path], object], path: Path) -> str:
+    """Returns ``refused``, ``read``, or the name of what was raised instead of our own error."""
+    try:
+        read(path)
+    except rejeu.CheckpointError:
+        return "refused"
+    except Exception as error:
+        return type(error).__name__
+    return "read"
+
+
+def count(contents: Iterator[bytes], read: Callable[[Path], object], path: Path) -> dict[str, Any]:
+    """Reads files and returns how often each outcome came, and the longest time that one took, in seconds."""
+    found: collections.Counter[str] = collections.Counter()
+    longest = 0.0
+    with path.open("w+b", buffering=0) as file:
+        for content in contents:
+            file.seek(0)
+            file.truncate()
+            file.write(content)
+            began = time.perf_counter()
+            found[outcome(read, path)] += 1
+            longest = max(longest, time.perf_counter() - began)
+    return {**found, "longest seconds": round(longest, 2)}
+
+
+def cuts(content: bytes) -> Iterator[bytes]:
+    """Yields a file cut short at every byte."""
+    return (content[:length] for length in range(len(content)))
+
+
+def flips(content: bytes) -> Iterator[bytes]:
+    """Yields a file with each of its bits the other way round."""
+    return (hostile_files.flipped(content, bit) for bit in range(8 * len(content)))
+
+
+def by_kind(kind: str, content: bytes, read: Callable[[Path], object], path: Path) -> dict[str, Any]:
+    """Returns the outcomes of the corpus, by what is wrong with the files."""
+    groups = collections.defaultdict(list)
+    for variant in (*hostile_files.variants(content), *SPECIAL[kind](content)):
+        groups[variant.kind].append(variant.content)
+    return {group: count(iter(contents), read, path) for group, contents in sorted(groups.items())}
+
+
+def peak_memory() -> int:
+    """Returns the most bytes that this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+class Payload:
+    """What makes a file, and nothing else, when it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return open, (str(self.marker), "w")
+
+
+def code_in_ours(folder: Path) -> dict[str, Any]:
+    """Puts a pickle that runs code into every text of a model file, and in the file's place; returns what came of it."""
+    marker = folder / "ours-was-run"
+    raw = pickle.dumps(Payload(marker))
+    text = base64.b64encode(raw).decode()
+    content = (ROOT / "tests" / "golden" / f"schema{checkpoint.SCHEMA}" / "sac.safetensors").read_bytes()
+    path = folder / "evil.safetensors"
+    contents = [raw]
+    for places in range(len(texts(hostile_files.take_apart(content).header))):
+        for value in (text, {":type:": "<class 'function'>", ":serialized:": text}):
+
+            def put(header: dict, arrays: dict, i: int = places, value: Any = value) -> None:
+                node, key = texts(header)[i]
+                node[key] = value
+
+            contents.append(hostile_files.changed(content, put))
+    return {"attempts": len(contents), **count(iter(contents), rejeu.load, path), "ran the code": marker.exists()}
+
+
+def texts(tree: Any) -> list[tuple[Any, Any]]:
+    """Returns where the values of a header stand."""
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    return [place for key, value in items for place in [(tree, key), *texts(value)]]
+
+
+THEIRS = """
+import io, json, sys, zipfile
+import stable_baselines3
+from stable_baselines3 import SAC
+
+source, target, payload = sys.argv[1:]
+SAC("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[4]), buffer_size=10).save(source)
+with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+    for item in old.namelist():
+        content = old.read(item)
+        if item == "data":
+            data = json.loads(content)
+            data["lr_schedule"][":serialized:"] = payload
+            content = json.dumps(data).encode()
+        new.writestr(item, content)
+try:
+    SAC.load(target)
+    print("loaded", stable_baselines3.__version__)
+except Exception as error:
+    print(type(error).__name__, stable_baselines3.__version__)
+"""
+
+
+def code_in_theirs(python: Path, folder: Path) -> dict[str, Any]:
+    """Gives Stable-Baselines3 a model in which one object is a pickle that runs code; returns what came of it."""
+    marker = folder / "theirs-was-run"
+    payload = base64.b64encode(pickle.dumps(Payload(marker))).decode()
+    command = [str(python), "-c", THEIRS, str(folder / "good.zip"), str(folder / "evil.zip"), payload]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": ""})
+    outcome, version = result.stdout.split()[-2:]
+    return {"version": version, "outcome": outcome, "ran the code": marker.exists()}
+
+
+if __name__ == "__main__":
+    main()
