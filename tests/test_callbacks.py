@@ -137,10 +137,14 @@ def test_stop_on_return_ends_learning():
     assert agent.num_timesteps == 600
 
 
-def shown(n_steps, seconds, steps, console):
+NO_TIME = dict.fromkeys(("env", "replay", "update", "total"), 0.0)
+
+
+def shown(n_steps, seconds, steps, console, spent=lambda step: NO_TIME):
     bar = ProgressBar(n_steps, seconds, console)
-    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[{"r": -3.0}], ep_success_buffer=[1.0, 0.0])
+    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[{"r": -3.0}], ep_success_buffer=[1.0, 0.0], seconds=NO_TIME)
     for step in steps:
+        agent.seconds = spent(step)
         bar(agent, Progress(step, [], None))
     bar.close()
     return console.file.getvalue()
@@ -171,6 +175,44 @@ def test_progress_bar_draws_a_bar_on_a_terminal():
     assert "100%" in text
 
 
+def steps_that_grow_slower(step):
+    """Of each of the first 20 steps' seconds the environment takes all, of each later one's the update three quarters."""
+    early, late = min(step, 20), max(step - 20, 0)
+    return {"env": early + 0.1 * late, "replay": 0.05 * late, "update": 0.75 * late, "total": float(step)}
+
+
+def test_progress_bar_says_what_the_time_went_into_lately(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(callbacks.time, "perf_counter", lambda: clock[0])
+
+    def spent(step):
+        clock[0] = float(step)
+        return steps_that_grow_slower(step)
+
+    console = Console(file=io.StringIO(), force_terminal=False, width=200)
+    lines = shown(60, None, range(1, 61), console, spent).splitlines()
+    assert lines[0].endswith("env 100% · replay 0% · update 0% · rest 0%")
+    assert lines[-1].endswith("env 10% · replay 5% · update 75% · rest 10%")
+
+
+def test_progress_bar_and_its_shares_fit_into_80_columns():
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, _environ={"TERM": "xterm"})
+    text = shown(60_000, None, [1, 60_000], console, steps_that_grow_slower)
+    assert "60,000/60,000 steps" in text
+    assert "env 10% · replay 5% · update 75% · rest 10%" in text
+
+
+def test_shares_of_time_are_rows_of_statistics_and_sum_to_one():
+    rows = []
+    sink = SimpleNamespace(write=lambda step, metrics: rows.append(metrics), close=lambda: None)
+    pendulum().learn(450, sinks=[sink], log_interval=1)
+    assert len(rows) == 2
+    for row in rows:
+        shares = [row[f"time/{part}_share"] for part in ("env", "replay", "update", "rest")]
+        assert sum(shares) == pytest.approx(1.0)
+        assert all(0.0 < share < 1.0 for share in shares)
+
+
 def test_progress_bar_counts_time_where_only_time_ends_the_run():
     console = Console(file=io.StringIO(), force_terminal=False, width=200)
     text = shown(None, 1e6, range(1, 5), console)
@@ -180,7 +222,7 @@ def test_progress_bar_counts_time_where_only_time_ends_the_run():
 
 def test_progress_bar_costs_microseconds_between_refreshes():
     bar = ProgressBar(10**9, None, Console(file=io.StringIO(), force_terminal=False))
-    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[], ep_success_buffer=[])
+    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[], ep_success_buffer=[], seconds=NO_TIME)
     turns = [Progress(step, [], None) for step in range(1, 10_001)]
     began = time.perf_counter()
     for turn in turns:

@@ -23,7 +23,7 @@ from rejeu.config import whole
 from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.vector import InProcess, VectorEnv, make_vector
 from rejeu.evaluation import Evaluation
-from rejeu.loops.host import Episode, Progress
+from rejeu.loops.host import Episode, Progress, time_shares
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,7 +37,7 @@ LINE_SECONDS = 10.0
 EVALUATION = 0x4556
 """Sets the random numbers of evaluations apart from all others."""
 RATE_SECONDS = 10.0
-"""Stretch over which the shown steps per second are measured."""
+"""Stretch over which the shown steps per second and shares of time are measured."""
 
 
 class Evaluated(NamedTuple):
@@ -244,8 +244,20 @@ def _stop_on_mean(least: float, episodes: int, value: Callable[[Episode], float]
     return stop
 
 
+class _Mark(NamedTuple):
+    """Where a run stood at a moment."""
+
+    time: float
+    step: int
+    seconds: dict[str, float]
+    """See :attr:`Agent.seconds`."""
+
+
 class ProgressBar:
     """Shows how far training has come; on a terminal as a bar, elsewhere as a line every ten seconds.
+
+    Beneath the bar, or at the end of the line, stands what the time went into: the environment's steps and resets, the replay
+    buffer, the update (off-policy: the time that the loop waited for the device) and everything else.
 
     Between two refreshes a call costs a look at the clock.
     """
@@ -273,7 +285,7 @@ class ProgressBar:
         self._first_step = 0
         self._latest: tuple[Agent, int] | None = None
         self._shown_step = -1
-        self._marks: deque[tuple[float, int]] = deque()
+        self._marks: deque[_Mark] = deque()
 
     def __call__(self, agent: Agent, progress: Progress) -> None:
         """Takes note of the step, and shows it if the last refresh is long enough ago."""
@@ -296,7 +308,7 @@ class ProgressBar:
 
     def _start(self, agent: Agent, progress: Progress, now: float) -> None:
         self._first_step = step_before(agent, progress, self.n_steps)
-        self._marks.append((self._began, self._first_step))
+        self._marks.append(_Mark(self._began, self._first_step, agent.seconds))
         if self._animated:
             self._bar.start()
         else:
@@ -305,11 +317,11 @@ class ProgressBar:
     def _refresh(self, agent: Agent, step: int, now: float) -> None:
         self._shown_step = step
         self._refresh_at = now + (REFRESH_SECONDS if self._animated else LINE_SECONDS)
-        self._marks.append((now, step))
-        while len(self._marks) > 2 and self._marks[1][0] <= now - RATE_SECONDS:
+        self._marks.append(_Mark(now, step, agent.seconds))
+        while len(self._marks) > 2 and self._marks[1].time <= now - RATE_SECONDS:
             self._marks.popleft()
-        (then, step_then), done = self._marks[0], step - self._first_step
-        rate = (step - step_then) / max(now - then, 1e-9)
+        then, done = self._marks[0], step - self._first_step
+        rate = (step - then.step) / max(now - then.time, 1e-9)
         shares, left = [], []
         if self.n_steps is not None:
             shares.append(done / self.n_steps)
@@ -322,11 +334,13 @@ class ProgressBar:
             done, self.n_steps, rate, _mean(e["r"] for e in agent.ep_info_buffer), _mean(agent.ep_success_buffer),
             min(left, default=math.nan),
         )  # fmt: skip
+        spent = time_spent(then.seconds, agent.seconds)
         if self._animated:
-            self._bar.update(self._task, completed=share, description=text)
+            self._bar.update(self._task, completed=share, description="\n".join(filter(None, (text, spent))))
             self._bar.refresh()
         else:
-            self._console.print(f"{share:4.0%}  {text}", soft_wrap=True, highlight=False, markup=False)
+            line = " · ".join(filter(None, (text, spent)))
+            self._console.print(f"{share:4.0%}  {line}", soft_wrap=True, highlight=False, markup=False)
             self._console.file.flush()
 
 
@@ -346,6 +360,21 @@ def status(
     if not math.isnan(seconds_left):
         parts.append(f"{duration(seconds_left)} left")
     return " · ".join(parts)
+
+
+def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
+    """Returns what the time between two readings of ``agent.seconds`` went into, empty if none has passed.
+
+    >>> time_spent(
+    ...     {"env": 1.0, "replay": 0.5, "update": 3.0, "total": 5.0},
+    ...     {"env": 2.2, "replay": 1.4, "update": 10.0, "total": 15.0},
+    ... )
+    'env 12% · replay 9% · update 70% · rest 9%'
+    """
+    passed = {part: now[part] - before[part] for part in now}
+    if passed["total"] <= 0.0:
+        return ""
+    return " · ".join(f"{part} {max(share, 0.0):.0%}" for part, share in time_shares(passed).items())
 
 
 def duration(seconds: float) -> str:

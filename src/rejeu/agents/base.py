@@ -472,8 +472,8 @@ class Agent(ABC):
         row["time/episodes"] = self._run.episode
         row["time/steps_per_second"] = float(self.steps_per_second)
         row["time/seconds"] = seconds["total"]
-        for part in ("env", "replay", "update"):
-            row[f"time/{part}_share"] = seconds[part] / max(seconds["total"], 1e-9)
+        for part, share in host.time_shares(seconds).items():
+            row[f"time/{part}_share"] = share
         row["time/compile_seconds"] = compilation.seconds()
         row["train/n_updates"] = self._run.n_updates
         if self._compiled.skips:

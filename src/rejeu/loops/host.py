@@ -25,6 +25,9 @@ from rejeu.spaces import leaves
 VDOT_SIZE = 2**13
 """Number of elements up to which an array is looked at by its square; beyond it BLAS would call up its threads."""
 
+PARTS = ("env", "replay", "update")
+"""What the loops measure the time of; see :attr:`Run.seconds`."""
+
 
 class Episode(NamedTuple):
     """One finished episode."""
@@ -105,10 +108,24 @@ class Run:
     metrics: Mapping[str, Array] | None = None
     td_errors: list[Array] = field(default_factory=list)
     """Of the newest updates, on their way to the priorities of the replay buffer, which get them one turn later."""
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("env", "replay", "update", "total"), 0.0))
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*PARTS, "total"), 0.0))
     """Wall time by what it went into; ``update`` is the time that the loop waited for the device."""
     watch: Watch = field(default_factory=Watch)
     """Looks after the updates: whether what they leave is finite."""
+
+
+def time_shares(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Returns what share of ``seconds["total"]`` went into ``env``, ``replay``, ``update`` and, the rest, everything else.
+
+    The rest is the loop's own bookkeeping and whatever ran between its turns: callbacks, evaluations, files. The shares sum
+    to 1; before any time has passed all of it is rest.
+
+    >>> time_shares({"env": 1.0, "replay": 1.0, "update": 5.0, "total": 8.0})
+    {'env': 0.125, 'replay': 0.125, 'update': 0.625, 'rest': 0.125}
+    """
+    total = max(seconds["total"], 1e-9)
+    shares = {part: seconds[part] / total for part in PARTS}
+    return shares | {"rest": 1.0 - sum(shares.values())}
 
 
 def restart(run: Run) -> None:
