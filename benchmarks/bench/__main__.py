@@ -1,0 +1,153 @@
+"""``scripts/bench``: rejeu, its peers and the machine's own limits, measured in turn in one run; then the page about it.
+
+    scripts/bench                                        # makes environments for the peers, takes about 35 minutes
+    scripts/bench --sb3-python PATH --sbx-python PATH    # with environments that are there
+    scripts/bench --resume                               # goes on where Ctrl-C ended
+    scripts/bench --report                               # writes the page anew from the samples
+
+Every measurement runs in a fresh process, the libraries in turn, several rounds. Samples are kept as they come in
+``benchmarks/results/bench.jsonl``; in the end all of them, with what they were measured on, go to
+``benchmarks/results/bench.json``, and ``docs/performance.md`` with its pictures is written from that file.
+
+The machine must be quiet: other programs' work makes timings worthless, so a busy machine is refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from benchmarks.bench import machine, peers, plan, report, runner
+
+RESULT = runner.ROOT / "benchmarks" / "results" / "bench.json"
+PAGE = runner.ROOT / "docs" / "performance.md"
+TAKES_PATHS = ("--sb3-python", "--sbx-python", "--peers", "--out", "--page")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Returns the command line."""
+    found = argparse.ArgumentParser(
+        "scripts/bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = found.add_argument
+    add("--cases", nargs="+", choices=plan.CASES, default=list(plan.CASES), help="what to measure; default: everything")
+    add("--libraries", nargs="+", choices=plan.LIBRARIES, default=list(plan.LIBRARIES), help="whom; default: all")
+    add("--rounds", type=int, default=3, help="turns of every measurement")
+    add("--quick", action="store_true", help="one tiny round, to see that everything runs; its figures mean nothing")
+    add("--resume", action="store_true", help="go on with the samples that are there")
+    add("--report", action="store_true", help="measure nothing: write the page from the file of results")
+    add("--busy", action="store_true", help="measure although the machine is busy")
+    add(
+        "--sb3-python",
+        metavar="PATH",
+        help="interpreter with stable-baselines3, sb3-contrib, highway-env, gymnasium[box2d]",
+    )
+    add("--sbx-python", metavar="PATH", help="interpreter with sbx-rl, stable-baselines3 and gymnasium[box2d]")
+    add(
+        "--peers", type=Path, metavar="DIR", help="where environments for the peers are made; default: the cache folder"
+    )
+    add("--out", type=Path, default=RESULT, help="the file of results")
+    add("--page", type=Path, default=PAGE, help="the page; its pictures go to the folder images beside it")
+    return found
+
+
+def shown_command(arguments: Sequence[str]) -> str:
+    """Returns the command as anybody could run it: paths of this machine left out.
+
+    >>> shown_command(["--rounds", "2", "--sb3-python", "/home/me/python"])
+    'scripts/bench --rounds 2 --sb3-python PATH'
+    """
+    words, hide = [], False
+    for word in arguments:
+        name, equals, _ = word.partition("=")
+        words.append("PATH" if hide else f"{name}=PATH" if equals and name in TAKES_PATHS else word)
+        hide = word in TAKES_PATHS
+    return shlex.join(["scripts/bench", *(word for word in words if word not in ("--resume", "--busy"))])
+
+
+def interpreters(arguments: argparse.Namespace) -> dict[str, str]:
+    """Returns the interpreter of each library, environments made where none was given.
+
+    Raises:
+        SystemExit: if one lacks something.
+    """
+    root = arguments.peers or Path(platformdirs.user_cache_dir("rejeu", appauthor=False)) / "bench-peers"
+    found = {"rejeu": sys.executable}
+    for library in ("sb3", "sbx"):
+        if library in arguments.libraries:
+            found[library] = getattr(arguments, f"{library}_python") or peers.make(library, root)
+    for library in arguments.libraries:
+        lacking = peers.missing(found[library], library)
+        if lacking:
+            raise SystemExit(f"{found[library]} lacks {', '.join(lacking)}, which the measurements of {library} need")
+    return found
+
+
+def header_of(arguments: argparse.Namespace, pythons: dict[str, str], command: str) -> dict[str, Any]:
+    """Returns what the file of results says about the run."""
+    settings = {"rounds": arguments.rounds, "quick": arguments.quick, "cases": arguments.cases}
+    settings["libraries"] = arguments.libraries
+    return {
+        "command": command,
+        "settings": settings,
+        "machine": machine.describe() | {"load_before": machine.load()},
+        "versions": {library: machine.versions(pythons[library], library) for library in arguments.libraries},
+        "variants": plan.VARIANTS,
+    }
+
+
+def write_results(path: Path, kept: runner.Samples) -> dict[str, Any]:
+    """Writes all samples with what they were measured on, one line a sample, and returns the same."""
+    head = json.dumps(kept.header, indent=1)[:-2]
+    rows = ",\n".join("  " + json.dumps(sample) for sample in kept.samples)
+    path.write_text(f'{head},\n "samples": [\n{rows}\n ]\n}}\n', encoding="utf-8")
+    return {**kept.header, "samples": kept.samples}
+
+
+def main(given: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit status."""
+    given = sys.argv[1:] if given is None else given
+    arguments = parser().parse_args(given)
+    if arguments.report:
+        report.write(json.loads(arguments.out.read_text(encoding="utf-8")), arguments.page)
+        return 0
+    if arguments.quick:
+        arguments.rounds = 1
+    if arguments.quick and arguments.out == RESULT:
+        arguments.out, arguments.page = [Path(tempfile.gettempdir()) / name for name in ("bench.json", "bench.md")]
+    reason = machine.why_busy()
+    if reason is not None:
+        print(f"THIS MACHINE IS BUSY: {reason}. Timings taken now are worthless.", file=sys.stderr)
+        if not (arguments.quick or arguments.busy):
+            print("Wait until it is quiet, or give --busy to measure nonetheless.", file=sys.stderr)
+            return 2
+    pythons = interpreters(arguments)
+    chosen = [
+        m for m in plan.everything(arguments.quick) if m.case in arguments.cases and m.library in arguments.libraries
+    ]
+    samples = arguments.out.with_suffix(".jsonl")
+    kept = runner.Samples(samples, header_of(arguments, pythons, shown_command(given)), arguments.resume)
+    try:
+        with tempfile.TemporaryDirectory() as cache:
+            runner.run_all(chosen, arguments.rounds, pythons, kept, Path(cache))
+    except KeyboardInterrupt:
+        print(f"\nstopped; what was measured is in {samples}, and --resume goes on", file=sys.stderr)
+        return 130
+    report.write(write_results(arguments.out, kept), arguments.page)
+    failed = [sample["key"] for sample in kept.samples if "error" in sample]
+    print(f"samples: {arguments.out}\npage: {arguments.page}")
+    if failed:
+        print(f"FAILED: {', '.join(failed)}; see the samples, and run again with --resume", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,126 @@
+"""What is measured on: its description, how busy it is, and whether its speed stays the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+PACKAGES = {
+    "rejeu": ("rejeu", "jax", "jaxlib", "equinox", "optax", "gymnasium", "highway-env", "envpool", "box2d", "numpy"),
+    "sb3": ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "highway-env", "box2d", "numpy"),
+    "sbx": ("sbx-rl", "stable-baselines3", "jax", "jaxlib", "flax", "optax", "torch", "gymnasium", "box2d", "numpy"),
+}
+"""Those whose versions a report names, by library."""
+BUSY = 0.35
+"""Cores that other programs may use before the machine counts as busy."""
+CALIBRATION_SIZE, CALIBRATION_ROUNDS = 384, 40
+VERSIONS = """
+import json, platform, sys
+from importlib import metadata
+found = {"python": platform.python_version()}
+for name in sys.argv[1:]:
+    try:
+        found[name] = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        found[name] = None
+print(json.dumps(found))
+"""
+
+
+def describe() -> dict[str, Any]:
+    """Returns processor, cores, memory and system."""
+    return {
+        "processor": processor(),
+        "cores": cores(),
+        "memory_gib": memory_gib(),
+        "system": f"{platform.system()} {platform.release().split('-')[0]} {platform.machine()}",
+    }
+
+
+def processor() -> str:
+    """Returns the processor's name as the system tells it."""
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def cores() -> int:
+    """Returns how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory_gib() -> float | None:
+    """Returns the memory in GiB, None where that is not told."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def versions(python: str, library: str) -> dict[str, str | None]:
+    """Returns the versions of Python and of the packages that a library's figures depend on, None for what is missing."""
+    command = [python, "-c", VERSIONS, *PACKAGES[library]]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{python} cannot be run: {done.stderr.strip()[-500:]}")
+    return json.loads(done.stdout)
+
+
+def others_busy(seconds: float = 0.25) -> float | None:
+    """Returns how many cores other programs use at this moment, None where the system does not tell.
+
+    This process sleeps meanwhile, so what is not idle is theirs.
+    """
+    stat = Path("/proc/stat")
+    if not stat.exists():
+        return None
+
+    def ticks() -> tuple[float, float]:
+        numbers = [float(word) for word in stat.read_text(encoding="ascii").splitlines()[0].split()[1:9]]
+        return sum(numbers), numbers[3] + numbers[4]
+
+    (total, idle), _ = ticks(), time.sleep(seconds)
+    total_after, idle_after = ticks()
+    passed = total_after - total
+    return round((os.cpu_count() or 1) * (1.0 - (idle_after - idle) / passed), 2) if passed > 0 else None
+
+
+def calibrate() -> float:
+    """Returns the milliseconds of one fixed matrix product, the median of many: if it changes, so did the machine's speed.
+
+    >>> 0.0 < calibrate() < 1000.0
+    True
+    """
+    a = np.random.default_rng(0).standard_normal((CALIBRATION_SIZE, CALIBRATION_SIZE)).astype(np.float32)
+    out, found = np.empty_like(a), []
+    for _ in range(CALIBRATION_ROUNDS):
+        began = time.perf_counter()
+        np.matmul(a, a, out=out)
+        found.append(time.perf_counter() - began)
+    return 1000.0 * median(found)
+
+
+def load() -> float | None:
+    """Returns the load average of the last minute, None where there is none."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def why_busy() -> str | None:
+    """Returns what makes timings worthless now, None if the machine is quiet."""
+    busy, average = others_busy(1.0), load()
+    if busy is not None and busy > BUSY:
+        return f"other programs use {busy:.2f} of {cores()} cores now (at most {BUSY} would do)"
+    if average is not None and average > BUSY:
+        return f"the load average of the last minute is {average:.2f} (at most {BUSY} would do)"
+    return None

@@ -1,0 +1,151 @@
+"""The pictures of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.ticker import FuncFormatter
+
+from benchmarks.bench import plan
+from benchmarks.bench.summary import Limit, Spread
+
+COLOURS = {"rejeu": "#0b6e99", "rejeu, EnvPool": "#15b097", "sb3": "#e07b39", "sbx": "#9b59b6", "limit": "#444444"}
+NAMES = {"rejeu": "rejeu", "sb3": "Stable-Baselines3", "sbx": "SBX"}
+STYLE = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "figure.dpi": 130,
+}
+
+
+def number(value: float, _: Any = None) -> str:
+    """Returns a number with three figures that count.
+
+    >>> [number(x) for x in (0.1234, 2.5, 1234.0)]
+    ['0.123', '2.5', '1,234']
+    """
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def draw_steps(
+    seconds: Mapping[str, Mapping[str, Spread]], limits: Mapping[str, Limit | None], path: Path, title: str
+) -> None:
+    """Draws milliseconds of a step by case and library as bars, spreads as whiskers, limits as lines across rejeu's bars."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(9, 4.4), layout="constrained")
+        width = 0.26
+        for i, library in enumerate(plan.LIBRARIES):
+            places, heights, low, high = [], [], [], []
+            for place, by in enumerate(seconds.values()):
+                if library in by:
+                    found = by[library]
+                    places.append(place + (i - 1) * width)
+                    heights.append(1e3 * found.median)
+                    low.append(1e3 * (found.median - found.low))
+                    high.append(1e3 * (found.high - found.median))
+            if places:
+                bars = axes.bar(places, heights, width, color=COLOURS[library], label=NAMES[library])
+                axes.errorbar(places, heights, [low, high], fmt="none", ecolor="black", elinewidth=0.8, capsize=2)
+                axes.bar_label(bars, [number(h) for h in heights], fontsize=7, padding=3)
+        labelled = False
+        for place, name in enumerate(seconds):
+            found = limits.get(name)
+            if found is not None:
+                left = place - 1.5 * width
+                label = None if labelled else "limit: bare environment and arithmetic"
+                axes.hlines(1e3 * found.seconds, left, left + width, color=COLOURS["limit"], linewidth=2, label=label)
+                labelled = True
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(FuncFormatter(number))
+        axes.grid(axis="x", visible=False)
+        axes.set_xticks(range(len(seconds)), [name.replace(", ", "\n") for name in seconds])
+        axes.set_ylabel("milliseconds of a step (log), less is better")
+        axes.set_title(title, loc="left")
+        axes.legend(loc="upper left", ncols=4, fontsize=8)
+        axes.margins(y=0.15)
+        save(figure, path)
+
+
+def draw_rollouts(
+    rates: Mapping[str, Mapping[str, Mapping[int, Spread]]],
+    limits: Mapping[str, Mapping[str, Mapping[int, float]]],
+    path: Path,
+    title: str,
+) -> None:
+    """Draws steps per second against the number of environments, a panel an algorithm, a line a library and backend.
+
+    Args:
+        rates: by algorithm, by line (``rejeu``, ``rejeu, EnvPool``, ``sb3``, ``sbx``), by number of environments.
+        limits: steps per second likewise, dashed.
+        path: of the picture.
+        title: above it.
+    """
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(1, len(rates), figsize=(9, 4), layout="constrained", squeeze=False)
+        for axes, (algorithm, lines) in zip(panels[0], rates.items(), strict=True):
+            for line, by in lines.items():
+                draw_line(axes, by, COLOURS[line], NAMES.get(line, line))
+            for line, at in limits.get(algorithm, {}).items():
+                axes.plot(list(at), list(at.values()), "--", color=COLOURS[line], linewidth=1, alpha=0.8)
+            axes.plot([], [], "--", color=COLOURS["limit"], linewidth=1, label="limit, of the same colour")
+            axes.set_xscale("log", base=2)
+            axes.set_yscale("log")
+            axes.set_xticks(plan.N_ENVS, [str(n) for n in plan.N_ENVS])
+            axes.yaxis.set_major_formatter(FuncFormatter(number))
+            axes.yaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+            axes.set_xlabel("environments")
+            axes.set_title(algorithm, loc="left")
+        panels[0][0].set_ylabel("environment steps a second (log), more is better")
+        panels[0][0].legend(fontsize=8)
+        figure.suptitle(title, x=0.01, ha="left")
+        save(figure, path)
+
+
+def draw_replay(seconds: Mapping[str, Mapping[int, Spread]], path: Path, title: str) -> None:
+    """Draws microseconds of a batch against the size of the buffer, a line each; ``sb3`` begins the names of the peer's."""
+    colours = {"rejeu, hindsight": "#0b6e99", "sb3, hindsight": "#e07b39", "rejeu, priority": "#15b097"}
+    labels = {
+        "rejeu, hindsight": "rejeu, hindsight",
+        "sb3, hindsight": "Stable-Baselines3, hindsight",
+        "rejeu, priority": "rejeu, by priority, with the update of priorities",
+    }
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+        for line, by in seconds.items():
+            scaled = {size: Spread(*(1e6 * value for value in found)) for size, found in by.items()}
+            draw_line(axes, scaled, colours[line], labels[line])
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(FuncFormatter(number))
+        axes.yaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+        axes.set_xlabel("transitions in the buffer (log)")
+        axes.set_ylabel("microseconds a batch of 256 (log), less is better")
+        axes.set_title(title, loc="left")
+        axes.legend(fontsize=8)
+        save(figure, path)
+
+
+def draw_line(axes: Any, by: Mapping[int, Spread], colour: str, label: str) -> None:
+    """Draws medians as a line and spreads as a band."""
+    places: Sequence[int] = list(by)
+    axes.plot(places, [found.median for found in by.values()], "o-", color=colour, label=label, markersize=4)
+    low, high = ([getattr(found, end) for found in by.values()] for end in ("low", "high"))
+    axes.fill_between(places, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def save(figure: Any, path: Path) -> None:
+    """Writes a picture and lets it go."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    plt.close(figure)

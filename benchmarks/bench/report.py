@@ -1,0 +1,181 @@
+"""The page ``docs/performance.md``, written from the file of results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.bench import machine, plan
+from benchmarks.bench.pictures import NAMES, number
+from benchmarks.bench.sections import files, memory, parking, per_step, replay, rollouts, startup
+from benchmarks.bench.summary import Sample, best, disturbed, drift, peak, step_seconds
+from benchmarks.bench.text import table, with_spread
+
+DID_NOT_HELP = (
+    "**A scan around a single gradient step** costs 20 to 30 us, so a turn with one update calls it without one.",
+    "**Two threads for XLA** help only above batches of 256 through 256-256; below 128-128 they cost a fifth.",
+    "**Unrolled scans** compile much longer and run the same.",
+    "**bfloat16** is slower on a CPU.",
+    "**Both critics in one batched matrix product** were not faster than two products.",
+    "**An actor in NumPy** for tiny networks is not bit-equal to XLA's, and was dropped.",
+)
+HELPED = (
+    "**The state packed into few vectors** makes dispatch 2 to 3 times faster than a tree of arrays.",
+    "**Donating the packed state** saves a copy of it.",
+)
+
+
+def write(results: Mapping[str, Any], page: Path) -> None:
+    """Writes the page, and its pictures into the folder ``images`` beside it."""
+    samples = results["samples"]
+    sections = [
+        head(results),
+        how_to_read(results),
+        parking(samples),
+        per_step(samples, page),
+        rollouts(samples, page),
+        replay(samples, page),
+        memory(samples),
+        startup(samples),
+        files(samples),
+        machine_limits(samples),
+        tried(),
+        conditions(results),
+    ]
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text("\n\n".join(filter(None, sections)) + "\n", encoding="utf-8")
+
+
+def head(results: Mapping[str, Any]) -> str:
+    described = results["machine"]
+    memory_text = "" if described["memory_gib"] is None else f", {described['memory_gib']:g} GiB of memory"
+    text = f"""# How fast it is
+
+Written by `scripts/bench`; every figure is from one run on one machine, and all samples are in
+`benchmarks/results/bench.json`.
+
+**The machine:** {described["processor"]}, {described["cores"]} cores{memory_text}, {described["system"]}.
+
+To measure again, on a machine that does nothing else, from a clone of the repository:
+
+```
+pip install -c constraints.txt -e ".[all,box2d]"
+scripts/bench
+```
+
+That makes a virtual environment for each peer first, with pip; `--sb3-python` and `--sbx-python` take ready ones, and
+`--help` tells the rest. This page is of the command
+
+```
+{results["command"]}
+```"""
+    if results["settings"]["quick"]:
+        text += "\n\n**This was a smoke run (`--quick`): its figures mean nothing.**"
+    return text
+
+
+def how_to_read(results: Mapping[str, Any]) -> str:
+    versions = []
+    for library, found in results["versions"].items():
+        listed = ", ".join(f"{name} {version}" for name, version in found.items() if version is not None)
+        versions.append(f"- {NAMES[library]}: {listed}")
+    return f"""## How to read it
+
+- Every measurement runs in a fresh process. The libraries take turns, {results["settings"]["rounds"]} round(s) of all cases;
+  a figure is the median over the rounds, in brackets the least and the greatest.
+- A ratio is taken in each round, between measurements minutes apart, and its median is shown. Above 1, rejeu is faster.
+  Read ratios rather than times: another processor has other times.
+- The clock starts once everything is compiled and warm, except where whole processes are timed.
+- Peers run with one thread and with all, in the first round; the faster setting is measured on and shown. rejeu chooses its
+  number of threads itself. Stable-Baselines3 and SBX step Gymnasium environments in the process (`DummyVecEnv`): neither
+  takes EnvPool's as they are.
+- All libraries get the same networks, batches, rollouts and numbers of updates.
+- **The limit** is a bare step of the same environment (random actions, resets included, through the same vector of
+  environments) plus the floating-point operations of acting and updating at the rate of the fastest matrix product that
+  this machine computes with as many threads as rejeu uses. No program that does the two one after the other can be faster.
+  rejeu's off-policy loop does them at the same time, where there is a core to spare; and no real update is one large
+  product. "Of the limit" is the limit divided by the measured time: 100 % would be a loop and an update without any loss.
+- Operations are counted by XLA (`cost_analysis` of the compiled update). XLA counts the body of a loop once and of a
+  conditional the costlier branch, so the count adds XLA's count of each body for its further runs, and takes of a
+  conditional its share: a delayed actor counts as often as it is updated.
+
+Versions:
+
+{chr(10).join(versions)}"""
+
+
+def machine_limits(samples: Sequence[Sample]) -> str:
+    rows = []
+    for threads, label in ((1, plan.ONE), (0, plan.ALL)):
+        rate = peak(samples, threads)
+        if rate is not None:
+            rows.append((f"fastest float32 matrix product, {label}", f"{rate / 1e9:,.0f} GFLOP/s"))
+    for measurement in plan.limits(1.0):
+        if measurement.arguments["what"] == "env":
+            numbers = step_seconds(samples, "limits", measurement.name, "rejeu")
+            if numbers:
+                rows.append((f"bare step: {measurement.name}", f"{with_spread(numbers, 1e6)} us"))
+    counted = [("steps", name, f"one update: {name}") for name in (*plan.STEPS, plan.POOL)]
+    for n in plan.N_ENVS:
+        for algorithm in ("PPO", "A2C"):
+            text = f"updates for one step: {algorithm}, {n} environments"
+            counted.append(("rollouts", f"{algorithm}, {n} on gymnasium", text))
+    for case, name, text in counted:
+        flops = next((row["result"].get("update_flops") for row in best(samples, case, name, "rejeu")), None)
+        if flops is not None:
+            rows.append((text, f"{number(flops / 1e6)} MFLOP"))
+    if not rows:
+        return ""
+    return f"""## What the limits are made of
+
+The products are of square matrices from 128 to 2,048, by NumPy and by XLA; the fastest counts. For SAC with 64-64 and batches
+of 64 the matrix products alone are {sac_by_hand() / 1e6:.2f} MFLOP by a formula on paper (`sac_by_hand` in
+`benchmarks/bench/work/flops.py`); what XLA counts on top is elementwise: activations, losses, Adam, targets.
+
+{table(("", ""), rows)}"""
+
+
+def sac_by_hand() -> int:
+    """Returns the formula's count for the case ``SAC``."""
+    from benchmarks.bench.work import flops
+
+    return flops.sac_by_hand(3, 1, (64, 64), 64)
+
+
+def tried() -> str:
+    helped, not_helped = ("\n".join(f"- {fact}" for fact in facts) for facts in (HELPED, DID_NOT_HELP))
+    return f"""## What was tried and did not help
+
+{not_helped}
+
+What did help, measured on the way:
+
+{helped}"""
+
+
+def conditions(results: Mapping[str, Any]) -> str:
+    samples = results["samples"]
+    calibrated, busy = drift(samples), disturbed(samples, machine.BUSY)
+    lines = [f"- Load average before the run: {results['machine']['load_before']}."]
+    if calibrated is not None:
+        lines.append(
+            f"- A fixed matrix product around every measurement took {number(calibrated.median)} ms (least "
+            f"{number(calibrated.low)}, greatest {number(calibrated.high)}): if it differs, the machine's speed did."
+        )
+    seconds = sum(sample["wall_seconds"] for sample in samples)
+    lines.append(f"- {len(samples)} measurements, {seconds / 60:.0f} minutes in all.")
+    if busy:
+        lines.append(
+            f"- **Other programs used more than {machine.BUSY} cores before {len(busy)} of the measurements: figures of those "
+            "are not to be trusted.**"
+        )
+    failed = sorted({sample["key"] for sample in samples if "error" in sample})
+    if failed:
+        lines.append(f"- **Failed: {', '.join(failed)}.**")
+    lines.append(
+        "- Settings called `1 thread` set "
+        + ", ".join(f"`{name}={v}`" for name, v in plan.VARIANTS[plan.ONE].items())
+        + "."
+    )
+    return "## Under which conditions\n\n" + "\n".join(lines)

@@ -1,0 +1,131 @@
+"""From samples to numbers: medians, spreads, ratios round by round, limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from statistics import median
+from typing import Any, NamedTuple
+
+from benchmarks.bench import plan
+
+Sample = Mapping[str, Any]
+ByRound = dict[int, float]
+"""One number for each round."""
+PARTS = ("env", "replay", "update", "rest")
+"""What rejeu's loops tell apart, and what is left."""
+
+
+class Spread(NamedTuple):
+    """The median of some numbers, and the least and the greatest."""
+
+    median: float
+    low: float
+    high: float
+
+
+class Limit(NamedTuple):
+    """What a step would take if nothing but the environment and the arithmetic took time."""
+
+    env: float
+    """Seconds of a bare environment step."""
+    arithmetic: float
+    """Seconds of the operations of acting and updating, at the rate of the machine's best matrix product."""
+    flops: float
+    """Those operations, for one environment step."""
+    share_reached: float
+    """The limit divided by the measured seconds of a step, the median over the rounds."""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of a step."""
+        return self.env + self.arithmetic
+
+
+def cost(sample: Sample) -> float:
+    """Returns what the variants of a measurement are compared by, in seconds: of a step, or of the whole process."""
+    if sample["case"] != "parking" and "seconds_per_step" in sample["result"]:
+        return sample["result"]["seconds_per_step"]
+    return sample["wall_seconds"]
+
+
+def best(samples: Iterable[Sample], case: str, name: str, library: str) -> list[Sample]:
+    """Returns a measurement's samples by round, of the variant that was measured most and, among those, is the fastest."""
+    by_variant: dict[str, list[Sample]] = {}
+    for sample in samples:
+        if (sample["case"], sample["name"], sample["library"]) == (case, name, library) and "error" not in sample:
+            by_variant.setdefault(sample["variant"], []).append(sample)
+    if not by_variant:
+        return []
+    chosen = min(by_variant.values(), key=lambda rows: (-len(rows), median(map(cost, rows))))
+    return sorted(chosen, key=lambda sample: sample["round"])
+
+
+def by_round(rows: Iterable[Sample], get: Callable[[Sample], float]) -> ByRound:
+    """Returns a number of each sample by its round."""
+    return {sample["round"]: get(sample) for sample in rows}
+
+
+def spread(numbers: ByRound) -> Spread:
+    """Returns median, least and greatest.
+
+    >>> spread({0: 3.0, 1: 1.0, 2: 2.5})
+    Spread(median=2.5, low=1.0, high=3.0)
+    """
+    return Spread(median(numbers.values()), min(numbers.values()), max(numbers.values()))
+
+
+def ratio(top: ByRound, bottom: ByRound) -> Spread | None:
+    """Returns the ratios of the rounds that both have; None if there is none.
+
+    >>> ratio({0: 4.0, 1: 9.0, 2: 8.0}, {0: 2.0, 1: 3.0})
+    Spread(median=2.5, low=2.0, high=3.0)
+    """
+    common = top.keys() & bottom.keys()
+    return spread({turn: top[turn] / bottom[turn] for turn in common}) if common else None
+
+
+def step_seconds(samples: Sequence[Sample], case: str, name: str, library: str) -> ByRound:
+    """Returns the seconds of a step by round."""
+    return by_round(best(samples, case, name, library), cost)
+
+
+def peak(samples: Sequence[Sample], threads: int) -> float | None:
+    """Returns the most operations a second in any round, with one thread (1) or all (0)."""
+    rows = best(samples, "limits", f"peak, {plan.ONE if threads == 1 else plan.ALL}", "rejeu")
+    return max((row["result"]["flops_per_second"] for row in rows), default=None)
+
+
+def limit(samples: Sequence[Sample], case: str, name: str, env: str) -> Limit | None:
+    """Returns rejeu's limit in a case whose bare environment was measured as ``env``; None if something is missing."""
+    rows = best(samples, case, name, "rejeu")
+    counted = next((row["result"] for row in rows if "update_flops" in row["result"]), None)
+    bare = step_seconds(samples, "limits", env, "rejeu")
+    rate = None if counted is None else peak(samples, counted["threads"])
+    if counted is None or rate is None:
+        return None
+    flops = counted["update_flops"] + counted["act_flops"]
+    limits = {turn: seconds + flops / rate for turn, seconds in bare.items()}
+    reached = ratio(limits, by_round(rows, cost))
+    return None if reached is None else Limit(spread(bare).median, flops / rate, flops, reached.median)
+
+
+def shares(rows: Sequence[Sample]) -> dict[str, float] | None:
+    """Returns what share of a step rejeu spent on each part, medians over the rounds; None if there are no rows."""
+    if not rows:
+        return None
+    found = {}
+    for part in PARTS:
+        each = (row["result"]["seconds_by_part"] for row in rows)
+        found[part] = median(seconds[part] / sum(seconds.values()) for seconds in each)
+    return found
+
+
+def drift(samples: Sequence[Sample]) -> Spread | None:
+    """Returns the milliseconds of the calibrating product over the run; None without samples."""
+    found = [ms for sample in samples for ms in sample["calibration_ms"]]
+    return spread(dict(enumerate(found))) if found else None
+
+
+def disturbed(samples: Sequence[Sample], most: float) -> list[Sample]:
+    """Returns the samples before which other programs used more than ``most`` cores."""
+    return [sample for sample in samples if sample["others_busy"] is not None and sample["others_busy"] > most]

@@ -1,0 +1,53 @@
+"""Numbers as text, and text as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from benchmarks.bench.pictures import number
+from benchmarks.bench.summary import ByRound, Sample, Spread, spread
+
+Row = Sequence[str]
+
+
+def table(header: Row, rows: Iterable[Row]) -> str:
+    """Returns a Markdown table.
+
+    >>> print(table(("a", "b"), [("1", "2")]))
+    | a | b |
+    |---|---|
+    | 1 | 2 |
+    """
+    lines = [header, ["---"] * len(header), *rows]
+    text = ["| " + " | ".join(line) + " |" for line in lines]
+    text[1] = "|" + "---|" * len(header)
+    return "\n".join(text)
+
+
+def with_spread(numbers: ByRound, scale: float = 1.0) -> str:
+    """Returns the median with the least and the greatest, where there is more than one.
+
+    >>> with_spread({0: 0.002, 1: 0.004, 2: 0.003}, 1e3), with_spread({0: 1.5}), with_spread({})
+    ('3 (2 to 4)', '1.5', '')
+    """
+    if not numbers:
+        return ""
+    found = spread(numbers)
+    if len(numbers) == 1:
+        return number(scale * found.median)
+    return f"{number(scale * found.median)} ({number(scale * found.low)} to {number(scale * found.high)})"
+
+
+def times(found: Spread | None) -> str:
+    """Returns how many times faster, empty where that is not known."""
+    return "" if found is None else f"{found.median:.2f}" if found.median < 10 else f"{found.median:.1f}"
+
+
+def percent(share: float) -> str:
+    """Returns a share in percent."""
+    return f"{100 * share:.0f} %"
+
+
+def variant_of(rows: Sequence[Sample]) -> str:
+    """Returns which of a peer's settings the figures are of."""
+    return rows[0]["variant"] if rows else ""

@@ -1,0 +1,94 @@
+"""Replay buffers that are full, of either library, without an agent and without the hours that filling them would take.
+
+They hold episodes of 100 steps, of an environment with the spaces of highway-env's parking-v0, or of Pendulum-v1. Every byte
+is written, so that no page of memory is merely promised.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+EPISODE = 100
+ACTION = {"parking": 2, "pendulum": 1}
+
+
+def observation_space(kind: str) -> spaces.Space:
+    """Returns the observations of ``"pendulum"``, or ``"parking"``: three vectors of six float64, as highway-env declares."""
+    if kind == "pendulum":
+        return spaces.Box(-8.0, 8.0, (3,), np.float32)
+    box = spaces.Box(-np.inf, np.inf, (6,), np.float64)
+    return spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
+
+
+def action_space(kind: str) -> spaces.Box:
+    """Returns the actions of either."""
+    return spaces.Box(-1.0, 1.0, (ACTION[kind],), np.float32)
+
+
+def necessary_bytes(kind: str) -> int:
+    """Returns the bytes that a transition must take: its observation once, action, reward and a flag for its end.
+
+    Numbers are of four bytes, the flag of one: ``4 * (observation + action + 1) + 1``. The next observation is the next
+    transition's own.
+    """
+    observation = {"parking": 18, "pendulum": 3}[kind]
+    return 4 * (observation + ACTION[kind] + 1) + 1
+
+
+def rejeu_ring(kind: str, rows: int) -> Any:
+    """Returns rejeu's ring of so many rows, of which every hundred and first is an episode's last observation, full."""
+    from rejeu import spaces as own
+    from rejeu.replay.ring import LAST, STEP, Ring
+
+    space = observation_space(kind)
+    ring = Ring(rows, 1, own.leaves(space), own.structure(space), (ACTION[kind],), np.float32)
+    period = EPISODE + 1
+    used = ring.rows // period * period
+    at = np.arange(used) % period
+    rng = np.random.default_rng(0)
+    for store in ring.obs:
+        store[:] = rng.standard_normal(store.shape, np.float32)
+    ring.action[:] = rng.uniform(-1, 1, ring.action.shape)
+    ring.reward[:] = -rng.random(ring.rows, np.float32)
+    ring.kind[:used] = np.where(at == EPISODE, LAST, STEP)
+    ring.since_start[:used] = at
+    ring.until_end[:used] = EPISODE - at
+    ring.head[:] = used - 1
+    ring.n_steps[:] = used // period * EPISODE
+    return ring
+
+
+def fill_sb3(buffer: Any) -> Any:
+    """Fills a replay buffer of Stable-Baselines3, hindsight's included, with whole episodes, and returns it."""
+    rng = np.random.default_rng(0)
+    size = buffer.buffer_size
+
+    def fill(store: np.ndarray) -> None:
+        store[:] = rng.standard_normal(store.shape, np.float32)
+
+    for name in ("observations", "next_observations"):
+        stores = getattr(buffer, name, None)
+        for store in stores.values() if isinstance(stores, dict) else [] if stores is None else [stores]:
+            fill(store)
+    fill(buffer.actions)
+    fill(buffer.rewards)
+    buffer.dones[:] = (np.arange(size) % EPISODE == EPISODE - 1)[:, None]
+    buffer.timeouts[:] = buffer.dones
+    if hasattr(buffer, "ep_start"):
+        whole = size // EPISODE * EPISODE
+        buffer.ep_start[:whole] = (np.arange(whole) // EPISODE * EPISODE)[:, None]
+        buffer.ep_length[:whole] = EPISODE
+    buffer.full, buffer.pos = True, 0
+    return buffer
+
+
+def nbytes(thing: Any) -> int:
+    """Returns the bytes of all arrays that an object holds, itself or in dictionaries."""
+    found = 0
+    for value in vars(thing).values():
+        for array in value.values() if isinstance(value, dict) else [value]:
+            found += array.nbytes if isinstance(array, np.ndarray) else 0
+    return found

@@ -1,0 +1,122 @@
+"""How much floating-point work an update is, by XLA's own count.
+
+XLA's cost analysis counts the body of a loop once, however often it runs, and of a conditional the costlier branch. So the
+count here is XLA's of the whole program, plus XLA's of each loop's body by itself for every further run of it, minus what
+a conditional's costlier branch has more than the other for the share of times that it is not taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+
+def flops(function: Callable[..., Any], *args: Any, while_runs: int = 1, taken: float = 1.0) -> float:
+    """Returns the floating-point operations of one call of ``function``, elementwise ones included.
+
+    Args:
+        function: what JAX can trace.
+        args: arrays or shapes of arrays.
+        while_runs: how often the body of a ``while_loop`` runs, which no program says.
+        taken: share of the calls in which a conditional takes its costlier branch.
+
+    >>> import jax, jax.numpy as jnp
+    >>> flops(jnp.matmul, jnp.ones((4, 5), jnp.float32), jnp.ones((5, 6), jnp.float32))
+    240.0
+    """
+    return _flops(jax.make_jaxpr(function)(*args), while_runs, taken)
+
+
+def _flops(program: ClosedJaxpr, while_runs: int, taken: float) -> float:
+    total = _by_xla(program)
+    for equation in _equations(program.jaxpr):
+        name, params = equation.primitive.name, equation.params
+        if name == "scan":
+            total += (params["length"] - 1) * _flops(params["jaxpr"], while_runs, taken)
+            total += _inner(params["jaxpr"], while_runs, taken)
+        elif name == "while":
+            total += (while_runs - 1) * _flops(params["body_jaxpr"], while_runs, taken)
+            total += _inner(params["body_jaxpr"], while_runs, taken)
+        elif name == "cond":
+            branches = sorted(_flops(branch, while_runs, taken) for branch in params["branches"])
+            total -= (1.0 - taken) * (branches[-1] - branches[0])
+    return total
+
+
+def _inner(program: ClosedJaxpr, while_runs: int, taken: float) -> float:
+    """Returns what the count of the whole program lacks of what lies inside a loop's body."""
+    return _flops(program, while_runs, taken) - _by_xla(program)
+
+
+def _equations(jaxpr: Any) -> Iterator[Any]:
+    """Yields the equations of a program, those of the functions that it calls included, not those inside of loops."""
+    for equation in jaxpr.eqns:
+        yield equation
+        if equation.primitive.name in ("scan", "while", "cond"):
+            continue
+        for value in equation.params.values():
+            if isinstance(value, ClosedJaxpr):
+                yield from _equations(value.jaxpr)
+
+
+def _by_xla(program: ClosedJaxpr) -> float:
+    inputs = [jax.ShapeDtypeStruct(value.aval.shape, value.aval.dtype) for value in program.jaxpr.invars]
+    cost = jax.jit(jaxpr_as_fun(program)).lower(*inputs).compile().cost_analysis()
+    return float((cost or {}).get("flops", 0.0))
+
+
+def sac_by_hand(obs_dim: int, action_dim: int, hidden: tuple[int, int], batch: int) -> int:
+    """Returns the operations of the matrix products alone in one update of SAC with two critics, to check the count by.
+
+    A product of a batch with a layer of n by m weights is 2 n m operations a transition; going back through a layer costs
+    as much again for its weights, and again for its inputs where something before it wants a gradient.
+    """
+    first, last = hidden
+    actor = obs_dim * first + first * last + last * 2 * action_dim
+    critic = (obs_dim + action_dim) * first + first * last + last
+    target = actor + 2 * critic
+    critics = 2 * (3 * critic - (obs_dim + action_dim) * first)
+    policy = 3 * actor - obs_dim * first + 2 * 2 * critic
+    return 2 * batch * (target + critics + policy)
+
+
+def off_policy(agent: Any, n_envs: int) -> dict[str, float]:
+    """Returns the operations of one gradient step and of acting for one environment step, for an off-policy agent."""
+    import numpy as np
+
+    from rejeu.core import Clock
+
+    config, algorithm, shapes = agent.config, agent._compiled.algorithm, agent._compiled.shapes
+    batch = agent.replay_buffer.sample(np.random.default_rng(0), (config.batch_size,))
+    clock = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
+    update = flops(algorithm.update, shapes, batch, clock, taken=1.0 / getattr(config, "policy_delay", 1))
+    return {"update_flops": update, "act_flops": _act(agent, jax.tree.map(lambda x: x[:n_envs], batch.obs), clock)}
+
+
+def on_policy(agent: Any, n_envs: int) -> dict[str, float]:
+    """Returns the operations of one update, of all its epochs, and of acting, each for one environment step."""
+    import numpy as np
+
+    from rejeu.core import Clock
+
+    config, algorithm, shapes = agent.config, agent._compiled.algorithm, agent._compiled.shapes
+    rollout = agent._run.replay.rollout()
+    clock = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
+    steps = config.n_steps * n_envs
+    runs = config.n_epochs * -(-steps // config.batch_size) if hasattr(config, "n_epochs") else 1
+    update = flops(algorithm.update, shapes, rollout, clock, while_runs=runs)
+    obs = jax.tree.map(lambda x: x[0], rollout.obs)
+    return {"update_flops": update / steps, "act_flops": _act(agent, obs, clock)}
+
+
+def _act(agent: Any, obs: Any, clock: Any) -> float:
+    algorithm = agent._compiled.algorithm
+    n_envs = len(jax.tree.leaves(obs)[0])
+
+    def act(state: Any, obs: Any, key: Any) -> Any:
+        return algorithm.explore(algorithm.actor(state), obs, key, clock)
+
+    return flops(act, agent._compiled.shapes, obs, jax.random.PRNGKey(0)) / n_envs

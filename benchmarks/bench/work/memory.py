@@ -1,0 +1,38 @@
+"""What a full replay buffer takes: bytes of its arrays, and by how much the process grew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.bench.work import buffers, common
+
+
+def measure(library: str, kind: str, n: int, compact: bool = False) -> dict[str, Any]:
+    """Makes and fills a buffer of ``n`` transitions; ``compact`` is Stable-Baselines3's ``optimize_memory_usage``."""
+    make = sb3_buffer if library == "sb3" else rejeu_buffer
+    make(kind, 1000, compact)
+    before = common.resident_bytes()
+    buffer = make(kind, n, compact)
+    after = common.resident_bytes()
+    grown = None if before is None or after is None else after - before
+    size = buffers.nbytes(buffer) if library == "sb3" else buffer.nbytes
+    return {"nbytes": size, "resident": grown, "necessary": n * buffers.necessary_bytes(kind), "n": n}
+
+
+def rejeu_buffer(kind: str, n: int, compact: bool) -> Any:
+    return buffers.rejeu_ring(kind, n)
+
+
+def sb3_buffer(kind: str, n: int, compact: bool) -> Any:
+    from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+
+    spaces = buffers.observation_space(kind), buffers.action_space(kind)
+    if kind == "parking":
+        return buffers.fill_sb3(DictReplayBuffer(n, *spaces, device="cpu"))
+    return buffers.fill_sb3(
+        ReplayBuffer(n, *spaces, device="cpu", optimize_memory_usage=compact, handle_timeout_termination=not compact)
+    )
+
+
+if __name__ == "__main__":
+    common.main(measure)

@@ -1,0 +1,64 @@
+"""Seconds of drawing a batch of 256 from full replay buffers: with hindsight, and by priority with the update of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks.bench.work import buffers, common
+
+BATCH = 256
+
+
+def measure(library: str, what: str, sizes: list[int], seconds: float) -> dict[str, Any]:
+    """Returns the seconds of a batch by size of the buffer, ``what`` being ``"hindsight"`` or ``"priority"``."""
+    make = sb3_sampler if library == "sb3" else rejeu_sampler
+    return {"seconds_per_batch": {str(size): common.seconds_of(make(what, size), seconds, 20) for size in sizes}}
+
+
+def rejeu_sampler(what: str, size: int) -> Any:
+    from rejeu.envs.vector import make_vector
+    from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig
+    from rejeu.replay.prioritized import Priorities, PriorityConfig
+    from rejeu.replay.uniform import ReplayBuffer
+
+    rng = np.random.default_rng(0)
+    if what == "hindsight":
+        goals = make_vector("parking-v0", 1, "gymnasium").goals()
+        replay: Any = HerReplayBuffer(buffers.rejeu_ring("parking", size), 0.99, HindsightConfig(), goals)
+        return lambda: replay.sample(rng, (BATCH,))
+    ring = buffers.rejeu_ring("pendulum", size)
+    priorities = Priorities(ring, PriorityConfig())
+    priorities.restore()
+    replay = ReplayBuffer(ring, 0.99, priorities=priorities)
+    td_errors = [rng.exponential(size=BATCH).astype(np.float32) for _ in range(64)]
+    turn = 0
+
+    def draw_and_update() -> None:
+        nonlocal turn
+        replay.sample(rng, (BATCH,), 0.5)
+        replay.reprioritise([td_errors[turn % len(td_errors)]])
+        turn += 1
+
+    return draw_and_update
+
+
+def sb3_sampler(what: str, size: int) -> Any:
+    import gymnasium as gym
+    import highway_env
+    from stable_baselines3 import HerReplayBuffer
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    assert what == "hindsight"
+    gym.register_envs(highway_env)
+    env = DummyVecEnv([lambda: gym.make("parking-v0")])
+    buffer = HerReplayBuffer(
+        size, buffers.observation_space("parking"), buffers.action_space("parking"), env, device="cpu", n_sampled_goal=4
+    )
+    buffers.fill_sb3(buffer)
+    return lambda: buffer.sample(BATCH)
+
+
+if __name__ == "__main__":
+    common.main(measure)

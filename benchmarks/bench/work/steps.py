@@ -1,0 +1,49 @@
+"""Seconds of an environment step with its share of updates: off-policy algorithms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.bench.work import common
+
+WARM_UP, UNIT = 304, 104
+"""Environment steps before the clock starts, and of which the rest is a multiple; 8 environments divide either."""
+
+
+def measure(
+    library: str,
+    algorithm: str,
+    env: str,
+    settings: dict[str, Any],
+    seconds: float,
+    n_envs: int = 1,
+    backend: str = "gymnasium",
+    count: bool = False,
+) -> dict[str, Any]:
+    """Trains on ``n_envs`` environments, one gradient step an environment step; ``count`` counts its operations too."""
+    import gymnasium as gym
+
+    settings = {**settings, "learning_starts": 100, "buffer_size": 100_000, "train_freq": 1, "gradient_steps": 1}
+    given: Any = gym.make(env)
+    if library == "rejeu" and (n_envs > 1 or backend != "gymnasium"):
+        import rejeu
+
+        given = rejeu.make_vector(env, n_envs, backend, seed=0)
+    if library == "sb3":
+        settings["device"] = "cpu"
+    agent = common.algorithm_of(library, algorithm)("MlpPolicy", given, seed=0, **settings)
+    result = common.time_learning(agent, library, warm_up=WARM_UP, unit=UNIT, seconds=seconds)
+    result["torch_threads"] = common.threads_of(library)
+    if library == "rejeu":
+        from rejeu import compilation
+
+        result["threads"] = 1 if agent._work(n_envs) <= compilation.LITTLE_WORK else 0
+    if count:
+        from benchmarks.bench.work import flops
+
+        result |= flops.off_policy(agent, n_envs)
+    return result
+
+
+if __name__ == "__main__":
+    common.main(measure)
