@@ -37,7 +37,7 @@ def result_of(measurement, turn, variant):
         found = {"seconds_per_step": seconds, "steps": 100, "seconds": 100 * seconds, "threads": 1}
         if measurement.library == "rejeu":
             found["seconds_by_part"] = {part: share * seconds for part, share in PARTS.items()}
-            found |= {"update_flops": 3.9e6, "act_flops": 0.1e6} if turn == 0 else {}
+            found |= {"update_flops": 3.9e6, "act_flops": 0.1e6} if turn == 0 and measurement.counts else {}
         return found
     if measurement.case == "parking":
         return {
@@ -115,7 +115,9 @@ def test_the_page_has_medians_spreads_ratios_of_rounds_and_limits(results, tmp_p
     ]  # fmt: skip
     assert row_of(text, "QRDQN")[4:6] == ["", ""]  # SBX has none
     assert row_of(text, "SAC", "20 %") == ["SAC", "20 %", "10 %", "60 %", "10 %"]
-    assert row_of(text, "16", "EnvPool")[2:5] == ["6,667 (5,000 to 10,000)", "333 (333 to 500), 1 thread", "20.0"]
+    on_pool = row_of(text, "16", "EnvPool")
+    assert on_pool[2:5] == ["6,667 (5,000 to 10,000)", "333 (333 to 500), 1 thread", "20.0"]
+    assert on_pool[-4:] == ["50", "10", "40", "33 %"]
     assert row_of(text, "1,000,000") == [
         "1,000,000", "150 (100 to 200)", "3,000 (2,000 to 3,000)", "20.0", "150 (100 to 200)",
     ]  # fmt: skip

@@ -90,7 +90,7 @@ def how_to_read(results: Mapping[str, Any]) -> str:
 - Peers run with one thread and with all, in the first round; the faster setting is measured on and shown. rejeu chooses its
   number of threads itself. Stable-Baselines3 and SBX step Gymnasium environments in the process (`DummyVecEnv`): neither
   takes EnvPool's as they are.
-- All libraries get the same networks, batches, rollouts and numbers of updates.
+- All libraries get the same networks, batches, rollouts and numbers of updates, and compute on the CPU.
 - **The limit** is a bare step of the same environment (random actions, resets included, through the same vector of
   environments) plus the floating-point operations of acting and updating at the rate of the fastest matrix product that
   this machine computes with as many threads as rejeu uses. No program that does the two one after the other can be faster.

@@ -170,7 +170,7 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
                     continue
                 measured.append((name, best(samples, "rollouts", name, "rejeu")))
                 peers = {library: step_seconds(samples, "rollouts", home, library) for library in ("sb3", "sbx")}
-                found = limit(samples, "rollouts", name, plan.env_name(plan.LANDER, n, backend))
+                found = limit(samples, "rollouts", name, plan.env_name(plan.LANDER, n, backend), counted_as=home)
                 line = "rejeu" if backend == "gymnasium" else "rejeu, EnvPool"
                 lines.setdefault(line, {})[n] = rate_of(own)
                 if found is not None:

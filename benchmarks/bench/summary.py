@@ -95,10 +95,14 @@ def peak(samples: Sequence[Sample], threads: int) -> float | None:
     return max((row["result"]["flops_per_second"] for row in rows), default=None)
 
 
-def limit(samples: Sequence[Sample], case: str, name: str, env: str) -> Limit | None:
-    """Returns rejeu's limit in a case whose bare environment was measured as ``env``; None if something is missing."""
+def limit(samples: Sequence[Sample], case: str, name: str, env: str, counted_as: str = "") -> Limit | None:
+    """Returns rejeu's limit in a case whose bare environment was measured as ``env``; None if something is missing.
+
+    ``counted_as`` names the measurement that counted the operations, where it is not the same.
+    """
     rows = best(samples, case, name, "rejeu")
-    counted = next((row["result"] for row in rows if "update_flops" in row["result"]), None)
+    results = (row["result"] for row in best(samples, case, counted_as or name, "rejeu"))
+    counted = next((result for result in results if "update_flops" in result), None)
     bare = step_seconds(samples, "limits", env, "rejeu")
     rate = None if counted is None else peak(samples, counted["threads"])
     if counted is None or rate is None:

@@ -33,7 +33,7 @@ def measure(
     agent = common.algorithm_of(library, algorithm)("MlpPolicy", vector, seed=0, **settings)
     unit = max(settings["n_steps"] * n_envs, 1)
     unit *= max(1, 320 // unit)
-    result = common.time_learning(agent, library, warm_up=2 * unit, unit=unit, seconds=seconds)
+    result = common.time_learning(agent, library, warm_up=unit, unit=unit, seconds=seconds)
     result["torch_threads"] = common.threads_of(library)
     if library == "rejeu":
         from rejeu import compilation
