@@ -10,7 +10,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from benchmarks.bench import plan
 from benchmarks.bench.summary import Limit, Spread
@@ -55,19 +55,22 @@ def draw_steps(
                     low.append(1e3 * (found.median - found.low))
                     high.append(1e3 * (found.high - found.median))
             if places:
-                bars = axes.bar(places, heights, width, color=COLOURS[library], label=NAMES[library])
+                axes.bar(places, heights, width, color=COLOURS[library], label=NAMES[library])
                 axes.errorbar(places, heights, [low, high], fmt="none", ecolor="black", elinewidth=0.8, capsize=2)
-                axes.bar_label(bars, [number(h) for h in heights], fontsize=7, padding=3)
+                for place, height, above in zip(places, heights, high, strict=True):
+                    above_it = {"xytext": (0, 2), "textcoords": "offset points", "ha": "center", "fontsize": 7}
+                    axes.annotate(number(height), (place, height + above), **above_it)
         labelled = False
         for place, name in enumerate(seconds):
             found = limits.get(name)
             if found is not None:
-                left = place - 1.5 * width
+                left = place - 1.65 * width
                 label = None if labelled else "limit: bare environment and arithmetic"
-                axes.hlines(1e3 * found.seconds, left, left + width, color=COLOURS["limit"], linewidth=2, label=label)
+                right = left + 1.3 * width
+                axes.hlines(1e3 * found.seconds, left, right, color="black", linewidth=2.2, label=label, zorder=3)
                 labelled = True
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(FuncFormatter(number))
+        logarithmic(axes.yaxis)
         axes.grid(axis="x", visible=False)
         axes.set_xticks(range(len(seconds)), [name.replace(", ", "\n") for name in seconds])
         axes.set_ylabel("milliseconds of a step (log), less is better")
@@ -102,8 +105,7 @@ def draw_rollouts(
             axes.set_xscale("log", base=2)
             axes.set_yscale("log")
             axes.set_xticks(plan.N_ENVS, [str(n) for n in plan.N_ENVS])
-            axes.yaxis.set_major_formatter(FuncFormatter(number))
-            axes.yaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+            logarithmic(axes.yaxis)
             axes.set_xlabel("environments")
             axes.set_title(algorithm, loc="left")
         panels[0][0].set_ylabel("environment steps a second (log), more is better")
@@ -127,13 +129,19 @@ def draw_replay(seconds: Mapping[str, Mapping[int, Spread]], path: Path, title: 
             draw_line(axes, scaled, colours[line], labels[line])
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(FuncFormatter(number))
-        axes.yaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+        logarithmic(axes.yaxis)
         axes.set_xlabel("transitions in the buffer (log)")
         axes.set_ylabel("microseconds a batch of 256 (log), less is better")
         axes.set_title(title, loc="left")
         axes.legend(fontsize=8)
         save(figure, path)
+
+
+def logarithmic(axis: Any) -> None:
+    """Labels a logarithmic axis at 1, 2 and 5 of each power of ten."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(number))
 
 
 def draw_line(axes: Any, by: Mapping[int, Spread], colour: str, label: str) -> None:

@@ -14,6 +14,7 @@ from benchmarks.bench.summary import (
     Spread,
     best,
     by_round,
+    gap,
     limit,
     ratio,
     shares,
@@ -74,23 +75,32 @@ all is compiled; "in the environment" are its `step` and `reset`, by the same wr
 
 {table((*header, "compiling, s", "success"), rows)}
 
-{share_table([(job.name, best(samples, "parking", job.name, "rejeu")) for job in jobs if job.library == "rejeu"])}"""
+{share_table([(job.name, best(samples, "parking", job.name, "rejeu"), None) for job in jobs if job.library == "rejeu"])}"""
 
 
-def share_table(cases: Sequence[tuple[str, Sequence[Sample]]]) -> str:
-    """Returns what rejeu's time went into, case by case."""
+def share_table(cases: Sequence[tuple[str, Sequence[Sample], Mapping[str, float] | None]]) -> str:
+    """Returns what rejeu's time went into, case by case, and by how much that is beyond the limit where there is one."""
     rows = []
-    for name, found in cases:
+    beyond = any(gaps is not None for *_, gaps in cases)
+    for name, found, gaps in cases:
         parts = shares(found)
         if parts is not None:
-            rows.append((name, *(percent(share) for share in parts.values())))
+            cells = [number(1e6 * gaps[part]) if gaps else "" for part in parts] if beyond else []
+            rows.append((name, *(percent(share) for share in parts.values()), *cells))
     if not rows:
         return ""
-    explained = (
-        "Where rejeu's time went while training (`agent.seconds`). `update` is the time that the loop waited for the "
+    text = (
+        "Where rejeu's time went while training (`agent.seconds`). `update` is the time that the loop waited for the device, "
+        "acting and\ndispatch included."
     )
-    explained += "device, acting and\ndispatch included:\n\n"
-    return explained + table(("", "environment", "replay", "update and acting", "rest"), rows)
+    header: tuple[str, ...] = ("", "environment", "replay", "update", "rest")
+    if beyond:
+        header += ("beyond the bare environment, us", "replay, us", "update beyond its arithmetic, us", "rest, us")
+        text += (
+            " The right half is what stands between rejeu and the limit, in microseconds of a step; a number is\nnegative "
+            "where something is done while something else is waited for."
+        )
+    return f"{text}\n\n{table(header, rows)}"
 
 
 def per_step(samples: Sequence[Sample], page: Path) -> str:
@@ -106,8 +116,11 @@ def per_step(samples: Sequence[Sample], page: Path) -> str:
     picture = page.parent / "images" / PICTURES["steps"]
     one = {name: by for name, by in drawn.items() if name != plan.POOL} or drawn
     pictures.draw_steps(one, limits, picture, "A step with one update, one environment")
+    measured = [
+        (name, best(samples, "steps", name, "rejeu"), gap_to(samples, "steps", name, limits[name])) for name in names
+    ]
     header = ("", "rejeu, ms", "Stable-Baselines3, ms", "ratio", "SBX, ms", "ratio", *LIMIT_HEADER)
-    settings = ", ".join(
+    settings = "; ".join(
         f"{name}: {'-'.join(map(str, s['policy_kwargs']['net_arch']))}, batches of {s['batch_size']}, {env}"
         for name, (_, env, s) in plan.STEPS.items()
         if name in names
@@ -121,9 +134,7 @@ EnvPool and eight updates a turn, which is again one a step. {settings}.
 
 ![Milliseconds of a step](images/{PICTURES["steps"]})
 
-What stands between rejeu and the limit: the update's time beyond its arithmetic, replay and rest.
-
-{share_table([(name, best(samples, "steps", name, "rejeu")) for name in names])}"""
+{share_table(measured)}"""
 
 
 LIMIT_HEADER = ("limit", "of it environment", "of it arithmetic", "of the limit")
@@ -149,6 +160,11 @@ def limit_cells(found: Limit | None, scale: float) -> tuple[str, ...]:
     return (*numbers, percent(found.share_reached))
 
 
+def gap_to(samples: Sequence[Sample], case: str, name: str, found: Limit | None) -> dict[str, float] | None:
+    """Returns what a step takes beyond a limit, None where there is no limit."""
+    return None if found is None else gap(samples, case, name, found)
+
+
 def env_of(name: str) -> str:
     """Returns the name of the bare environment of a case of :func:`per_step`."""
     if name == plan.POOL:
@@ -168,9 +184,11 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
                 own = step_seconds(samples, "rollouts", name, "rejeu")
                 if not own:
                     continue
-                measured.append((name, best(samples, "rollouts", name, "rejeu")))
                 peers = {library: step_seconds(samples, "rollouts", home, library) for library in ("sb3", "sbx")}
                 found = limit(samples, "rollouts", name, plan.env_name(plan.LANDER, n, backend), counted_as=home)
+                measured.append(
+                    (name, best(samples, "rollouts", name, "rejeu"), gap_to(samples, "rollouts", name, found))
+                )
                 line = "rejeu" if backend == "gymnasium" else "rejeu, EnvPool"
                 lines.setdefault(line, {})[n] = rate_of(own)
                 if found is not None:

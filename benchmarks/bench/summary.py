@@ -124,6 +124,19 @@ def shares(rows: Sequence[Sample]) -> dict[str, float] | None:
     return found
 
 
+def gap(samples: Sequence[Sample], case: str, name: str, found: Limit) -> dict[str, float]:
+    """Returns what a step takes beyond its limit, in seconds by part, medians over the rounds.
+
+    The environment's part is what it takes beyond a bare step, the update's what the loop waits for beyond the arithmetic,
+    which is negative where environment and update run at the same time.
+    """
+    floor = {"env": found.env, "update": found.arithmetic}
+    rows = best(samples, case, name, "rejeu")
+    return {
+        part: median(row["result"]["seconds_by_part"][part] for row in rows) - floor.get(part, 0.0) for part in PARTS
+    }
+
+
 def drift(samples: Sequence[Sample]) -> Spread | None:
     """Returns the milliseconds of the calibrating product over the run; None without samples."""
     found = [ms for sample in samples for ms in sample["calibration_ms"]]
