@@ -206,8 +206,14 @@ def test_a_busy_machine_is_refused(monkeypatch, capsys):
 
 def test_a_quiet_machine_is_not_called_busy(monkeypatch):
     monkeypatch.setattr(machine, "others_busy", lambda seconds: 0.02)
-    monkeypatch.setattr(machine, "load", lambda: 0.05)
+    monkeypatch.setattr(machine, "load", lambda: 1.5)  # of what ended just now
     assert machine.why_busy() is None
+
+
+def test_the_load_average_counts_where_nothing_better_is_known(monkeypatch):
+    monkeypatch.setattr(machine, "others_busy", lambda seconds: None)
+    monkeypatch.setattr(machine, "load", lambda: 1.5)
+    assert "load average of the last minute is 1.50" in machine.why_busy()
 
 
 @pytest.mark.parametrize(

@@ -129,6 +129,8 @@ def main(given: Sequence[str] | None = None) -> int:
         if not (arguments.quick or arguments.busy):
             print("Wait until it is quiet, or give --busy to measure nonetheless.", file=sys.stderr)
             return 2
+    elif (machine.load() or 0.0) > machine.BUSY:
+        print(f"WARNING: the load average is {machine.load()}: something ran until just now.", file=sys.stderr)
     pythons = interpreters(arguments)
     chosen = [
         m for m in plan.everything(arguments.quick) if m.case in arguments.cases and m.library in arguments.libraries

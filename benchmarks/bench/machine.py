@@ -117,10 +117,16 @@ def load() -> float | None:
 
 
 def why_busy() -> str | None:
-    """Returns what makes timings worthless now, None if the machine is quiet."""
-    busy, average = others_busy(1.0), load()
-    if busy is not None and busy > BUSY:
-        return f"other programs use {busy:.2f} of {cores()} cores now (at most {BUSY} would do)"
+    """Returns what makes timings worthless now, None if the machine is quiet.
+
+    Where the system tells how busy it is at this moment, the load average does not count: it still remembers what ended a
+    minute ago, a run of this program that is now resumed for one.
+    """
+    busy, average = others_busy(2.0), load()
+    if busy is not None:
+        return (
+            f"other programs use {busy:.2f} of {cores()} cores now (at most {BUSY} would do)" if busy > BUSY else None
+        )
     if average is not None and average > BUSY:
         return f"the load average of the last minute is {average:.2f} (at most {BUSY} would do)"
     return None
