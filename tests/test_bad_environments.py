@@ -266,3 +266,9 @@ def test_the_command_prints_what_it_finds(capsys):
     assert out[-1] == "tests.registered_badly:Bad-v0: 1 error, no warnings"
     assert main(["check", "CartPole-v9000"]) == 2
     assert "did you mean CartPole" in capsys.readouterr().err
+
+
+def test_training_refuses_restarts_without_workers(capsys, tmp_path):
+    assert main(["train", "Pendulum-v1", "--restart-workers", "2", "--out", str(tmp_path / "run")]) == 2
+    assert "restart_workers=2 is for worker processes" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -172,12 +172,12 @@ def actions(*given):
 @pytest.mark.parametrize("act", [1, 2])
 def test_a_worker_that_crashes_or_hangs_is_named_and_all_are_ended(act):
     began = time.monotonic()
-    vector = make_vector(Losable, 3, "gymnasium-async", seed=0, worker_timeout=1.5)
+    vector = make_vector(Losable, 3, "gymnasium-async", seed=0, worker_timeout=1.0)
     vector.reset()
     words = (
         r"environment 1 ended by itself at 'step' \(exit code (-9, SIGKILL|9)\)"
         if act == 1
-        else r"environment 1 gave no answer to 'step' for 1.5 seconds; a longer worker_timeout"
+        else r"environment 1 gave no answer to 'step' for 1 seconds; a longer worker_timeout"
     )
     with pytest.raises(WorkerError, match=words):
         vector.step(actions(0, act, 0))
@@ -190,7 +190,7 @@ def test_a_worker_that_crashes_or_hangs_is_named_and_all_are_ended(act):
 
 @pytest.mark.parametrize("act", [1, 2])
 def test_a_lost_worker_is_started_anew_and_its_episode_truncated(act):
-    vector = make_vector(Losable, 2, "gymnasium-async", seed=0, worker_timeout=1.5, restart_workers=1)
+    vector = make_vector(Losable, 2, "gymnasium-async", seed=0, worker_timeout=1.0, restart_workers=1)
     vector.reset()
     before = np.array(vector.step(actions(0, 0)).obs)
     with pytest.warns(
@@ -239,7 +239,7 @@ def test_training_goes_on_where_workers_are_started_anew():
 
 
 def test_a_subproc_vector_replaces_lost_processes_too():
-    env = SubprocVecEnv([Losable] * 2, worker_timeout=1.5, restart_workers=1)
+    env = SubprocVecEnv([Losable] * 2, worker_timeout=1.0, restart_workers=1)
     try:
         env.reset()
         before = env.step(actions(0, 0))[0]
@@ -254,6 +254,17 @@ def test_a_subproc_vector_replaces_lost_processes_too():
     finally:
         env.close()
     assert not children()
+
+
+def test_answers_that_nobody_fetched_are_dropped():
+    """As after a Ctrl-C that came between question and answer."""
+    vector = make("nothing")
+    vector.reset()
+    vector.workers.send({i: ("step", np.zeros(1, np.float32)) for i in range(2)})
+    np.testing.assert_array_equal(vector.step(actions(0, 0)).obs[:, 1], 2)
+    vector.workers.send({0: ("step", np.zeros(1, np.float32))})
+    np.testing.assert_array_equal(vector.reset_done(np.array([True, False]))[:, 1], [0, 2])
+    vector.close()
 
 
 @pytest.mark.parametrize(
