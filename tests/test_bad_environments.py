@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +21,7 @@ from rejeu.envs.subproc import SubprocVecEnv
 from rejeu.envs.vec_wrappers import VecMonitor
 from rejeu.envs.vector import GymnasiumVector, make_vector
 from rejeu.errors import BadEnvironmentError
-from rejeu.loops.host import check_rewards
+from rejeu.loops.host import check_finite
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac
 
@@ -71,7 +72,7 @@ def walk(vector, n_steps=12):
         vector.reset(0)
         for n in range(n_steps):
             step = vector.step(np.zeros((vector.n_envs, 1), np.float32))
-            check_rewards(step, vector, n * vector.n_envs)
+            check_finite(SimpleNamespace(env=vector, action=None), step, n * vector.n_envs)
             done = step.terminated | step.truncated
             if done.any():
                 vector.reset_done(done)

@@ -7,7 +7,7 @@ to do, or None where nothing is wrong. They run once something has failed, and i
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -187,15 +187,6 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
                 f"{name_of(leaf.path)} with {array[at]}{_place(at)}{more}, outside of the declared bounds "
                 f"[{low[at]}, {high[at]}]; declare the bounds that it really has, or clip it"
             )
-    return None
-
-
-def finite_fault(space_leaves: Sequence[Leaf], stores: Sequence[np.ndarray]) -> tuple[int, str] | None:
-    """Returns the environment and the sentence for the first number in a batch of observations that is not finite."""
-    for leaf, store in zip(space_leaves, stores, strict=True):
-        if store.dtype.kind == "f" and not np.isfinite(store).all():
-            env = int(np.argwhere(~np.isfinite(store))[0][0])
-            return env, f"{_finite_fault(store[env], name_of(leaf.path))}"
     return None
 
 

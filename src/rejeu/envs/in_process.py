@@ -19,9 +19,6 @@ from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import leaves, structure
 
-FINITE_EVERY = 64
-"""Steps of the vector between two looks for observations that are not finite; there is one more where episodes end."""
-
 
 class InProcess(VectorEnv):
     """Gymnasium environments stepped one after the other in this process.
@@ -53,8 +50,6 @@ class InProcess(VectorEnv):
         only = self._stores[0] if isinstance(self.observation_space, gym.spaces.Box) else None
         self._hot = (self._put, only, math.prod(self._leaves[0].shape), self.observation_space.dtype)
         """What every step needs, in one place; ``only`` is the store of observations that are one array."""
-        floats = [store.reshape(-1) for store in self._stores if store.dtype.kind == "f"]
-        self._watched = [(flat, np.zeros_like(flat)) for flat in floats]
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
 
     def handed_on(self, wrap: Callable[[gym.Env], gym.Env], seed: int | None = None) -> InProcess:
@@ -86,7 +81,7 @@ class InProcess(VectorEnv):
         info: list[dict[str, Any]] = [{}] * self.n_envs
         envs = self.envs
         put, only, size, dtype = self._hot
-        self.n_steps = n_steps = self.n_steps + 1
+        self.n_steps += 1
         for i in self._all if which is None else which:
             answer = envs[i].step(action[i])
             try:
@@ -102,12 +97,9 @@ class InProcess(VectorEnv):
                     truncated[i] = cut if type(cut) in FLAGS else flag_of(cut)
             except Exception as error:  # whatever NumPy says of an answer that does not fit
                 raise self._bad(i, faults.step_fault(answer, self.observation_space), error) from error
-        if not n_steps % FINITE_EVERY:
-            self._check_finite()
         return Step(self._obs, reward, terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
-        self._check_finite()
         envs, put = self.envs, self._put
         for i in np.flatnonzero(done).tolist():
             answer = envs[i].reset()
@@ -119,13 +111,6 @@ class InProcess(VectorEnv):
             except Exception as error:  # whatever NumPy says of an answer that does not fit
                 raise self._bad(i, faults.reset_fault(answer, self.observation_space), error) from error
         return self._obs
-
-    def _check_finite(self) -> None:
-        for flat, zeros in self._watched:
-            if flat.dot(zeros) != 0.0:  # NaN for anything that is not finite, in a third of the time of isfinite
-                found = faults.finite_fault(self._leaves, self._stores)
-                assert found is not None
-                raise BadEnvironmentError(faults.blamed(self.env_id, found[0], self.n_steps, f"returned {found[1]}"))
 
     def _bad(self, i: int, fault: str | None, error: Exception) -> BadEnvironmentError:
         """Returns what is wrong with environment ``i``'s answer, be it only what NumPy said of it."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from rejeu.envs import faults, goals as goals_module, worker_process
 from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
-from rejeu.envs.in_process import FINITE_EVERY
 from rejeu.envs.worker_process import Failure
 from rejeu.envs.workers import RESTARTED, TIMEOUT, Restarted, Workers
 from rejeu.errors import BadEnvironmentError, WorkerError
@@ -86,7 +85,6 @@ class InWorkers(VectorEnv):
         return self._reset({i: None if seed is None else seed + i for i in range(self.n_envs)})
 
     def reset_done(self, done: np.ndarray) -> Any:
-        self._check_finite()
         return self._reset(dict.fromkeys(np.flatnonzero(done).tolist()))
 
     def _reset(self, seeds: Mapping[int, int | None]) -> Any:
@@ -133,8 +131,6 @@ class InWorkers(VectorEnv):
                 reward[i], terminated[i], truncated[i], info[i] = answer
                 stepped.append(i)
         self._take(stepped)
-        if not self.n_steps % FINITE_EVERY:
-            self._check_finite()
         return Step(self._obs, reward, terminated, truncated, info)
 
     def _take(self, which: Sequence[int]) -> None:
@@ -154,11 +150,6 @@ class InWorkers(VectorEnv):
             raise BadEnvironmentError(faults.blamed(self.env_id, first, self.n_steps, failure.message))
         which = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
         raise WorkerError(f"{which} failed in a worker process, at a {what}:\n{failure.trace}")
-
-    def _check_finite(self) -> None:
-        found = faults.finite_fault(self._leaves, self._stores)
-        if found is not None:
-            raise BadEnvironmentError(faults.blamed(self.env_id, found[0], self.n_steps, f"returned {found[1]}"))
 
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])
