@@ -45,7 +45,7 @@ STEPS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "TQC": ("TQC", "Pendulum-v1", MIDDLE),
     "CrossQ": ("CrossQ", "Pendulum-v1", MIDDLE),
     "DQN": ("DQN", "MountainCar-v0", VALUES),
-    "QRDQN": ("QRDQN", "MountainCar-v0", VALUES),
+    "QRDQN": ("QRDQN", "MountainCar-v0", {**VALUES, "batch_size": 32}),  # 200 by 200 quantiles a transition
 }
 """Algorithm, environment and settings of each case with one environment and one update a step."""
 POOL = "SAC, 8 environments"
