@@ -315,7 +315,7 @@ EVERY: dict[str, Fault] = {
         MissingKey, "error", "expected left, right; add right", "keys left, expected left, right; add"
     ),
     "nothing seen": Fault(NothingSeen, "error", "observation as None", "step 3: .*the observation as None"),
-    "nan seen": Fault(NanSeen, "error", "the observation with nan at index 1", "the observation with nan at index 1"),
+    "nan seen": Fault(NanSeen, "error", "the observation with nan at index 1", r"an observation with nan at \[1\]"),
     "out of bounds": Fault(
         OutOfBounds, "warning", r"under 'speed' with 7.5 at index 1, outside of the declared bounds \[-1.0, 1.0\]", None
     ),

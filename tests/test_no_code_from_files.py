@@ -40,15 +40,18 @@ class Find(NamedTuple):
 
 ALLOWED = {
     # Functions go to worker processes as this program made them; nothing is read from a file.
+    "envs/worker_process.py": {"CloudpickleWrapper"},
     "envs/workers.py": {"CloudpickleWrapper"},
-    "envs/subproc.py": {"CloudpickleWrapper"},
     # The modules are those of our own table of environments' packages.
     "envs/registry.py": {"import_module", "find_spec"},
-    # Callbacks of Stable-Baselines3's kind are handed these; nothing is taken from them.
+    # Callbacks of Stable-Baselines3's kind are handed globals; nothing is taken from them.
     "evaluation.py": {"globals()"},
-    "hooks.py": {"globals()"},
     # The names of the fields of our own dataclasses, and settings that a class lists in its own source.
     "agents/base.py": {"getattr"},
+    "agents/checkpoints.py": {"getattr"},
+    "cli/run_folder.py": {"getattr"},
+    "envs/state.py": {"getattr"},
+    "hooks.py": {"globals()", "getattr"},
     "replay/ring.py": {"getattr"},
     "replay/rollout.py": {"getattr"},
     "config.py": {"getattr"},

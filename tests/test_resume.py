@@ -100,8 +100,8 @@ def compiled_once():
     """Within, agents share what is compiled, which holds no state: they must be of one kind."""
     made = []
 
-    def make(algorithm, noise):
-        made.extend([Compiled(algorithm, noise)] if not made else [])
+    def make(*arguments):
+        made.extend([Compiled(*arguments)] if not made else [])
         return copy.copy(made[0])
 
     with mock.patch.object(rejeu.agents.base, "Compiled", make):
