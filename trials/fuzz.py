@@ -108,7 +108,8 @@ def main() -> None:
 
 def in_process(target: str, seconds: int) -> dict[str, Any]:
     """Fuzzes one target in a new process and returns what is to be recorded of it."""
-    with tempfile.TemporaryDirectory() as folder:
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
         command = [sys.executable, __file__, "--child", "--target", target, "--seconds", str(seconds)]
         environment = os.environ | {"FUZZ_FOLDER": folder}
         began = time.monotonic()
@@ -151,9 +152,8 @@ class Watched:
     """Gives inputs to a target, counts outcomes and saves findings."""
 
     def __init__(self, target: str, folder: Path) -> None:
-        ram = Path("/dev/shm")
         self.target, self.folder = target, folder
-        self.path = Path(tempfile.mkdtemp(dir=ram if ram.is_dir() else None)) / "input.safetensors"
+        self.path = folder / "input.safetensors"
         self.read = READERS[target](self.path)
         self.counts = {"executions": 0, "refused": 0, "read": 0, "findings": 0}
         self.seen: set[str] = set()
