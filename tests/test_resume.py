@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import checkpoint
+from rejeu import checkpoint, plain
 from rejeu.agents.checkpoints import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
@@ -205,7 +205,7 @@ def test_no_rows_may_be_left_out(which, tmp_path):
     path = run_files(tmp_path)[0]
     header, arrays = checkpoint.read(path, "run")
     header["rows"].pop(which)
-    checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in ("schema", "kind")})
+    checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
     run_files(tmp_path)[1].unlink()
     with pytest.raises(CheckpointError, match="rows of the replay buffer are missing"):
         rejeu.SAC.resume(tmp_path)
@@ -487,3 +487,75 @@ def test_nothing_warns_where_all_is_exact(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rejeu.SAC.resume(tmp_path).learn()
+
+
+JUNK = [
+    None,
+    True,
+    -1,
+    2**70,
+    0.5,
+    float("nan"),
+    "text",
+    [],
+    [1, "x"],
+    {},
+    {"a": 1},
+    (1, 2),
+    np.zeros((3, 0)),
+    np.full(9, np.nan),
+]
+
+
+@pytest.mark.parametrize("kind", ["off policy", "on policy"])
+def test_a_checkpoint_full_of_nonsense_is_refused_by_our_own_error_alone(kind, tmp_path):
+    name, settings = ("DQN", {**OFF, "priorities": {}}) if kind == "off policy" else ("PPO", {**SMALL, "n_steps": 16})
+    env = vector("CartPole-v1", 2)
+    with compiled_once(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        rejeu.AGENTS[name]("MlpPolicy", env(), **settings).learn(
+            60, [Checkpoint(tmp_path, every=1000), lambda agent, turn: turn.step < 40]
+        )
+        path = run_files(tmp_path)[0]
+        for other in run_files(tmp_path)[1:]:
+            other.unlink()
+        whole, arrays = checkpoint.read(path, "run")
+        header = {key: value for key, value in whole.items() if key not in checkpoint.RESERVED}
+        read = []
+        for place in [
+            ("rows",),
+            ("run_id",),
+            ("n_envs",),
+            ("env_id",),
+            *(("run", key) for key in header["run"]["dict"]),
+        ]:
+            for junk in (*JUNK, "deleted"):
+                changed, more = copy.deepcopy(header), dict(arrays)
+                holder = changed if len(place) == 1 else changed["run"]["dict"]
+                if isinstance(junk, str) and junk == "deleted":
+                    del holder[place[-1]]
+                elif len(place) == 1:
+                    holder[place[-1]] = junk if isinstance(junk, int | str | list | None) else 0.5
+                else:
+                    holder[place[-1]] = plain.encode(junk, more, "junk")
+                checkpoint.write(path, "run", more, changed)
+                try:
+                    rejeu.AGENTS[name].resume(tmp_path, env())
+                    read.append((place[-1], junk))
+                except CheckpointError:
+                    continue
+    # What this run has no use for is not looked at, and of some things there may be none.
+    unused = {"env_id", "seed", "vec_normalize"}
+    assert {place for place, junk in read if place not in unused and junk} <= {"run_id", "reason"}
+
+
+def test_an_environment_that_a_file_names_is_not_imported(tmp_path):
+    cut_run(tmp_path)
+    path = run_files(tmp_path)[0]
+    run_files(tmp_path)[1].unlink()
+    header, arrays = checkpoint.read(path, "run")
+    header["env_id"] = "antigravity:Pendulum-v1"
+    checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
+    with pytest.raises(CheckpointError, match="give it again"):
+        rejeu.SAC.resume(tmp_path)
+    assert "antigravity" not in sys.modules

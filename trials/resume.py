@@ -116,6 +116,8 @@ def try_case(algorithm: str, env_id: str, n_envs: int, backend: str, cut: int) -
 def cases() -> list[tuple[str, str, int, str]]:
     import gymnasium as gym
 
+    import rejeu  # noqa: F401 - it registers the ball
+
     found = []
     for algorithm, env_ids in ALGORITHMS.items():
         for i, env_id in enumerate(env_ids):

@@ -34,6 +34,8 @@ REFRESH_SECONDS = 0.125
 """Least time between two refreshes of the progress bar on a terminal."""
 LINE_SECONDS = 10.0
 """Least time between two lines of progress where the output is no terminal."""
+EVALUATED = ("returns", "lengths", "successes")
+"""The arrays of an :class:`Evaluation`."""
 EVALUATION = 0x4556
 """Sets the random numbers of evaluations apart from all others."""
 RATE_SECONDS = 10.0
@@ -124,12 +126,21 @@ class Evaluate:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns every result so far, as plain data for a checkpoint."""
-        rows = [(r.step, r.evaluation.returns, r.evaluation.lengths, r.evaluation.successes) for r in self.results]
-        return {"results": rows, "best": None if self.best is None else self.results.index(self.best)}
+        parts = [r.evaluation for r in self.results]
+        columns = {key: [getattr(part, key) for part in parts] for key in EVALUATED}
+        return {
+            "steps": np.array([r.step for r in self.results], np.int64),
+            "counts": np.array([len(part.returns) for part in parts], np.int64),
+            **{key: np.concatenate([np.zeros(0), *arrays]) for key, arrays in columns.items()},
+            "best": None if self.best is None else self.results.index(self.best),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Takes back what :meth:`state_dict` returned."""
-        self.results = [Evaluated(int(step), Evaluation(*arrays)) for step, *arrays in state["results"]]
+        ends = np.cumsum(state["counts"])[:-1]
+        returns, lengths, successes = (np.split(state[key], ends) for key in EVALUATED)
+        parts = zip(state["steps"].tolist(), returns, lengths, successes, strict=False)
+        self.results = [Evaluated(step, Evaluation(r, n.astype(int), s)) for step, r, n, s in parts]
         self.best = None if state["best"] is None else self.results[state["best"]]
 
     def close(self) -> None:

@@ -52,6 +52,8 @@ MINUTES = 5.0
 """Between two checkpoints where nothing else is asked for."""
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 ROWS_FILE = re.compile(r"rows_\d{12}_[0-9a-f]+\.safetensors")
+MOST_ENVS = 4096
+"""More environments than so many are not made because a file says so."""
 SCALARS = ("learn_from", "owed", "steps_since_update")
 """Counters of a run that are in no model file; whole numbers from 0."""
 PER_ENV = ("playing", "ended", "episode_return", "episode_length", "running_return")
@@ -363,13 +365,13 @@ def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
         rows = [_rows_name(name) for name in header["rows"]]
         parts = [checkpoint.read(path.parent / name, "rows")[1] for name in rows]
         restore(agent, saved, parts, {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}, path)
-        agent._run_id, agent._own_env = str(header["run_id"]), env is None
+        agent._run_id, agent._own_env = text(header["run_id"]), env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
     except CheckpointError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        raise CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {error}") from error
+    except loading.WRONG as error:
+        raise CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {loading.brief(error)}") from error
     if parts:
         ring = agent._run.replay.ring
         heads = [part["head"] for part in parts]
@@ -393,9 +395,9 @@ def environment(path: Path, header: dict[str, Any]) -> tuple[str, int, Backend]:
         CheckpointError: if the checkpoint does not say, or they were not made from an id.
     """
     env_id, n_envs, backend = header.get("env_id"), header.get("n_envs"), header.get("backend")
-    if not isinstance(env_id, str) or backend not in BACKENDS or not isinstance(n_envs, int) or not 0 < n_envs < 2**16:
+    if not isinstance(env_id, str) or backend not in BACKENDS or type(n_envs) is not int or not 0 < n_envs <= MOST_ENVS:
         raise CheckpointError(f"{path} does not say which environments the run had; give them: resume(folder, env=...)")
-    if not header.get("own_env"):
+    if not header.get("own_env") or ":" in env_id:  # a colon would let Gymnasium import what stands before it
         raise CheckpointError(
             f"the run was given an environment, {env_id[:60]!r}, that no file can hold; give it again: "
             "resume(folder, env=...)"
@@ -409,7 +411,7 @@ def restore(
     """Puts an agent that was loaded from the same checkpoint where its run stood.
 
     Raises:
-        KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError: if something is damaged.
+        LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
     """
     run, compiled = agent._run, agent._compiled
     for key in SCALARS:
@@ -418,9 +420,10 @@ def restore(
     run.rng.bit_generator.state = saved["rng"]
     run.carry = like(compiled.initial_carry(n_envs), saved["carry"], "carry")
     if saved["metrics"] is not None:
-        run.metrics = Readings.of({key: jnp.float32(value) for key, value in saved["metrics"].items()})
+        metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved["metrics"].items()}
+        run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
     run.watch.n_skipped = whole("n_skipped", saved["n_skipped"], least=0)
-    run.td_errors = [jnp.asarray(array) for array in saved["td_errors"]]
+    run.td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved["td_errors"]]
     run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
     for key in PER_ENV:
         setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
@@ -433,15 +436,17 @@ def restore(
     agent._fill_windows()
     if saved["best"] is not None:
         packed = compiled.pack(checkpoint.arrays_to_tree(compiled.shapes, best, path))
-        agent._put_best(saved["best"]["score"], str(saved["best"]["by"]), int(saved["best"]["step"]), packed)
-    agent.logger.name_to_value, agent.logger._counts = saved["logger"]
+        agent._put_best(saved["best"]["score"], text(saved["best"]["by"]), int(saved["best"]["step"]), packed)
+    values, counts = saved["logger"]
+    agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
+    agent.logger._counts = {key: whole(key, value, least=0) for key, value in counts.items()}
     agent._n_predictions = whole("n_predictions", saved["n_predictions"], least=0)
     agent._call = None if saved["call"] is None else Call.from_json(saved["call"])
-    agent._saved_callbacks = list(saved["callbacks"])
+    agent._saved_callbacks = [(text(name), state) for name, state in saved["callbacks"]]
     statistics = agent.get_vec_normalize_env()
     if statistics is not None and saved["vec_normalize"] is not None:
         statistics.put_statistics(saved["vec_normalize"])
-    agent.resumed = Resumed(run.step, not saved["reason"], str(saved["reason"]))
+    agent.resumed = Resumed(run.step, not text(saved["reason"]), saved["reason"])
 
 
 def put_envs_back(run: Run, saved: dict[str, Any]) -> None:
@@ -477,6 +482,17 @@ def restore_buffer(run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.
         buffer.priorities.restore(saved["priorities"])
         if [error.size for error in run.td_errors] != [len(index) for index, _ in saved["priorities"]["drawn"]]:
             raise ValueError("the TD errors under way are not those of the steps that were drawn")
+
+
+def text(value: Any) -> str:
+    """Returns a text of a file.
+
+    Raises:
+        TypeError: if it is none.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"expected a text, got {type(value).__name__}")
+    return value
 
 
 def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
@@ -517,7 +533,10 @@ def restore_callbacks(callbacks: Sequence[Any], saved: Sequence[Any]) -> None:
             warnings.warn(f"the run was saved without a {name}; it begins anew", UserWarning, stacklevel=4)
             continue
         left.remove(match)
-        one.load_state_dict(match[1])
+        try:
+            one.load_state_dict(match[1])
+        except loading.WRONG as error:
+            raise CheckpointError(f"what {name} remembered is damaged: {loading.brief(error)}") from error
     if left:
         names = ", ".join(name for name, _ in left)
         warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=4)
