@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -403,6 +404,12 @@ class Counting(BaseCallback):
     def _on_step(self):
         self.passed[0] += 2
         return True
+
+
+def test_the_progress_bar_counts_the_steps_before(tmp_path, capsys):
+    cut_run(tmp_path)
+    rejeu.SAC.resume(tmp_path).learn(progress_bar=True)
+    assert re.match(r"100%  60/60 steps · ", capsys.readouterr().out)
 
 
 def test_callbacks_go_on_with_what_they_remember(tmp_path):

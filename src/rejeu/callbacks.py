@@ -273,13 +273,22 @@ class ProgressBar:
     Between two refreshes a call costs a look at the clock.
     """
 
-    def __init__(self, n_steps: int | None, seconds: float | None, console: Console | None = None) -> None:
+    def __init__(
+        self,
+        n_steps: int | None,
+        seconds: float | None,
+        console: Console | None = None,
+        taken: int = 0,
+        spent: float = 0.0,
+    ) -> None:
         """Starts counting time; the bar appears with the first step.
 
         Args:
             n_steps: environment steps that will be taken, None if only time ends the run.
             seconds: wall time after which the run ends, None if only steps do.
             console: where to write; None: standard output.
+            taken: how many of the steps a resumed run had taken before.
+            spent: how much of the wall time it had taken, in seconds.
         """
         from rich.console import Console
         from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
@@ -293,6 +302,7 @@ class ProgressBar:
         self._task = self._bar.add_task("", total=1.0)
         self._began = time.perf_counter()
         self._refresh_at = 0.0
+        self._taken, self._spent = taken, spent
         self._first_step = 0
         self._latest: tuple[Agent, int] | None = None
         self._shown_step = -1
@@ -318,8 +328,9 @@ class ProgressBar:
             self._bar.stop()
 
     def _start(self, agent: Agent, progress: Progress, now: float) -> None:
-        self._first_step = step_before(agent, progress, self.n_steps)
-        self._marks.append(_Mark(self._began, self._first_step, agent.seconds))
+        before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
+        self._first_step = before - self._taken
+        self._marks.append(_Mark(self._began, before, agent.seconds))
         if self._animated:
             self._bar.start()
         else:
@@ -338,8 +349,9 @@ class ProgressBar:
             shares.append(done / self.n_steps)
             left.append((self.n_steps - done) / max(rate, 1e-9))
         if self.seconds is not None:
-            shares.append((now - self._began) / self.seconds)
-            left.append(max(self.seconds - (now - self._began), 0.0))
+            spent_seconds = self._spent + now - self._began
+            shares.append(spent_seconds / self.seconds)
+            left.append(max(self.seconds - spent_seconds, 0.0))
         share = min(max(shares, default=0.0), 1.0)
         text = status(
             done, self.n_steps, rate, _mean(e["r"] for e in agent.ep_info_buffer), _mean(agent.ep_success_buffer),

@@ -328,7 +328,8 @@ class Agent(ABC):
         if progress_bar:
             from rejeu.callbacks import ProgressBar
 
-            bar = ProgressBar(call.n_steps, call.seconds)
+            taken = self._run.step - call.first_step
+            bar = ProgressBar(call.n_steps, call.seconds, taken=taken, spent=call.spent)
             callbacks.append(bar)
         self.interrupted, self.interrupted_by = False, None
         self._run.success_threshold = self.success_threshold
@@ -337,7 +338,8 @@ class Agent(ABC):
             held.callback(self._stop_learning, loggers, bar, own_outputs)
             for saver in savers:
                 held.enter_context(saver.held(self))
-            hooks.begin(self, call.n_steps, {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps})
+            remaining = None if call.last_step is None else call.last_step - self._run.step
+            hooks.begin(self, remaining, {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps})
             self._restore_callbacks()
             try:
                 with Interrupt() as interrupt:
