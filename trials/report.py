@@ -52,8 +52,8 @@ checkpoint, until `SIGKILL` ends it at a random moment, in two lives out of thre
 """
     if peer:
         text += f"""
-Stable-Baselines3 2.9.2, saving model and replay buffer over and over under the same names, as a run that keeps its newest model
-does, killed {peer["kills"]} times: {peer["models_lost"]} models and {peer["replay_buffers_lost"]} replay buffers could not be
+Stable-Baselines3 2.9.2, saving model and replay buffer over and over under the same names, as a run that keeps its newest
+model does, killed {peer["kills"]} times: {peer["models_lost"]} models and {peer["replay_buffers_lost"]} replay buffers could not be
 loaded afterwards ({"; ".join(f"`{error}`" for error in shortened(peer["errors"])) or "no errors"}).
 """
     return text
@@ -128,9 +128,9 @@ def hostile() -> str:
     text = f"""## Hostile and damaged files
 
 What is refused, by our own error alone, within bounded time and memory: files cut short at every byte, files with one bit
-flipped, for every bit, and the corpus of `tests/hostile_files.py` (headers that lie about sizes, overlapping and out-of-range
-places, names given twice, nesting without end, hyper-parameters that are no numbers, unknown classes ...). Files of schema 1 had
-no checksums yet.
+flipped, for every bit, and the corpus of `tests/hostile_files.py` (headers that lie about sizes, overlapping and
+out-of-range places, names given twice, nesting without end, hyper-parameters that are no numbers, unknown classes ...).
+Files of schema 1 had no checksums yet.
 
 {table(("file", "cut short", "one bit flipped", "corpus"), rows)}
 """
@@ -200,8 +200,8 @@ def main() -> None:
     PAGE.write_text(
         f"""# Reliability
 
-What was tried to break runs and files, how often, and what came out. This page is written by `trials/report.py` from the results
-under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the comparisons:
+What was tried to break runs and files, how often, and what came out. This page is written by `trials/report.py` from the
+results under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the comparisons:
 
 ```
 {COMMANDS}
