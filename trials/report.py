@@ -53,8 +53,8 @@ checkpoint, until `SIGKILL` ends it at a random moment, in two lives out of thre
     if peer:
         text += f"""
 Stable-Baselines3 2.9.2, saving model and replay buffer over and over under the same names, as a run that keeps its newest
-model does, killed {peer["kills"]} times: {peer["models_lost"]} models and {peer["replay_buffers_lost"]} replay buffers could not be
-loaded afterwards ({"; ".join(f"`{error}`" for error in shortened(peer["errors"])) or "no errors"}).
+model does, killed {peer["kills"]} times: {peer["models_lost"]} models and {peer["replay_buffers_lost"]} replay buffers could
+not be loaded afterwards ({"; ".join(f"`{error}`" for error in shortened(peer["errors"])) or "no errors"}).
 """
     return text
 
@@ -201,7 +201,8 @@ def main() -> None:
         f"""# Reliability
 
 What was tried to break runs and files, how often, and what came out. This page is written by `trials/report.py` from the
-results under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the comparisons:
+results under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the
+comparisons:
 
 ```
 {COMMANDS}
