@@ -3,10 +3,12 @@
 Every compiled update says whether what it left is finite (:func:`all_finite`), beside its metrics, and the loop looks
 one turn later, when it waits for the device anyway. So that the culprit can be named then, a :class:`Watch` keeps a
 copy of the state from some updates ago and what went into each update since: from these the state before the one
-that broke is made again, bit for bit, and the agent is left in it. That costs one copy in :data:`STRETCH` updates,
-where a guard in every update would cost some per cent.
+that broke is made again, bit for bit, and the agent is left in it. It also lets the update pass over large arrays, of
+weights between wide layers: what is not finite there makes the next loss so, and the first update to blame is looked for
+among those that are kept.
 
-With ``nonfinite="skip"`` an update that breaks something is undone on the device at once, and counted.
+With ``nonfinite="skip"`` an update that breaks something is undone on the device at once, and counted. It looks at large
+arrays too.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ MOST_SKIPPED = 100
 """Skipped updates in a row after which it is an error all the same: nothing is being learnt."""
 PREFIX = "nonfinite_batch_"
 """Of the files with offending batches."""
-WIDTH = 16
+WIDTH, FEW = 16, 256
 
 
 def parse(value: Any) -> Nonfinite:
@@ -76,32 +78,34 @@ def is_loss(name: str) -> bool:
     return name.endswith("loss")
 
 
-def all_finite(vectors: list[Array]) -> Array:
-    """Returns whether every number of every vector is finite, ``bool[]``; vectors of whole numbers are.
+def all_finite(vectors: list[Array], metrics: Metrics) -> Array:
+    """Returns whether every number of every vector, and every loss among the metrics, is finite, ``bool[]``.
 
-    Inside compiled code. ``0 x`` is NaN where x is not finite; sixteen stretches of a vector are summed side by side, since
-    XLA adds up a single one on a CPU number by number.
+    Inside compiled code. ``0 x`` is NaN where x is not finite. Sixteen stretches of a vector are summed side by side, since
+    XLA on a CPU adds up a single one number by number, and what is left of all vectors is looked at together: the fewer
+    kernels the better.
     """
-    left = [_folded(vector.reshape(-1)) for vector in vectors if jnp.issubdtype(vector.dtype, jnp.floating)]
-    return jnp.isfinite(jnp.sum(jnp.concatenate(left))) if left else jnp.bool(True)
+    floats = [vector.reshape(-1) for vector in vectors if jnp.issubdtype(vector.dtype, jnp.floating)]
+    left = [_folded(vector).astype(jnp.float32) for vector in floats]
+    left += [value.reshape(-1) for name, value in metrics.items() if is_loss(name)]
+    if not left:
+        return jnp.bool(True)
+    return jnp.isfinite(jnp.sum(_folded(jnp.concatenate(left)) * jnp.float32(0)))
 
 
 def _folded(x: Array) -> Array:
-    """Returns few numbers that are 0 or NaN: NaN somewhere if and only if ``x`` holds a number that is not finite."""
-    zero = jnp.zeros((), x.dtype)
-    while x.size > 4 * WIDTH:
-        n = x.size // WIDTH
-        total = x[:n] * zero
-        for i in range(1, WIDTH):
-            total = total + x[i * n : (i + 1) * n] * zero
-        x = jnp.concatenate([total, x[WIDTH * n :] * zero])
-    return (x * zero).astype(jnp.float32)
+    """Returns a sixteenth as many numbers, one of which is NaN if ``x`` holds a number that is not finite, else all 0.
 
-
-def losses_finite(metrics: Metrics) -> Array:
-    """Returns whether all losses among the metrics are, over the last axis if they have one, ``bool[]``."""
-    losses = [jnp.isfinite(value).all() for name, value in metrics.items() if is_loss(name)]
-    return jnp.stack(losses).all() if losses else jnp.bool(True)
+    A vector of few numbers comes back as it is.
+    """
+    if x.size <= FEW:
+        return x
+    n, zero = -(-x.size // WIDTH), jnp.zeros((), x.dtype)
+    total = x[:n] * zero
+    for i in range(1, WIDTH):
+        begin = min(i * n, x.size - n)  # the last stretches overlap
+        total = total + x[begin : begin + n] * zero
+    return total
 
 
 def bad_leaves(tree: PyTree) -> list[str]:
@@ -132,13 +136,19 @@ class Stretch:
         """Functions that took the state and these arguments, and returned it, alone or first of a tuple."""
         self.n_updates = 0
 
-    def before(self, i: int) -> PackedState:
-        """Returns the state before the i-th of what was done; uses up ``start``."""
-        state = self.start
-        for function, arguments in self.done[:i]:
+        self.previous: Stretch | None = None
+        """The one before."""
+
+    def first_to_break(self, compiled: Compiled, last: int) -> tuple[PackedState, int]:
+        """Returns the first thing done, up to number ``last``, that left something not finite, and the state before it."""
+        state = compiled.copy(self.start)
+        for i, (function, arguments) in enumerate(self.done[:last]):
+            before = compiled.copy(state)
             after = function(state, *arguments)
             state = after[0] if isinstance(after, tuple) else after
-        return state
+            if compiled.bad_leaves(state):
+                return before, i
+        return state, last
 
 
 class Unread(NamedTuple):
@@ -199,14 +209,18 @@ class Watch:
             size = sum(leaf.nbytes for leaf in jax.tree.leaves(batches))
             self._most = max(1, min(most, STRETCH_BYTES // max(size, 1)))
         if self._stretch is None or run.state is not self._newest or self._stretch.n_updates >= self._most:
-            self._stretch, self._most = Stretch(compiled.copy(run.state)), most
+            new = Stretch(compiled.copy(run.state))
+            if self._stretch is not None and run.state is self._newest:
+                new.previous, self._stretch.previous = self._stretch, None
+            self._stretch, self._most = new, most
         return self._stretch
 
-    def read(self, run: Run, n: int | None = None) -> None:
+    def read(self, run: Run, compiled: Compiled, n: int | None = None) -> None:
         """Looks at the oldest ``n`` updates (None: all); waits for them.
 
         Raises:
-            Broken: if one of them left numbers that are not finite; ``run.state`` is then what it was before.
+            Broken: if one of them left numbers that are not finite; ``run.state`` is then what it was before, and the
+                running episodes are given up.
         """
         for _ in range(len(self._unread) if n is None else n):
             one = self._unread.popleft()
@@ -215,7 +229,7 @@ class Watch:
                 self._in_a_row = 0
                 continue
             if one.stretch is not None:
-                run.state = one.stretch.before(one.place)
+                one = self._culprit(run, compiled, one)
             else:
                 self.n_skipped += n_bad
                 self._in_a_row += n_bad
@@ -225,7 +239,20 @@ class Watch:
             self._unread.clear()
             self._stretch = self._newest = None
             run.td_errors = []
+            run.obs = run.action = None  # what has been chosen since is not to be relied on: new episodes
             raise Broken(one.batches, one.clock, in_a_row)
+
+    @staticmethod
+    def _culprit(run: Run, compiled: Compiled, one: Unread) -> Unread:
+        """Returns the first update to blame for what ``one`` found, and puts the state before it into ``run``."""
+        stretch, last = one.stretch, one.place
+        assert stretch is not None
+        if stretch.previous is not None and compiled.bad_leaves(stretch.start):
+            stretch = stretch.previous
+            last = len(stretch.done) - 1
+        run.state, place = stretch.first_to_break(compiled, last)
+        _, arguments = stretch.done[place]
+        return one._replace(batches=arguments[0], clock=arguments[1])
 
 
 class Found(NamedTuple):
@@ -256,7 +283,7 @@ def settle(agent: Agent) -> None:
         NonFiniteError: if one of them left numbers that are not finite.
     """
     try:
-        agent._run.watch.read(agent._run)
+        agent._run.watch.read(agent._run, agent._compiled)
     except Broken as broken:
         raise reported(agent, broken) from None
 
@@ -265,10 +292,11 @@ def reported(agent: Agent, broken: Broken) -> NonFiniteError:
     """Saves the batch that broke something and returns the error that says what, where and why."""
     run, compiled, clock = agent._run, agent._compiled, broken.clock
     state, found, batch = agent._compiled.state(run.state), Found([], [], []), broken.batches
-    for one in _one_by_one(broken.batches):
+    for i, one in enumerate(_one_by_one(broken.batches)):
         after, found = effect(compiled, state, one, clock)
         if found:
             batch = one
+            run.state = compiled.pack(state) if i > 0 else run.state
             break
         state = after
     names = [text.split(" ")[0] for text in (*found.losses, *found.leaves)]

@@ -36,7 +36,9 @@ class Compiled:
         self.shapes = jax.eval_shape(algorithm.init, jax.ShapeDtypeStruct((2,), jnp.uint32))
         """The state, of shapes in place of arrays."""
         self._packing = packing = Packing(self.shapes)
-        telling = frozenset(i for i, name in enumerate(names(self.shapes)) if not finite.is_averaged(name))
+        averaged = {i for i, name in enumerate(names(self.shapes)) if finite.is_averaged(name)}
+        passed_over = averaged if skips else {*packing.large}
+        """Large leaves that no update looks at; where none is skipped, the next one finds what broke there by its loss."""
         self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
         self._recall_packer, self._observe_packer = HostPacker(), HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
@@ -69,7 +71,7 @@ class Compiled:
             return packing.pack(algorithm.observe(packing.unpack(state), *plan.unpack(vectors)))
 
         def is_sound(after: PackedState, metrics: Metrics) -> Array:
-            return finite.all_finite(packing.pick(after, telling)) & finite.losses_finite(metrics)
+            return finite.all_finite(packing.without(after, passed_over), metrics)
 
         def learnt(state: PackedState, batch: Transition | Rollout, clock: Clock) -> tuple[PackedState, Metrics, Array]:
             after, metrics = algorithm.update(packing.unpack(state), batch, clock)

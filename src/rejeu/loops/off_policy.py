@@ -111,7 +111,7 @@ def off_policy(
                 run.td_errors.append(td_error)
         run.n_updates += n_updates
         run.action = np.asarray(chosen)
-        run.watch.read(run, n_before)  # the actions came after them
+        run.watch.read(run, compiled, n_before)  # the actions came after them
         t7 = time.perf_counter()
         run.seconds["env"] += (t1 - t0) + (t3 - t2)
         run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)

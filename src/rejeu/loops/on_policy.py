@@ -68,7 +68,7 @@ def on_policy(
     while last is None or run.step < last:
         t0 = time.perf_counter()
         run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
-        run.watch.read(run)  # while the rollout that it learnt from still stands
+        run.watch.read(run, compiled)  # while the rollout that it learnt from still stands
         rollout.observe(run.obs)
         t1 = time.perf_counter()
         stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0

@@ -54,19 +54,10 @@ class Packing:
         vectors = [concatenate([leaves[i].reshape(-1) for i in group]) for group in self.groups]
         return vectors + [leaves[i] for i in self.large]
 
-    def pick(self, arrays: list[Array], wanted: Container[int]) -> list[Array]:
-        """Returns the parts of :meth:`pack`'s vectors that hold the ``wanted`` leaves, in as few pieces as they lie."""
-        pieces = []
-        for vector, group, ends in zip(arrays, self.groups, self.ends, strict=False):
-            runs: list[list[int]] = []
-            for i, begin, end in zip(group, [0, *ends], ends, strict=False):
-                if i in wanted and runs and runs[-1][1] == begin:
-                    runs[-1][1] = end
-                elif i in wanted:
-                    runs.append([begin, end])
-            pieces += [vector[begin:end] for begin, end in runs]
+    def without(self, arrays: list[Array], unwanted: Container[int]) -> list[Array]:
+        """Returns :meth:`pack`'s arrays without the large ones among the ``unwanted`` leaves."""
         large = zip(self.large, arrays[len(self.groups) :], strict=True)
-        return pieces + [array for i, array in large if i in wanted]
+        return arrays[: len(self.groups)] + [array for i, array in large if i not in unwanted]
 
     def unpack(self, arrays: list[Any]) -> PyTree:
         """Returns the tree again: the inverse of :meth:`pack`."""
