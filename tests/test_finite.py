@@ -18,9 +18,11 @@ from rejeu.algorithms import sac
 from rejeu.core import Rollout
 from rejeu.envs.vector import InProcess
 from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
+from rejeu.loops import watch
 from rejeu.loops.packing import Readings
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.ring import Ring
+from rejeu.replay.rollout import RolloutBuffer
 from rejeu.running_stats import merged, nothing
 from rejeu.spaces import Leaf
 from tests.environments import Counter, Reach, Sampled
@@ -91,7 +93,7 @@ def replace_update(agent, which, instead):
 def poison(agent, which, value):
     """Puts ``value`` into a reward of the ``which``-th sample or rollout, so that what is saved is what was learnt from."""
     buffer, calls = agent._run.replay, []
-    name = "rollout" if hasattr(buffer, "rollout") else "sample"
+    name = "rollout" if isinstance(buffer, RolloutBuffer) else "sample"
     method = getattr(buffer, name)
 
     def poisoned(*arguments):
@@ -193,7 +195,7 @@ LEAVES = {
 def test_a_weight_between_wide_layers_is_found_by_the_next_loss_and_yet_its_own_batch_is_named(monkeypatch, tmp_path):
     """The device passes over arrays of more than 8,192 numbers; from what was kept the first to blame is found."""
     monkeypatch.setattr(sac, "make", broken_at(lambda s: s.critics.torso.layers[1].weight))
-    for which in (4, finite.STRETCH - 1):  # in the midst of a stretch, and the last of one
+    for which in (4, watch.STRETCH - 1):  # in the midst of a stretch, and the last of one
         agent = rejeu.SAC("MlpPolicy", box(), **{**OFF, "policy_kwargs": {"net_arch": [100, 100]}})
         agent.report_folder = tmp_path
         poison(agent, which, 100.0)

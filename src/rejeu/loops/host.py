@@ -18,8 +18,8 @@ from jax import Array
 from rejeu.core import Clock, PyTree
 from rejeu.envs.vector import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError, NonFiniteError
-from rejeu.finite import Watch
 from rejeu.loops.compiled import Compiled, PackedState
+from rejeu.loops.watch import Watch
 from rejeu.spaces import leaves
 
 VDOT_SIZE = 2**13
