@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -133,3 +134,19 @@ def test_without_a_seed_one_is_drawn_and_kept():
     one, two = small_sac(Counter(), seed=None), small_sac(Counter(), seed=None)
     assert one.seed != two.seed
     assert_same_parameters(one, small_sac(Counter(), seed=one.seed))
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_actions_follow_the_newest_update_unless_they_overlap_with_it(overlap):
+    agent = rejeu.DDPG(
+        "MlpPolicy",
+        gym.make("Pendulum-v1"),
+        overlap=overlap,
+        learning_starts=8,
+        batch_size=4,
+        learning_rate=1e-2,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    ).learn(30)
+    newest = np.asarray(agent._compiled.exploit(agent._run.state, agent._run.obs))
+    assert (newest == agent._run.action).all() == (not overlap)

@@ -75,6 +75,9 @@ class OffPolicyConfig:
     nonfinite: finite.Nonfinite = "stop"
     """What to do when an update leaves a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
     it and saves the batch, or ``"skip"`` that update as if its batch had never been drawn, and count it."""
+    overlap: bool = True
+    """Step the environments while the newest update is computed: an action then follows the update of the step before the
+    last, in a fixed order, so that runs repeat exactly. False waits for the newest weights before every action; slower."""
     policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
     (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``) or a ``torso`` of your
@@ -105,6 +108,8 @@ class OffPolicyConfig:
             )
         put("action_noise", action_noises.parse(self.action_noise))
         put("n_steps", whole("n_steps", self.n_steps, least=1))
+        if not isinstance(self.overlap, bool):
+            raise ValueError(f"overlap={self.overlap!r} must be True or False")
         if self.priorities is not None:
             put("priorities", nested("priorities", PriorityConfig, self.priorities))
         if self.frame_stack is not None:

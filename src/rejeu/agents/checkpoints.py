@@ -107,7 +107,7 @@ class Checkpoint:
 
     >>> import rejeu, tempfile
     >>> folder = tempfile.mkdtemp()
-    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=0, buffer_size=1000)
+    >>> agent = rejeu.SAC("MlpPolicy", "rejeu/Ball-v0", seed=0, buffer_size=1000)
     >>> stop = lambda agent, progress: progress.step < 150
     >>> _ = agent.learn(300, [Checkpoint(folder, every=100), stop])
     >>> rejeu.SAC.resume(folder).learn().num_timesteps

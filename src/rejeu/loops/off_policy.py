@@ -11,7 +11,8 @@ all environments::
     the actions are read     while it begins
 
 So the environments never wait for the gradient nor the gradient for them, and yet every number depends on the seed
-alone: the action at a step always follows the update of the step before the last.
+alone: the action at a step always follows the update of the step before the last. With ``overlap=False`` actions are asked
+for after the update is queued, and wait for it.
 """
 
 from __future__ import annotations
@@ -97,7 +98,8 @@ def off_policy(
         sizes = chunks(n_updates, per_turn)
         t4 = time.perf_counter()
         clock = clock_of(run, done)
-        chosen = choose_or_draw(run, compiled, config, clock)
+        if config.overlap:
+            chosen = choose_or_draw(run, compiled, config, clock)
         t5 = time.perf_counter()
         shapes = [(config.batch_size,) if size == 1 else (size, config.batch_size) for size in sizes]
         samples = [run.replay.sample(run.rng, shape, done) for shape in shapes]
@@ -110,6 +112,8 @@ def off_policy(
             if td_error is not None:
                 run.td_errors.append(td_error)
         run.n_updates += n_updates
+        if not config.overlap:
+            chosen = choose_or_draw(run, compiled, config, clock)
         run.action = np.asarray(chosen)
         run.watch.read(run, compiled, n_before)  # the actions came after them
         t7 = time.perf_counter()
