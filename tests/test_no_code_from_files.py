@@ -49,6 +49,7 @@ ALLOWED = {
     # The names of the fields of our own dataclasses, and settings that a class lists in its own source.
     "agents/base.py": {"getattr"},
     "agents/checkpoints.py": {"getattr"},
+    "agents/resuming.py": {"getattr"},
     "callbacks.py": {"getattr"},
     "cli/run_folder.py": {"getattr"},
     "envs/state.py": {"getattr"},

@@ -22,11 +22,12 @@ import jax
 import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, finite, spaces, summary
-from rejeu.agents import checkpoints, files
+from rejeu.agents import files, resuming
 from rejeu.agents.call import Call
-from rejeu.agents.checkpoints import Checkpoint, Resumed, RowFiles
+from rejeu.agents.checkpoints import Checkpoint, RowFiles
 from rejeu.agents.files import AGENT_ARGUMENTS
 from rejeu.agents.loading import whole_seed
+from rejeu.agents.resuming import Resumed
 from rejeu.envs.auto_reset import AutoResetView, around
 from rejeu.envs.masks import split
 from rejeu.envs.vec_env import VecEnv
@@ -411,7 +412,7 @@ class Agent(ABC):
         """Gives callbacks what they remembered when the run was saved, once."""
         saved, self._saved_callbacks = self._saved_callbacks, None
         if saved is not None:
-            checkpoints.restore_callbacks(self._callbacks, saved)
+            resuming.restore_callbacks(self._callbacks, saved)
 
     def _record(self, episode: Episode) -> None:
         self.history.append(episode)
@@ -758,7 +759,7 @@ class Agent(ABC):
             FileNotFoundError: if there is no checkpoint.
             CheckpointError: if the checkpoints are damaged, or of another algorithm or environment.
         """
-        return checkpoints.resume(cls, Path(folder), env, changes)
+        return resuming.resume(cls, Path(folder), env, changes)
 
     def _stand(self, vector: VectorEnv | None, state: Any, counters: dict[str, int], rng: dict[str, int]) -> None:
         """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""

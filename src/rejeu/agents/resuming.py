@@ -1,0 +1,260 @@
+"""The agent of a run's newest checkpoint, standing where it stood; whatever the files hold, nothing else comes of them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rejeu import checkpoint, plain, spaces
+from rejeu.agents import files, loading
+from rejeu.agents.call import Call
+from rejeu.agents.checkpoints import PER_ENV, ROWS_FILE, SCALARS, RowFiles, run_files
+from rejeu.config import number, whole
+from rejeu.core import PyTree
+from rejeu.envs import state as env_state
+from rejeu.envs.vector import BACKENDS, Backend, VectorEnv
+from rejeu.errors import CheckpointError
+from rejeu.loops.host import Run
+from rejeu.loops.packing import Readings
+from rejeu.replay.rollout import RolloutBuffer
+
+if TYPE_CHECKING:
+    from rejeu.agents.base import Agent
+
+A = TypeVar("A", bound="Agent")
+
+MOST_ENVS = 4096
+"""More environments than so many are not made because a file says so."""
+
+
+class Resumed(NamedTuple):
+    """Where a run was taken up again."""
+
+    step: int
+    """Environment steps that had been taken."""
+    exact: bool
+    """Whether the environments go on where they stood too, so that the run is the same as without a break."""
+    reason: str
+    """Why not, in words; empty where it is exact."""
+
+    def __str__(self) -> str:
+        where = "exactly where it stood" if self.exact else f"at the start of new episodes: {self.reason}"
+        return f"resumed at step {self.step:,}, {where}"
+
+
+def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
+    """Returns the agent of the newest checkpoint that is whole; see :meth:`Agent.resume`."""
+    found = run_files(folder)
+    if not found:
+        raise FileNotFoundError(f"there is no checkpoint in {folder}")
+    for i, path in enumerate(found):
+        try:
+            return _resume(cls, path, env, dict(changes))
+        except CheckpointError as error:
+            if i + 1 == len(found):
+                raise
+            warnings.warn(f"{error}; going on from the checkpoint before it", UserWarning, stacklevel=3)
+    raise AssertionError
+
+
+def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
+    header, arrays = checkpoint.read(path, "run")
+    state = {name[6:]: array for name, array in arrays.items() if name.startswith("state.")}
+
+    def make_env(agent: Agent) -> VectorEnv:
+        if env is None:
+            env_id, n_envs, backend = environment(path, header)
+            vector = agent._vector(env_id, n_envs, backend, agent.seed)
+        else:
+            vector = agent._vector(env, seed=agent.seed)
+        if vector.n_envs != header.get("n_envs"):
+            raise CheckpointError(f"the run had {header.get('n_envs')} environments, and {vector.n_envs} are given")
+        return vector
+
+    agent = files.load(cls, path, header, state, make_env, changes)
+    try:
+        saved = plain.decode(header["run"], arrays)
+        rows = [_rows_name(name) for name in header["rows"]]
+        parts = [checkpoint.read(path.parent / name, "rows")[1] for name in rows]
+        restore(agent, saved, parts, {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}, path)
+        agent._run_id, agent._own_env = text(header["run_id"]), env is None
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
+    except CheckpointError:
+        raise
+    except loading.WRONG as error:
+        raise CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {loading.brief(error)}") from error
+    if parts:
+        ring = agent._run.replay.ring
+        heads = [part["head"] for part in parts]
+        agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
+    assert agent.resumed is not None
+    if not agent.resumed.exact:
+        warnings.warn(str(agent.resumed), UserWarning, stacklevel=4)
+    return agent
+
+
+def _rows_name(name: Any) -> str:
+    if not isinstance(name, str) or not ROWS_FILE.fullmatch(name):
+        raise CheckpointError(f"{str(name)[:40]!r} is no file of rows")
+    return name
+
+
+def environment(path: Path, header: dict[str, Any]) -> tuple[str, int, Backend]:
+    """Returns id, number and backend of the environments that a run had.
+
+    Raises:
+        CheckpointError: if the checkpoint does not say, or they were not made from an id.
+    """
+    env_id, n_envs, backend = header.get("env_id"), header.get("n_envs"), header.get("backend")
+    if not isinstance(env_id, str) or backend not in BACKENDS or type(n_envs) is not int or not 0 < n_envs <= MOST_ENVS:
+        raise CheckpointError(f"{path} does not say which environments the run had; give them: resume(folder, env=...)")
+    if not header.get("own_env") or ":" in env_id:  # a colon would let Gymnasium import what stands before it
+        raise CheckpointError(
+            f"the run was given an environment, {env_id[:60]!r}, that no file can hold; give it again: "
+            "resume(folder, env=...)"
+        )
+    return env_id, n_envs, backend
+
+
+def restore(
+    agent: Agent, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
+) -> None:
+    """Puts an agent that was loaded from the same checkpoint where its run stood.
+
+    Raises:
+        LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
+    """
+    run, compiled = agent._run, agent._compiled
+    for key in SCALARS:
+        setattr(run, key, whole(key, saved[key], least=0))
+    n_envs = run.env.n_envs
+    run.rng.bit_generator.state = saved["rng"]
+    run.carry = like(compiled.initial_carry(n_envs), saved["carry"], "carry")
+    if saved["metrics"] is not None:
+        metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved["metrics"].items()}
+        run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
+    run.watch.n_skipped = whole("n_skipped", saved["n_skipped"], least=0)
+    run.td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved["td_errors"]]
+    run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
+    for key in PER_ENV:
+        setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
+    restore_buffer(run, saved["buffer"], rows, compiled.initial_carry(n_envs))
+    if saved["envs"] is not None:
+        put_envs_back(run, saved)
+    elif saved["seed"] is not None:
+        run.seed = loading.whole_seed(saved["seed"])
+    agent.history.replace(saved["history"])
+    agent._fill_windows()
+    if saved["best"] is not None:
+        packed = compiled.pack(checkpoint.arrays_to_tree(compiled.shapes, best, path))
+        agent._put_best(saved["best"]["score"], text(saved["best"]["by"]), int(saved["best"]["step"]), packed)
+    values, counts = saved["logger"]
+    agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
+    agent.logger._counts = {key: whole(key, value, least=0) for key, value in counts.items()}
+    agent._n_predictions = whole("n_predictions", saved["n_predictions"], least=0)
+    agent._call = None if saved["call"] is None else Call.from_json(saved["call"])
+    agent._saved_callbacks = [(text(name), state) for name, state in saved["callbacks"]]
+    statistics = agent.get_vec_normalize_env()
+    if statistics is not None and saved["vec_normalize"] is not None:
+        statistics.put_statistics(saved["vec_normalize"])
+    agent.resumed = Resumed(run.step, not text(saved["reason"]), saved["reason"])
+
+
+def put_envs_back(run: Run, saved: dict[str, Any]) -> None:
+    """Lets the environments stand where they stood, with the observations and the actions that were chosen there."""
+    n_envs = run.env.n_envs
+    for key in PER_ENV:
+        if len(getattr(run, key)) not in (n_envs, 0):
+            raise ValueError(f"{key} is not of {n_envs} environments")
+    held = run.replay if isinstance(run.replay, RolloutBuffer) else run.replay.ring
+    parts = zip(saved["obs"], held.obs_leaves, strict=True)
+    obs = jax.tree.unflatten(
+        held.obs_structure, [exactly(part, (n_envs, *leaf.shape), leaf.dtype, "obs") for part, leaf in parts]
+    )
+    env_state.put_back(run.env, saved["envs"], obs)
+    run.obs = obs
+    if saved["action"] is not None:
+        expected = np.asarray(spaces.random_action(run.env.action_space, n_envs, np.random.default_rng(0)))
+        run.action = exactly(saved["action"], expected.shape, expected.dtype, "action")
+
+
+def restore_buffer(run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], carry: PyTree) -> None:
+    """Puts the experience of a run back; ``carry`` is what exploration remembers, for its form."""
+    buffer = run.replay
+    if isinstance(buffer, RolloutBuffer):
+        buffer.restore(saved["rollout"])
+        buffer.started = exactly(saved["started"], (buffer.n_envs,), np.dtype(bool), "started")
+        buffer.carry = like(carry, saved["carry"], "carry") if buffer.length or saved["carry"] else ()
+        return
+    buffer.ring.put_rows(rows)
+    if not np.array_equal(buffer.ring.head, saved["heads"]):
+        raise ValueError("rows of the replay buffer are missing")
+    if buffer.priorities is not None:
+        buffer.priorities.restore(saved["priorities"])
+        if [error.size for error in run.td_errors] != [len(index) for index, _ in saved["priorities"]["drawn"]]:
+            raise ValueError("the TD errors under way are not those of the steps that were drawn")
+
+
+def text(value: Any) -> str:
+    """Returns a text of a file.
+
+    Raises:
+        TypeError: if it is none.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"expected a text, got {type(value).__name__}")
+    return value
+
+
+def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
+    """Returns a tree of the form of ``expected`` with the given leaves.
+
+    Raises:
+        ValueError: if shapes or dtypes differ.
+    """
+    parts = jax.tree.leaves(expected)
+    return jax.tree.unflatten(
+        jax.tree.structure(expected),
+        [jnp.asarray(exactly(g, e.shape, np.dtype(e.dtype), name)) for g, e in zip(given, parts, strict=True)],
+    )
+
+
+def exactly(array: Any, shape: tuple[int, ...], dtype: Any, name: str) -> np.ndarray:
+    """Returns an array of a file.
+
+    Raises:
+        ValueError: if its shape or dtype is another than expected.
+    """
+    if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != dtype:
+        found = f"{array.dtype}{list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{name} is {found}, expected {np.dtype(dtype)}{list(shape)}")
+    return array.copy()
+
+
+def restore_callbacks(callbacks: Sequence[Any], saved: Sequence[Any]) -> None:
+    """Gives callbacks what those of the same kind remembered when the run was saved, in order.
+
+    Those for which nothing was saved begin anew, with a warning, and what was saved for others is passed over likewise.
+    """
+    left = [(name, state) for name, state in saved]
+    for one in callbacks:
+        name = type(one).__name__
+        match = next((entry for entry in left if entry[0] == name), None)
+        if match is None:
+            warnings.warn(f"the run was saved without a {name}; it begins anew", UserWarning, stacklevel=4)
+            continue
+        left.remove(match)
+        try:
+            one.load_state_dict(match[1])
+        except loading.WRONG as error:
+            raise CheckpointError(f"what {name} remembered is damaged: {loading.brief(error)}") from error
+    if left:
+        names = ", ".join(name for name, _ in left)
+        warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=4)
