@@ -454,25 +454,41 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
     def of(name: str, change: Callable[[dict, dict], Any]) -> Variant:
         return Variant("buffer", name, changed(content, change))
 
+    arrays = take_apart(content).arrays
+    # Where a full ring begins is for its file to say: with the newest row elsewhere it is another ring, and whole.
+    is_full = (arrays["head"] >= arrays["kind"].shape[1]).all()
     for name in ("head", "n_steps"):
         for value in (-2, -1, 0, 10**6, 2**62, 2**63 - 1, -(2**63)):
-            yield of(f"{name} {value}", lambda h, a, n=name, v=value: a[n].fill(v))
+            if (name, value) != ("head", 10**6) or not is_full:
+                yield of(f"{name} {value}", lambda h, a, n=name, v=value: a[n].fill(v))
         yield of(f"{name} of nothing", lambda h, a, n=name: a.update({n: a[n][:0]}))
         yield of(f"{name} of more", lambda h, a, n=name: a.update({n: np.repeat(a[n], 2)}))
-    for name, value in (
-        ("kind", 3),
-        ("kind", 255),
-        ("since_start", 10**6),
-        ("since_start", -1),
-        ("until_end", 10**6),
-        ("until_end", -1),
-    ):
-        yield of(f"{name} {value}", lambda h, a, n=name, v=value: a[n].fill(v))
+    for value in (3, 255):
+        yield of(f"kind {value}", lambda h, a, v=value: a["kind"].fill(v))
+    # What older files count for every row, and newer ones leave out.
+    for name in ("since_start", "until_end"):
+        for value in (10**6, 2**31 - 1, -1, -(2**31)):
+            yield of(f"{name} {value}", lambda h, a, n=name, v=value: a.update({**counters(a), n: counters(a)[n] + v}))
+        yield of(f"{name} alone", lambda h, a, n=name: only_counter(a, n))
+        yield of(f"{name} wide", lambda h, a, n=name: a.update({**counters(a), n: counters(a)[n].astype(np.int64)}))
+        yield of(f"{name} flat", lambda h, a, n=name: a.update({**counters(a), n: counters(a)[n].ravel()}))
     for name in ("reward", "action"):
         yield of(f"{name} not finite", lambda h, a, n=name: a[n].fill(np.nan))
-    for name in take_apart(content).arrays:
+    for name in arrays:
         yield of(f"{name} gone", lambda h, a, n=name: a.pop(n))
         yield of(f"{name} shorter", lambda h, a, n=name: a.update({n: a[n][:, :-1] if a[n].ndim > 1 else a[n][:-1]}))
+
+
+def counters(arrays: dict) -> dict[str, np.ndarray]:
+    """Returns what older replay files count for every row: zeros, which are no lie."""
+    return {name: np.zeros(arrays["kind"].shape, np.int32) for name in ("since_start", "until_end")}
+
+
+def only_counter(arrays: dict, name: str) -> None:
+    """Leaves but one of the two counters in a file."""
+    for other in counters(arrays):
+        arrays.pop(other, None)
+    arrays[name] = counters(arrays)[name]
 
 
 def flipped(content: bytes, bit: int) -> bytes:

@@ -6,6 +6,7 @@ checked. The model knows nothing of rings: what is kept is simply the end of the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,8 +122,11 @@ def observe_goal(n_envs: int, places: list[int]) -> Any:
     return {"observation": where, "achieved_goal": where, "desired_goal": np.full((n_envs, 2), -1.0, np.float32)}
 
 
-def make_ring(capacity: int, n_envs: int, space: gym.Space = OBSERVATION) -> Ring:
-    return Ring(capacity, n_envs, spaces.leaves(space), spaces.structure(space), (1,), np.float32)
+def make_ring(
+    capacity: int, n_envs: int, space: gym.Space = OBSERVATION, counters: Sequence[str] = (), n_actions: int = 1
+) -> Ring:
+    leaves, structure = spaces.leaves(space), spaces.structure(space)
+    return Ring(capacity, n_envs, leaves, structure, (n_actions,), np.float32, counters=counters)
 
 
 def play(replay: Any, model: Model, history: list[Turn], observe_function: Any = observe, seed: int = 0) -> None:

@@ -184,7 +184,7 @@ def test_samples_are_kept_at_once_and_resumed_and_errors_tried_again(tmp_path):
     kept, failed, measured = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     assert kept == header
     assert "nonsense" in failed["error"]
-    assert measured["result"]["nbytes"] == 96 * 1000  # 85 necessary bytes, 8 of the step's place, 3 of alignment
+    assert measured["result"]["nbytes"] == 89 * 1000  # 85 necessary bytes, and 4 for the steps until the end
     assert len(measured["calibration_ms"]) == 2
     again = runner.Samples(path, header, resume=True)
     assert again.has(good.key, "", 0)
@@ -258,15 +258,15 @@ def test_the_count_of_an_update_is_that_by_hand_and_what_is_elementwise():
 def test_the_benchmarks_full_ring_is_one_that_episodes_would_have_made():
     from rejeu.replay.ring import Ring
 
-    ring = buffers.rejeu_ring("pendulum", 505)
-    played = Ring(505, 1, ring.obs_leaves, ring.obs_structure, (1,), np.float32)
+    ring = buffers.rejeu_ring("parking", 505)
+    played = Ring(505, 1, ring.obs_leaves, ring.obs_structure, (2,), np.float32, counters=("until_end",))
+    obs = {leaf.path: np.zeros((1, 6), np.float32) for leaf in ring.obs_leaves}
     for _ in range(5):
-        played.begin(np.zeros((1, 3), np.float32))
+        played.begin(obs)
         for _ in range(buffers.EPISODE):
-            zero = np.zeros(1, np.float32)
-            played.add(np.zeros((1, 1), np.float32), zero, np.zeros(1, bool), np.zeros((1, 3), np.float32))
+            played.add(np.zeros((1, 2), np.float32), np.zeros(1, np.float32), np.zeros(1, bool), obs)
         played._close(0)
-    for name in ("kind", "since_start", "until_end", "head", "n_steps"):
+    for name in ("kind", "until_end", "head", "n_steps", "start"):
         np.testing.assert_array_equal(getattr(ring, name), getattr(played, name), err_msg=name)
 
 

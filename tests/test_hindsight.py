@@ -6,12 +6,13 @@ sampled goal tells where it was taken from.
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
-from rejeu.replay.hindsight import GoalFunctions, GoalSelectionStrategy, HerReplayBuffer, HindsightConfig
+from rejeu.replay.hindsight import GoalFunctions, GoalSelectionStrategy, HerReplayBuffer, HindsightConfig, counters
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from tests.replay_model import GOAL_OBSERVATION, Model, Turn, make_ring, observe_goal, play, turns
 
@@ -29,11 +30,12 @@ def terminated(achieved, desired):
 
 
 def filled(n_envs, rows, history, strategy="future", k=4, n_steps=1, ends=False, priorities=False):
-    ring = make_ring(rows * n_envs, n_envs, GOAL_OBSERVATION)
+    config = HindsightConfig(n_sampled_goal=k, goal_selection_strategy=strategy)
+    ring = make_ring(rows * n_envs, n_envs, GOAL_OBSERVATION, counters(config))
     replay = HerReplayBuffer(
         ring,
         GAMMA,
-        HindsightConfig(n_sampled_goal=k, goal_selection_strategy=strategy),
+        config,
         GoalFunctions(reward, terminated if ends else None),
         n_steps,
         Priorities(ring, PriorityConfig()) if priorities else None,
@@ -201,14 +203,34 @@ def test_the_buffer_itself_keeps_the_original_goals():
         np.testing.assert_array_equal(array, before[name])
 
 
-def test_a_restored_buffer_relabels_like_the_original():
-    replay, _ = filled(1, 16, RUNNING_AND_WRAPPED)
-    other = HerReplayBuffer(make_ring(16, 1, GOAL_OBSERVATION), GAMMA, replay.config, replay.goals)
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_restored_buffer_relabels_like_the_original(strategy):
+    replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, strategy)
+    ring = make_ring(16, 1, GOAL_OBSERVATION, counters(replay.config))
+    other = HerReplayBuffer(ring, GAMMA, replay.config, replay.goals)
     other.restore(replay.arrays())
     one, two = (buffer.sample(np.random.default_rng(2), (40,)) for buffer in (replay, other))
     for key in GOAL_OBSERVATION:
         np.testing.assert_array_equal(one.obs[key], two.obs[key])
     np.testing.assert_array_equal(one.reward, two.reward)
+
+
+def test_a_ring_without_the_counters_of_the_strategy_is_refused():
+    config = HindsightConfig(goal_selection_strategy="episode")
+    for kept, lacking in (((), "since_start and until_end"), (("until_end",), "since_start")):
+        with pytest.raises(ValueError, match=f"'episode' needs a ring that keeps {lacking}; make it with Ring"):
+            HerReplayBuffer(make_ring(8, 1, GOAL_OBSERVATION, kept), GAMMA, config, GoalFunctions(reward))
+
+
+@pytest.mark.parametrize(("strategy", "n_counters"), [("random", 0), ("future", 1), ("final", 1), ("episode", 2)])
+def test_a_row_takes_what_the_strategy_needs(strategy, n_counters):
+    """Observations like parking-v0's: 18 numbers, two actions and a reward of 4 bytes each, and one byte for the kind."""
+    box = gym.spaces.Box(-np.inf, np.inf, (6,), np.float64)
+    space = gym.spaces.Dict(observation=box, achieved_goal=box, desired_goal=box)
+    ring = make_ring(1000, 2, space, counters(HindsightConfig(goal_selection_strategy=strategy)), n_actions=2)
+    needed = 1000 * (4 * (18 + 2 + 1) + 1)
+    assert ring.nbytes == needed + 1000 * 4 * n_counters
+    assert strategy == "episode" or ring.nbytes < 1.05 * needed
 
 
 @pytest.mark.parametrize("strategy", [*STRATEGIES, *GoalSelectionStrategy])

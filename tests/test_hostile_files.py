@@ -16,18 +16,24 @@ from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
 from tests.environments import Counter
 from tests.golden import record_files
-from tests.test_schemas import FOLDERS
+from tests.test_schemas import FOLDERS, WITHOUT_COUNTERS
 
 SECONDS = 2.0
 """Longest that any file may take."""
 MEGABYTES = 64
 """Most memory that any file may take, beyond what was in use."""
-FILES = {"agent": "sac", "replay": "replay", "vec_normalize": "vec_normalize"}
-"""A valid file of each kind."""
-CONTENTS = {kind: (FOLDERS[-1] / f"{name}.safetensors").read_bytes() for kind, name in FILES.items()}
+FILES = {
+    "agent": FOLDERS[-1] / "sac",
+    "replay": WITHOUT_COUNTERS / "replay",
+    "replay with counters": FOLDERS[-1] / "replay",
+    "vec_normalize": FOLDERS[-1] / "vec_normalize",
+}
+"""A valid file of each kind, which is the first word."""
+CONTENTS = {kind: path.with_suffix(".safetensors").read_bytes() for kind, path in FILES.items()}
 SPECIAL = {
     "agent": hostile_files.bad_models,
     "replay": hostile_files.bad_buffers,
+    "replay with counters": hostile_files.bad_buffers,
     "vec_normalize": hostile_files.bad_statistics,
 }
 
@@ -47,7 +53,8 @@ def loaders():
     def state():
         return {**agent.replay_buffer.arrays(), **agent.get_parameters()}
 
-    return {"agent": rejeu.load, "replay": load_replay, "vec_normalize": load_statistics}, state
+    loaders = {"agent": rejeu.load, "vec_normalize": load_statistics}
+    return loaders | dict.fromkeys(("replay", "replay with counters"), load_replay), state
 
 
 def all_variants(kind):
@@ -133,7 +140,7 @@ def test_a_file_cut_short_at_any_byte_is_refused(kind, tmp_path):
     path.write_bytes(content)
     for length in reversed(range(len(content))):
         os.truncate(path, length)
-        assert attempt(lambda p: checkpoint.read(p, kind), path) == "refused", length
+        assert attempt(lambda p: checkpoint.read(p, kind.split()[0]), path) == "refused", length
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -147,7 +154,7 @@ def test_a_single_bit_that_flips_is_noticed(kind, tmp_path):
             for value in (content[bit // 8] ^ 1 << bit % 8, content[bit // 8]):
                 file.seek(bit // 8)
                 file.write(bytes([value]))
-                outcome = attempt(lambda p: checkpoint.read(p, kind), path)
+                outcome = attempt(lambda p: checkpoint.read(p, kind.split()[0]), path)
                 assert outcome == ("read" if value == content[bit // 8] else "refused"), bit
 
 

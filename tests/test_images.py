@@ -194,7 +194,7 @@ def test_hindsight_finds_the_stacks_too():
         achieved_goal=spaces.Box(-1, 1, (1,)),
         desired_goal=spaces.Box(-1, 1, (1,)),
     )
-    ring = Ring(50, 1, leaves(space), structure(space), (1,), np.float32, 3)
+    ring = Ring(50, 1, leaves(space), structure(space), (1,), np.float32, 3, ("until_end",))
     goals = GoalFunctions(lambda achieved, desired: np.zeros(len(achieved), np.float32))
     buffer = HerReplayBuffer(ring, 0.9, HindsightConfig(), goals)
     film = FrameStackObservation(Film(length=100), 3)
@@ -295,16 +295,15 @@ def test_goals_are_never_taken_for_stacks():
 def test_the_bytes_of_a_ring_are_told(frame_stack):
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
     ring = Ring(100, 2, leaves(space), structure(space), (2,), np.float32, frame_stack)
-    # Per row: the frames; two actions and a reward of 4 bytes; the kind; the steps since the start and until the end;
-    # and 3 bytes so that the next row's numbers begin at a multiple of 4.
-    frames = 4 if frame_stack is None else 1
-    assert ring.nbytes == 100 * (frames * 84 * 84 + 2 * 4 + 4 + 1 + 2 * 4 + 3)
+    # Per row: the frames; two actions and a reward of 4 bytes; the kind; and for stacks the steps since the start.
+    frames, since_start = (4, 0) if frame_stack is None else (1, 4)
+    assert ring.nbytes == 100 * (frames * 84 * 84 + 2 * 4 + 4 + 1 + since_start)
 
 
 def test_a_buffer_that_memory_cannot_hold_is_refused_before_anything_is_reserved(monkeypatch):
     monkeypatch.setattr("os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**20}[name])  # 4 GiB
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
-    per_row = 84 * 84 + 4 + 4 + 1 + 8 + 3
+    per_row = 84 * 84 + 4 + 4 + 1 + 4
     tracemalloc.start()
     try:
         with pytest.raises(MemoryError) as refused:

@@ -54,7 +54,6 @@ ALLOWED = {
     "cli/run_folder.py": {"getattr"},
     "envs/state.py": {"getattr"},
     "hooks.py": {"globals()", "getattr"},
-    "replay/ring.py": {"getattr"},
     "replay/rollout.py": {"getattr"},
     "config.py": {"getattr"},
     "exploration/noise.py": {"getattr"},

@@ -22,8 +22,8 @@ NUMBER = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 GOALS = spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), NUMBER))
 
 
-def ring_of(space: spaces.Space, capacity: int, n_envs: int) -> Ring:
-    return Ring(capacity, n_envs, leaves(space), structure(space), (1,), np.float32)
+def ring_of(space: spaces.Space, capacity: int, n_envs: int, counters: tuple[str, ...] = ()) -> Ring:
+    return Ring(capacity, n_envs, leaves(space), structure(space), (1,), np.float32, counters=counters)
 
 
 class Story:
@@ -70,7 +70,7 @@ def uniform(capacity: int, n_envs: int = 1, n_steps: int = 1, **config) -> Repla
 
 
 def hindsight(capacity: int, n_envs: int = 1, n_steps: int = 1, k: int = 0, **config) -> HerReplayBuffer:
-    ring = ring_of(GOALS, capacity, n_envs)
+    ring = ring_of(GOALS, capacity, n_envs, ("until_end",))
     goals = GoalFunctions(lambda achieved, desired: (achieved == desired)[..., 0].astype(np.float32))
     return HerReplayBuffer(
         ring, 0.9, HindsightConfig(n_sampled_goal=k), goals, n_steps, Priorities(ring, PriorityConfig(**config))

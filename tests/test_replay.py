@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 from rejeu.replay.prioritized import Priorities, PriorityConfig
-from rejeu.replay.ring import check_memory
+from rejeu.replay.ring import COUNTERS, check_memory
 from rejeu.replay.uniform import ReplayBuffer
 from tests.replay_model import Model, Turn, make_ring, observe, play, turns
 
@@ -23,12 +24,22 @@ def histories(draw):
     return n_envs, rows, draw(turns(n_envs))
 
 
-def filled(n_envs, rows, history, n_steps=1, priorities=False):
-    ring = make_ring(rows * n_envs, n_envs)
+def filled(n_envs, rows, history, n_steps=1, priorities=False, counters=()):
+    ring = make_ring(rows * n_envs, n_envs, counters=counters)
     replay = ReplayBuffer(ring, GAMMA, n_steps, Priorities(ring, PriorityConfig()) if priorities else None)
     model = Model(n_envs, rows)
     play(replay, model, history)
     return replay, model
+
+
+def kept_counters(ring):
+    """By environment, of the rows kept in order: steps since the oldest of their episode, and steps until its end."""
+    found = []
+    for env in range(ring.n_envs):
+        times = np.arange(ring.oldest()[env], ring.head[env] + 1)
+        index = ring.index(np.full(len(times), env), times)
+        found.append((np.minimum(ring.since_start[index], times - times[0]).tolist(), ring.until_end[index].tolist()))
+    return found
 
 
 def check_observation(obs, row, env, place):
@@ -69,11 +80,12 @@ def test_samples_are_exactly_the_steps_that_are_kept(case, n_steps, priorities):
 @given(case=histories(), more=turns(2, 10))
 def test_a_restored_buffer_samples_and_grows_like_the_original(case, more):
     n_envs, rows, history = case
-    replay, model = filled(n_envs, rows, history)
+    replay, model = filled(n_envs, rows, history, counters=COUNTERS)
     arrays = {name: array.copy() for name, array in replay.arrays().items()}
-    other = ReplayBuffer(make_ring(rows * n_envs, n_envs), GAMMA)
+    other = ReplayBuffer(make_ring(rows * n_envs, n_envs, counters=COUNTERS), GAMMA)
     other.restore(arrays)
     assert other.size() == replay.size()
+    assert kept_counters(other.ring) == kept_counters(replay.ring)
     for buffer in (replay, other):
         again = Model(n_envs, rows)
         again.frames = [list(frames) for frames in model.frames]
@@ -84,6 +96,26 @@ def test_a_restored_buffer_samples_and_grows_like_the_original(case, more):
         jax.tree.map(np.testing.assert_array_equal, one, two)
     for name, array in replay.arrays().items():
         np.testing.assert_array_equal(array, other.arrays()[name], err_msg=name)
+    assert kept_counters(other.ring) == kept_counters(replay.ring)
+
+
+@settings(max_examples=100)
+@given(case=histories())
+def test_counters_are_those_of_the_episodes(case):
+    replay, model = filled(*case, counters=COUNTERS)
+    for env, (since_start, until_end) in enumerate(kept_counters(replay.ring)):
+        episodes = [model.episode(env, place) for place in model.kept(env)]
+        places = list(model.kept(env))
+        assert since_start == [place - episode[0] for place, episode in zip(places, episodes, strict=True)]
+        closed = [model.frames[env][episode[-1]].closed for episode in episodes]
+        ends = [e[-1] if is_closed else place for place, e, is_closed in zip(places, episodes, closed, strict=True)]
+        assert until_end == [end - place for place, end in zip(places, ends, strict=True)]
+
+
+def test_a_ring_keeps_no_counters_that_nobody_asked_for():
+    bare, one = make_ring(4, 1), make_ring(4, 1, counters=["until_end"])
+    assert (bare.counters, bare.since_start, bare.until_end) == ((), None, None)
+    assert (one.counters, one.since_start) == (("until_end",), None)
 
 
 NO_END = Turn([True] * 2, ["no"] * 2, [False] * 2)
@@ -145,8 +177,28 @@ def test_an_empty_buffer_says_that_it_is_empty():
 def test_capacity_is_shared_among_environments():
     ring = make_ring(10, 3)
     assert ring.rows == 3
-    needed = sum(a.nbytes for a in (*ring.obs, ring.action, ring.reward, ring.kind)) + 9 * 8
-    assert needed <= ring.nbytes < needed + 9 * 8, "a row takes what it holds, and less than 8 bytes of alignment"
+    needed = sum(a.nbytes for a in (*ring.obs, ring.action, ring.reward, ring.kind))
+    assert needed <= ring.nbytes < needed + 9 * 4, "a row takes what it holds, and less than 4 bytes of alignment"
+
+
+def test_a_row_of_pendulum_takes_what_a_transition_needs():
+    """Three observations, an action and a reward of 4 bytes each, and one byte for the kind."""
+    assert make_ring(1000, 4, gym.spaces.Box(-8, 8, (3,), np.float32)).nbytes == 1000 * (4 * (3 + 1 + 1) + 1)
+
+
+def test_priorities_take_sixteen_bytes_a_row_where_their_number_is_a_power_of_two():
+    """A sum tree of float64 has twice as many nodes as leaves, and the next power of two of leaves."""
+    ring = make_ring(1024, 4, gym.spaces.Box(-8, 8, (3,), np.float32))
+    assert ring.nbytes == 1024 * 21
+    assert Priorities(ring, PriorityConfig()).tree.nodes.nbytes == 1024 * 16
+    assert Priorities(make_ring(1025, 1), PriorityConfig()).tree.nodes.nbytes == 2048 * 16
+
+
+def test_small_numbers_leave_no_gaps_between_larger_ones():
+    """9 and 7 bytes around two float32, which would take 12 and 8 in the order of the keys."""
+    boxes = {"a": (9, np.uint8), "b": (2, np.float32), "c": (7, np.uint8)}
+    space = gym.spaces.Dict({key: gym.spaces.Box(0, 255, (n,), dtype) for key, (n, dtype) in boxes.items()})
+    assert make_ring(100, 1, space).nbytes == 100 * (9 + 2 * 4 + 7 + 4 + 4 + 1)
 
 
 def test_memory_beyond_the_machine_is_refused_with_the_numbers():
@@ -167,6 +219,21 @@ def test_arrays_leave_out_rows_that_were_never_written():
     assert ring_arrays["obs.where"].shape == (2, 4, 2)
 
 
+def with_counters(arrays, since_start=0, until_end=0):
+    """The two arrays that older files have beside the others."""
+    fill = lambda value: np.full(arrays["kind"].shape, value, np.int32)  # noqa: E731
+    return {"since_start": fill(since_start), "until_end": fill(until_end)}
+
+
+def test_counters_in_older_files_are_counted_anew(arrays):
+    rings = [make_ring(12, 2, counters=COUNTERS) for _ in range(2)]
+    rings[0].restore(arrays)
+    rings[1].restore(arrays | with_counters(arrays))
+    np.testing.assert_array_equal(rings[0].until_end, rings[1].until_end)
+    np.testing.assert_array_equal(rings[0].since_start, rings[1].since_start)
+    assert rings[0].since_start.any()
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -178,8 +245,12 @@ def test_arrays_leave_out_rows_that_were_never_written():
         (lambda a: a.update(n_steps=a["n_steps"] + 1), "counters are damaged"),
         (lambda a: a.update(kind=np.full_like(a["kind"], 2)), "counters are damaged"),
         (lambda a: a.update(kind=np.full_like(a["kind"], 3)), "counters are damaged"),
-        (lambda a: a.update(since_start=a["since_start"] - 100), "counters are damaged"),
-        (lambda a: a.update(until_end=a["until_end"] + 1000), "counters are damaged"),
+        (lambda a: a.update(with_counters(a, since_start=-1)), "counters are damaged"),
+        (lambda a: a.update(with_counters(a, since_start=100)), "counters are damaged"),
+        (lambda a: a.update(with_counters(a, until_end=-1)), "counters are damaged"),
+        (lambda a: a.update(with_counters(a, until_end=100)), "counters are damaged"),
+        (lambda a: a.update(until_end=with_counters(a)["until_end"]), "differ in the arrays until_end"),
+        (lambda a: a.update(with_counters(a), until_end=np.zeros(3, np.int32)), r"until_end .* expects int32\[2, 6\]"),
         (lambda a: a.update(reward=a["reward"].astype(np.float64)), r"reward .* float64.* expects float32"),
         (lambda a: a.update({"obs.where": a["obs.where"][:, :, :1]}), "another environment or buffer_size"),
         (lambda a: a.update(head=a["head"] + 2**62), "counters are damaged"),
@@ -201,18 +272,21 @@ def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
     n_envs, rows, history = case
     replay, parts, heads = None, [], np.full(n_envs, -1, np.int64)
     for cut in sorted({min(cut, len(history)) for cut in (*cuts, len(history))}):
-        replay, _ = filled(n_envs, rows, history[:cut], priorities=priorities)  # the same up to there, whatever follows
+        # The same up to there, whatever follows.
+        replay, _ = filled(n_envs, rows, history[:cut], priorities=priorities, counters=COUNTERS)
         parts.append({key: np.copy(value) for key, value in replay.ring.rows_since(heads).items()})
         heads = replay.ring.head.copy()
-    other = make_ring(rows * n_envs, n_envs)
+    other = make_ring(rows * n_envs, n_envs, counters=COUNTERS)
     other.put_rows(parts)
+    assert kept_counters(other) == kept_counters(replay.ring)
     expected, found = replay.ring.arrays(), other.arrays()
     kept = [replay.ring.index(np.full(k, e), replay.ring.head[e] - np.arange(k)) for e, k in enumerate(counts(replay))]
     for key in expected:
         if key in ("head", "n_steps"):
             np.testing.assert_array_equal(found[key], expected[key])
-    for store, own in zip((*other.obs, other.records), (*replay.ring.obs, replay.ring.records), strict=True):
-        np.testing.assert_array_equal(store[np.concatenate(kept)], own[np.concatenate(kept)])
+    stores = ([*ring.obs, ring.action, ring.reward, ring.kind] for ring in (other, replay.ring))
+    for one, two in zip(*stores, strict=True):
+        np.testing.assert_array_equal(one[np.concatenate(kept)], two[np.concatenate(kept)])
     if priorities:
         again = Priorities(other, PriorityConfig())
         again.restore(replay.priorities.state())
@@ -221,6 +295,26 @@ def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
             one, two = (p.draw(np.random.default_rng(0), 5, 0.5) for p in (again, replay.priorities))
             np.testing.assert_array_equal(one[0], two[0])
             np.testing.assert_array_equal(one[1], two[1])
+
+
+def test_rows_with_counters_of_older_checkpoints_are_read():
+    ring = filled(2, 6, [NO_END] * 8)[0].ring
+    rows = ring.rows_since(np.full(2, -1))
+    assert "since_start" not in rows
+    other = make_ring(12, 2)
+    other.put_rows([rows | {"since_start": np.zeros(len(rows["kind"]), np.int32)}])
+    np.testing.assert_array_equal(other.records, ring.records)
+    np.testing.assert_array_equal(other.kind, ring.kind)
+
+
+def test_rows_of_a_kind_that_is_none_are_refused_and_whole_ones_then_taken():
+    rows = filled(2, 6, [NO_END] * 8)[0].ring.rows_since(np.full(2, -1))
+    other = make_ring(12, 2)
+    with pytest.raises(ValueError, match="damaged kinds"):
+        other.put_rows([rows | {"kind": rows["kind"] + 3}])
+    assert len(other) == 0
+    other.put_rows([rows])
+    assert len(other) == 10
 
 
 def counts(replay):

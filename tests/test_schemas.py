@@ -10,12 +10,14 @@ import pytest
 import rejeu
 from rejeu import checkpoint
 from rejeu.errors import CheckpointError
+from rejeu.replay.ring import COUNTERS
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests.environments import Counter
 from tests.golden import record_files
 
 GOLDEN = Path(record_files.__file__).parent
 FOLDERS = [GOLDEN / f"schema{n}" for n in range(1, checkpoint.SCHEMA + 1)]
+WITHOUT_COUNTERS = GOLDEN / "replay_without_counters"
 MODELS = ("sac", "td3", "dqn", "ppo")
 
 
@@ -49,9 +51,31 @@ def test_a_replay_buffer_holds_what_it_held(folder):
     agent.load_replay_buffer(folder / "replay.safetensors")
     assert agent.replay_buffer.size() == 23
     arrays = agent.replay_buffer.arrays()
-    assert {f"replay.{name}" for name in arrays} == {name for name in expected if name.startswith("replay.")}
+    counters = {f"replay.{name}" for name in COUNTERS}
+    assert {f"replay.{name}" for name in arrays} | counters == {name for name in expected if name.startswith("replay.")}
     for name, value in arrays.items():
         np.testing.assert_array_equal(value, expected[f"replay.{name}"], err_msg=name)
+
+
+def test_the_counters_in_older_replay_files_are_those_that_are_counted_now(folder):
+    expected = recorded(folder)
+    agent = record_files.replay_agent("episode")
+    agent.load_replay_buffer(folder / "replay.safetensors")
+    for name, value in record_files.kept_counters(agent).items():
+        np.testing.assert_array_equal(value, expected[f"replay.{name}"][0], err_msg=name)
+
+
+def test_a_replay_file_without_counters_holds_what_it_held():
+    expected = recorded(WITHOUT_COUNTERS)
+    agent = record_files.replay_agent("episode")
+    agent.load_replay_buffer(WITHOUT_COUNTERS / "replay.safetensors")
+    found = agent.replay_buffer.arrays()
+    assert agent.replay_buffer.ring.oldest() > 0
+    assert {*COUNTERS}.isdisjoint(checkpoint.read(WITHOUT_COUNTERS / "replay.safetensors", "replay")[1])
+    found |= record_files.kept_counters(agent)
+    assert found.keys() == expected.keys()
+    for name, value in found.items():
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)
 
 
 def test_the_statistics_of_a_wrapper_are_what_they_were(folder):

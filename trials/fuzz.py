@@ -137,10 +137,12 @@ def fuzz(target: str, seconds: int) -> None:
     corpus = folder / "corpus"
     corpus.mkdir()
     seeds = []
-    for path in golden:
-        for name in SEEDS[target]:
-            seeds.append((path / f"{name}.safetensors").read_bytes())
-            (corpus / f"{path.name}-{name}").write_bytes(seeds[-1])
+    files = [path / f"{name}.safetensors" for path in golden for name in SEEDS[target]]
+    if "replay" in SEEDS[target]:
+        files.append(ROOT / "tests" / "golden" / "replay_without_counters" / "replay.safetensors")
+    for path in files:
+        seeds.append(path.read_bytes())
+        (corpus / f"{path.parent.name}-{path.stem}").write_bytes(seeds[-1])
     mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size))  # which is another function once it fuzzes
     watched = Watched(target, folder)
     flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=60", "-len_control=0"]

@@ -5,8 +5,9 @@ Run once for each schema that is released, with the code that writes it::
     python tests/golden/record_files.py
 
 It writes the folder ``schema<number>`` beside itself: models, a replay buffer and normalisation statistics as rejeu saves
-them, and ``expected.npz``, which holds the same numbers, and what the models predict, without rejeu's format. A folder
-that is there is never written again: its files stand for those that users have.
+them, and ``expected.npz``, which holds the same numbers, and what the models predict, without rejeu's format; and the folder
+``replay_without_counters``, a replay buffer as it is saved since files leave out what follows from the rows' kinds, and the
+same beside it. A folder that is there is never written again: its files stand for those that users have.
 """
 
 from __future__ import annotations
@@ -56,15 +57,26 @@ def flat(agent: rejeu.Agent) -> np.ndarray:
     return np.concatenate([arrays[name].ravel().astype(np.float64) for name in sorted(arrays)])
 
 
-def replay_agent() -> rejeu.SAC:
+def replay_agent(strategy: str = "future") -> rejeu.SAC:
     """Returns an agent with an empty buffer of the kind that is recorded."""
-    return rejeu.SAC("MultiInputPolicy", Reach(), **{**OFF_POLICY, "learning_starts": 10**6}, **HINDSIGHT)
+    kwargs = {"goal_selection_strategy": strategy}
+    settings = {**OFF_POLICY, "learning_starts": 10**6, **HINDSIGHT, "replay_buffer_kwargs": kwargs}
+    return rejeu.SAC("MultiInputPolicy", Reach(), **settings)
 
 
-def main() -> None:
-    """Writes the folder, and says how large its files are."""
-    folder = Path(__file__).with_name(f"schema{checkpoint.SCHEMA}")
-    folder.mkdir()
+def kept_counters(agent: rejeu.SAC) -> dict[str, np.ndarray]:
+    """Returns the counters of the rows kept, oldest first, of a buffer with hindsight's strategy ``episode``."""
+    ring = agent.replay_buffer.ring
+    times = np.arange(ring.oldest()[0], ring.head[0] + 1)
+    index = times % ring.rows
+    return {
+        "since_start": np.minimum(ring.since_start[index], times - times[0]),
+        "until_end": ring.until_end[index],
+    }
+
+
+def record_schema(folder: Path) -> None:
+    """Writes files of every kind."""
     expected: dict[str, np.ndarray] = {}
     for name, agent in models().items():
         agent.save(folder / f"{name}.safetensors")
@@ -83,8 +95,26 @@ def main() -> None:
             f"vec_normalize.{key}.{part}": np.array(getattr(moments, part)) for part in ("mean", "var", "count")
         }
     np.savez_compressed(folder / "expected.npz", **expected)
-    for path in sorted(folder.iterdir()):
-        print(path.name, path.stat().st_size, "bytes")
+
+
+def record_replay(folder: Path) -> None:
+    """Writes a replay buffer that has forgotten its first steps, and the counters that were kept while it was played."""
+    agent = replay_agent("episode").learn(63)
+    agent.save_replay_buffer(folder / "replay.safetensors")
+    np.savez_compressed(folder / "expected.npz", **agent.replay_buffer.arrays(), **kept_counters(agent))
+
+
+def main() -> None:
+    """Writes the folders that are missing, and says how large their files are."""
+    here = Path(__file__)
+    for name, record in ((f"schema{checkpoint.SCHEMA}", record_schema), ("replay_without_counters", record_replay)):
+        folder = here.with_name(name)
+        if folder.exists():
+            continue
+        folder.mkdir()
+        record(folder)
+        for path in sorted(folder.iterdir()):
+            print(name, path.name, path.stat().st_size, "bytes")
 
 
 if __name__ == "__main__":

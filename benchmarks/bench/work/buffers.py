@@ -39,12 +39,17 @@ def necessary_bytes(kind: str) -> int:
 
 
 def rejeu_ring(kind: str, rows: int) -> Any:
-    """Returns rejeu's ring of so many rows, of which every hundred and first is an episode's last observation, full."""
+    """Returns rejeu's ring of so many rows, of which every hundred and first is an episode's last observation, full.
+
+    That of parking keeps what hindsight's strategy ``future`` needs.
+    """
     from rejeu import spaces as own
+    from rejeu.replay.hindsight import HindsightConfig, counters
     from rejeu.replay.ring import LAST, STEP, Ring
 
     space = observation_space(kind)
-    ring = Ring(rows, 1, own.leaves(space), own.structure(space), (ACTION[kind],), np.float32)
+    kept = counters(HindsightConfig() if kind == "parking" else None)
+    ring = Ring(rows, 1, own.leaves(space), own.structure(space), (ACTION[kind],), np.float32, counters=kept)
     period = EPISODE + 1
     used = ring.rows // period * period
     at = np.arange(used) % period
@@ -54,9 +59,10 @@ def rejeu_ring(kind: str, rows: int) -> Any:
     ring.action[:] = rng.uniform(-1, 1, ring.action.shape)
     ring.reward[:] = -rng.random(ring.rows, np.float32)
     ring.kind[:used] = np.where(at == EPISODE, LAST, STEP)
-    ring.since_start[:used] = at
-    ring.until_end[:used] = EPISODE - at
+    if ring.until_end is not None:
+        ring.until_end[:used] = EPISODE - at
     ring.head[:] = used - 1
+    ring.start[:] = used - period
     ring.n_steps[:] = used // period * EPISODE
     return ring
 

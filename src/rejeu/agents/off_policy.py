@@ -19,7 +19,7 @@ from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise
 from rejeu.loops.host import Progress
 from rejeu.loops.off_policy import off_policy
-from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer
+from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer, counters
 from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
@@ -97,6 +97,7 @@ class OffPolicyAgent(Agent):
             action.shape[1:],
             action.dtype,
             config.frame_stack,
+            counters(config.hindsight),
         )
         priorities = None if config.priorities is None else Priorities(ring, config.priorities)
         if config.hindsight is None:

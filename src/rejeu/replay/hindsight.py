@@ -65,6 +65,17 @@ class HindsightConfig:
             raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
 
 
+def counters(config: HindsightConfig | None) -> tuple[str, ...]:
+    """Returns the counters that the ring must keep of every row for these settings, None being no hindsight.
+
+    >>> counters(HindsightConfig(goal_selection_strategy="future"))
+    ('until_end',)
+    """
+    if config is None or config.goal_selection_strategy == "random":
+        return ()
+    return ("since_start", "until_end") if config.goal_selection_strategy == "episode" else ("until_end",)
+
+
 class GoalFunctions(NamedTuple):
     """The environment's own view of its goals, vectorised: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
 
@@ -85,6 +96,16 @@ class HerReplayBuffer:
         n_steps: int = 1,
         priorities: Priorities | None = None,
     ) -> None:
+        """Takes a ring that keeps the ``counters`` of ``config``.
+
+        Raises:
+            ValueError: if it does not.
+        """
+        if missing := [name for name in counters(config) if name not in ring.counters]:
+            raise ValueError(
+                f"goal_selection_strategy={config.goal_selection_strategy!r} needs a ring that keeps "
+                f"{' and '.join(missing)}; make it with Ring(..., counters={counters(config)})"
+            )
         self.ring = ring
         self.gamma = gamma
         self.config = config
@@ -135,7 +156,7 @@ class HerReplayBuffer:
             reward, steps, terminated = self._n_step(rows, relabelled, goal)
         _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
-            reward, terminated = step["reward"], step["kind"] == TERMINATED
+            reward, terminated = step["reward"], ring.kind.take(index) == TERMINATED
             reached = next_obs[self.achieved][relabelled]
             if len(goal):
                 reward[relabelled] = self.goals.reward(reached, goal)

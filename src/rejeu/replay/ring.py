@@ -21,6 +21,8 @@ from rejeu.spaces import Leaf, flat_keys
 
 STEP, TERMINATED, LAST = 0, 1, 2
 """Kinds of row: an ordinary step, a step into a terminal state of the MDP, a final observation without a step."""
+COUNTERS = ("since_start", "until_end")
+"""What a ring can keep of every row beside what the environment said: see :func:`episode_counters`."""
 
 
 class Rows(NamedTuple):
@@ -42,10 +44,12 @@ class Ring:
         action_shape: tuple[int, ...],
         action_dtype: Any,
         frame_stack: int | None = None,
+        counters: Sequence[str] = (),
     ) -> None:
         """Reserves ``capacity // n_envs`` rows for each environment (at least 2, and more than ``frame_stack``).
 
-        Images whose first axis has length ``frame_stack`` are taken for as many frames, oldest first.
+        Images whose first axis has length ``frame_stack`` are taken for as many frames, oldest first. Of ``counters``
+        (names of ``COUNTERS``) each takes 4 bytes a row; stacks need ``since_start``, and have it without being asked.
 
         Raises:
             MemoryError: if the machine cannot hold them, with the numbers.
@@ -63,30 +67,37 @@ class Ring:
                 f"frame_stack={frame_stack} needs uint8 observations ({frame_stack}, height, width[, channels]), got "
                 f"{given}; wrap the environment with gymnasium.wrappers.FrameStackObservation(env, {frame_stack})"
             )
-        fields: list[tuple[Any, ...]] = [("reward", np.float32), ("since_start", np.int32), ("until_end", np.int32)]
-        fields.append(("action", action_dtype, action_shape))
+        asked = {*counters, *(() if frame_stack is None else ("since_start",))}
+        self.counters = tuple(name for name in COUNTERS if name in asked)
+        """Which of ``COUNTERS`` are kept."""
+        fields: list[tuple[Any, ...]] = [("reward", np.float32, ()), ("action", action_dtype, action_shape)]
+        fields += [(name, np.int32, ()) for name in self.counters]
         fields += [(f"obs.{i}", leaf.dtype, leaf.shape) for i, leaf in enumerate(obs_leaves) if not self.stacked[i]]
-        record = np.dtype([*fields, ("kind", np.uint8)], align=True)
+        fields.sort(key=lambda field: -np.dtype(field[1]).alignment)  # leaves no gaps but at the end
+        record = np.dtype(fields, align=True)
         frames = [leaf.nbytes // leaf.shape[0] for leaf, is_ in zip(obs_leaves, self.stacked, strict=True) if is_]
         n = self.rows * n_envs
-        check_memory((record.itemsize + sum(frames)) * n, capacity)
+        check_memory((record.itemsize + 1 + sum(frames)) * n, capacity)
         self.records = np.zeros(n, record)
-        """The rows, all that belongs to one side by side in memory; what follows are views of them, and stacked frames."""
+        """The rows but for kinds and stacked frames: what is read together, side by side. What follows are views of it."""
         self.obs = [
             np.zeros((n, *leaf.shape[1:]), leaf.dtype) if self.stacked[i] else self.records[f"obs.{i}"]
             for i, leaf in enumerate(obs_leaves)
         ]
         self.action = self.records["action"]
         self.reward = self.records["reward"]
-        self.kind = self.records["kind"]
-        self.since_start = self.records["since_start"]
-        """Steps since the row's episode began."""
-        self.until_end = self.records["until_end"]
-        """Steps from the row to the ``LAST`` row of its episode; 0 while the episode runs, and in the ``LAST`` row."""
+        self.since_start = self.records["since_start"] if "since_start" in asked else None
+        """Steps since the row's episode began, or since the oldest row that a file held of it; None if not kept."""
+        self.until_end = self.records["until_end"] if "until_end" in asked else None
+        """Steps to the ``LAST`` row of the episode; 0 while it runs, and in that row itself; None if not kept."""
+        self.kind = np.zeros(n, np.uint8)
+        """Apart from the records: it would take 4 bytes of them, and a draw looks at nothing else."""
         self.head = np.full(n_envs, -1, np.int64)
         """Absolute time of each environment's newest row; -1 before the first."""
         self.n_steps = np.zeros(n_envs, np.int64)
         """Steps kept, by environment: the rows that are not ``LAST`` and not the newest."""
+        self.start = np.zeros(n_envs, np.int64)
+        """Absolute time at which the episode of each environment's newest row began."""
         self.base = np.arange(n_envs, dtype=np.int64) * self.rows
         self._newest = self.base
         """Positions of the newest rows, by environment."""
@@ -104,7 +115,7 @@ class Ring:
     def nbytes(self) -> int:
         """Bytes reserved."""
         stacks = [array for array, stacked in zip(self.obs, self.stacked, strict=True) if stacked]
-        return self.records.nbytes + sum(array.nbytes for array in stacks)
+        return self.records.nbytes + self.kind.nbytes + sum(array.nbytes for array in stacks)
 
     def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
         """Starts an episode with ``obs`` ``(n_envs, ...)`` in the environments ``envs`` (indices; None: all).
@@ -115,8 +126,10 @@ class Ring:
         for env in envs[self.head[envs] >= 0]:
             self._close(env)
         self._advance(envs)
+        self.start[envs] = self.head[envs]
         index = self.index(envs, self.head[envs])
-        self.since_start[index] = 0
+        if self.since_start is not None:
+            self.since_start[index] = 0
         self._write_obs(index, obs, envs)
 
     def add(
@@ -138,7 +151,8 @@ class Ring:
         self.kind[index] = terminated[chosen]
         following = self._advance(chosen)
         self.n_steps[chosen] += 1
-        self.since_start[following] = self.since_start[index] + 1
+        if self.since_start is not None:
+            self.since_start[following] = self.head[chosen] - self.start[chosen]
         self._write_obs(following, next_obs, chosen)
         return index, following
 
@@ -161,12 +175,11 @@ class Ring:
         if not np.count_nonzero(self.n_steps):
             raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
         rows = self._draw_rows(rng, n)
-        last = self.kind[self.index(*rows)] == LAST
-        while last.any():
-            again = np.flatnonzero(last)
+        again = np.flatnonzero(self.kind.take(self.index(*rows)) == LAST)
+        while len(again):
             redrawn = self._draw_rows(rng, len(again))
             rows.env[again], rows.time[again] = redrawn
-            last[again] = self.kind[self.index(*redrawn)] == LAST
+            again = again[self.kind.take(self.index(*redrawn)) == LAST]
         return rows
 
     def _draw_rows(self, rng: np.random.Generator, n: int) -> Rows:
@@ -189,17 +202,17 @@ class Ring:
         records = self.records.take(index)
         if self.frame_stack is None:
             return records, [records[name] for name in self._names]
-        frames = self._frames(index)
+        frames = self._frames(index, records["since_start"])
         kinds = zip(self.obs, self.stacked, self._names, strict=True)
         return records, [leaf.take(frames, axis=0) if stacked else records[name] for leaf, stacked, name in kinds]
 
-    def _frames(self, index: np.ndarray) -> np.ndarray:
+    def _frames(self, index: np.ndarray, since_start: np.ndarray) -> np.ndarray:
         """Returns where the frames of the stacks at ``index`` are, oldest first, ``(*index.shape, frame_stack)``."""
         assert self.frame_stack is not None
         env, slot = np.divmod(index, self.rows)
         head = self.head[env]
         since_oldest = np.minimum(head, self.rows - 1) - (head - slot) % self.rows
-        available = np.minimum(since_oldest, self.since_start[index])
+        available = np.minimum(since_oldest, since_start)
         back = np.minimum(np.arange(self.frame_stack)[::-1], available[..., None])
         return self.base[env][..., None] + (slot[..., None] - back) % self.rows
 
@@ -216,17 +229,17 @@ class Ring:
         if head.max() >= self.rows:
             self.n_steps[envs] -= (head >= self.rows) & (self.kind[index] != LAST)
         self.kind[index] = STEP
-        self.until_end[index] = 0
+        if self.until_end is not None:
+            self.until_end[index] = 0
         return index
 
     def _close(self, env: int) -> None:
         """Marks the newest row of ``env`` as its episode's final observation."""
         head = int(self.head[env])
-        newest = int(self.base[env]) + head % self.rows
-        self.kind[newest] = LAST
-        length = min(int(self.since_start[newest]), self.rows - 1)
-        times = np.arange(head - length, head + 1)
-        self.until_end[self.base[env] + times % self.rows] = head - times
+        self.kind[int(self.base[env]) + head % self.rows] = LAST
+        if self.until_end is not None:
+            times = np.arange(max(int(self.start[env]), head - self.rows + 1), head + 1)
+            self.until_end[self.base[env] + times % self.rows] = head - times
 
     def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray | slice) -> None:
         """Writes observations ``(n_envs, ...)`` at ``index``, of stacks the newest frame.
@@ -241,7 +254,7 @@ class Ring:
             return
         # A run may begin an episode in the ring midway, whose older frames are then padded like those of any other; the
         # first that an environment ever begins does follow a reset, and shows how its stacks are padded.
-        length = np.where(self.head[envs] == 0, self.frame_stack, self.since_start[index] + 1)
+        length = np.where(self.head[envs] == 0, self.frame_stack, self.head[envs] - self.start[envs] + 1)
         for rebuilt, leaf, stacked in zip(self.read(index)[1], leaves, self.stacked, strict=True):
             if stacked:
                 differs = (rebuilt != leaf[envs]).any(axis=tuple(range(2, leaf.ndim)))
@@ -253,23 +266,31 @@ class Ring:
                     )
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Returns everything kept as named arrays, the untouched rows left out: ``(n_envs, rows used, ...)``."""
+        """Returns everything kept as named arrays, the untouched rows left out: ``(n_envs, rows used, ...)``.
+
+        The counters of rows are left out; they follow from ``kind``.
+        """
         used = int(min(self.head.max() + 1, self.rows))
         split = lambda a: a.reshape(self.n_envs, self.rows, *a.shape[1:])[:, :used]  # noqa: E731
-        stored = {f"obs.{leaf.path or 'array'}": split(a) for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
-        for name in ("action", "reward", "kind", "since_start", "until_end"):
-            stored[name] = split(getattr(self, name))
+        stored = {name: split(array) for name, array in self._stored().items()}
         return stored | {"head": self.head, "n_steps": self.n_steps}
+
+    def _stored(self) -> dict[str, np.ndarray]:
+        """Returns what files hold of every row, by its name there, ``(n, ...)``."""
+        obs = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
+        return {**obs, "action": self.action, "reward": self.reward, "kind": self.kind}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Puts back what :meth:`arrays` returned; everything is checked before anything is changed.
 
+        Arrays of ``COUNTERS``, which older files hold, are checked and then counted anew.
+
         Raises:
             ValueError: if names, shapes or dtypes are not those of this ring.
         """
-        own = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
-        own |= {name: getattr(self, name) for name in ("action", "reward", "kind", "since_start", "until_end")}
-        if missing := ({*own, "head", "n_steps"} ^ set(arrays)):
+        own = self._stored()
+        counters = {name: arrays[name] for name in COUNTERS} if {*COUNTERS} <= {*arrays} else {}
+        if missing := ({*own, *counters, "head", "n_steps"} ^ set(arrays)):
             raise ValueError(f"the replay file and this buffer differ in the arrays {', '.join(sorted(missing))}")
         head, n_steps = arrays["head"], arrays["n_steps"]
         if head.shape != (self.n_envs,) or n_steps.shape != (self.n_envs,):
@@ -279,47 +300,48 @@ class Ring:
         if head.dtype != np.int64 or n_steps.dtype != np.int64 or head.min() < -1 or head.max() >= 2**62:
             raise ValueError("the replay file's counters are damaged")
         used = int(min(head.max() + 1, self.rows))
-        for name, array in own.items():
-            expected = (self.n_envs, used, *array.shape[1:])
-            if arrays[name].shape != expected or arrays[name].dtype != array.dtype:
+        expected_of = {name: (array.shape[1:], array.dtype) for name, array in own.items()}
+        for name, (shape, dtype) in (expected_of | {name: ((), np.dtype(np.int32)) for name in counters}).items():
+            expected = (self.n_envs, used, *shape)
+            if arrays[name].shape != expected or arrays[name].dtype != dtype:
                 raise ValueError(
                     f"{name} in the replay file is {arrays[name].dtype}{list(arrays[name].shape)} and this buffer "
-                    f"expects {array.dtype}{list(expected)}; it was saved with another environment or buffer_size"
+                    f"expects {dtype}{list(expected)}; it was saved with another environment or buffer_size"
                 )
         for name in ("action", "reward"):
             if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"{name} in the replay file holds what is not finite, which no environment may return")
-        if not self._consistent(head, n_steps, arrays["kind"], arrays["since_start"], arrays["until_end"]):
+        if not self._consistent(head, n_steps, arrays["kind"], counters):
             raise ValueError("the replay file's counters are damaged")
         for name, array in own.items():
             array.reshape(self.n_envs, self.rows, *array.shape[1:])[:, :used] = arrays[name]
-        self._stand(head.copy(), n_steps.copy())
+        self._stand(head.copy())
 
     def rows_since(self, heads: np.ndarray) -> dict[str, np.ndarray]:
         """Returns the rows from those that were the newest at ``heads`` on, ``(n, ...)``, environment after environment.
 
         The row at a head is among them: its action and reward came later. With ``-1`` for every head these are all rows.
-        ``until_end`` is left out; it follows from ``kind``.
+        The counters of rows are left out; they follow from ``kind``.
         """
         first = np.maximum(heads, self.oldest())
         spans = [np.arange(first[env], self.head[env] + 1) for env in range(self.n_envs)]
         index = np.concatenate([self.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
-        rows = {f"obs.{leaf.path or 'array'}": a[index] for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
-        rows |= {name: getattr(self, name)[index] for name in ("action", "reward", "kind", "since_start")}
+        rows = {name: array[index] for name, array in self._stored().items()}
         return rows | {"first": first, "head": self.head.copy()}
 
     def put_rows(self, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Puts back what :meth:`rows_since` returned in turn, each beginning where the one before ended, or earlier.
 
+        An array ``since_start``, which older files hold, is passed over.
+
         Raises:
             ValueError: if they are of another ring, or something between them is missing; the ring is then empty.
         """
-        self._stand(np.full(self.n_envs, -1, np.int64), np.zeros(self.n_envs, np.int64))
-        own = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
-        own |= {name: getattr(self, name) for name in ("action", "reward", "kind", "since_start")}
+        self._stand(np.full(self.n_envs, -1, np.int64))
+        own = self._stored()
         known = newest = self.head
         for rows in parts:
-            if {*rows} != {*own, "first", "head"}:
+            if {*rows} - {"since_start"} != {*own, "first", "head"}:
                 raise ValueError(
                     f"rows of the replay buffer hold {sorted(rows)}, expected {sorted({*own, 'first', 'head'})}"
                 )
@@ -334,56 +356,65 @@ class Ring:
                         f"{name} in rows of the replay buffer is {rows[name].dtype}{list(rows[name].shape)}, expected "
                         f"{array.dtype}{[n, *array.shape[1:]]}; it was saved with another environment or buffer_size"
                     )
+            if rows["kind"].max(initial=0) > LAST:
+                raise ValueError("rows of the replay buffer have damaged kinds")
             spans = [np.arange(first[env], head[env] + 1) for env in range(self.n_envs)]
             index = np.concatenate([self.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
             for name, array in own.items():
                 array[index] = rows[name]
             known, newest = np.where(first > newest, first, np.minimum(known, first)), head
-        self._stand(newest.copy(), self._follow(known, newest))
+        if ((newest >= 0) & (known > np.maximum(newest - self.rows + 1, 0))).any():
+            raise ValueError("rows of the replay buffer are missing")
+        self._stand(newest.copy())
 
-    def _follow(self, known: np.ndarray, head: np.ndarray) -> np.ndarray:
-        """Writes ``until_end`` anew from ``kind`` and returns the steps kept, for rows from the times ``known`` on.
-
-        Raises:
-            ValueError: if older rows should be there, or the counters do not agree.
-        """
-        n_steps = np.zeros(self.n_envs, np.int64)
-        for env in range(self.n_envs):
-            if head[env] < 0:
-                continue
-            oldest = max(int(head[env]) - self.rows + 1, 0)
-            times = np.arange(oldest, head[env] + 1)
-            index = int(self.base[env]) + times % self.rows
-            kind, since_start = self.kind[index], self.since_start[index]
-            if known[env] > oldest or kind.max() > LAST or not ((since_start >= 0) & (since_start <= times)).all():
-                raise ValueError("rows of the replay buffer are missing or damaged")
-            ends = times[kind == LAST]
-            where = np.searchsorted(ends, times)
-            last = np.append(ends, 0)[where]
-            self.until_end[index] = np.where(where < len(ends), last - times, 0)
-            n_steps[env] = np.count_nonzero(kind[:-1] != LAST)
-        return n_steps
-
-    def _stand(self, head: np.ndarray, n_steps: np.ndarray) -> None:
-        self.head, self.n_steps = head, n_steps
+    def _stand(self, head: np.ndarray) -> None:
+        """Takes the rows up to the times ``head`` for what is kept, and counts steps and episodes by their kinds."""
+        self.head = head
+        self.n_steps, self.start = np.zeros(self.n_envs, np.int64), np.zeros(self.n_envs, np.int64)
+        for env in np.flatnonzero(head >= 0):
+            index = self.base[env] + np.arange(max(int(head[env]) - self.rows + 1, 0), head[env] + 1) % self.rows
+            kind = self.kind[index]
+            self.n_steps[env] = np.count_nonzero(kind[:-1] != LAST)
+            since_start, until_end = episode_counters(kind)
+            self.start[env] = head[env] - since_start[-1]
+            if self.since_start is not None:
+                self.since_start[index] = since_start
+            if self.until_end is not None:
+                self.until_end[index] = until_end
         self._newest = self.base + self.head % self.rows
         self.version += 1
 
     def _consistent(
-        self, head: np.ndarray, n_steps: np.ndarray, kind: np.ndarray, since_start: np.ndarray, until_end: np.ndarray
+        self, head: np.ndarray, n_steps: np.ndarray, kind: np.ndarray, counters: Mapping[str, np.ndarray]
     ) -> bool:
-        """Whether the counters of a file agree with each other, so that nothing drawn by them lies outside the ring."""
+        """Whether the numbers of a file agree with each other, so that nothing drawn by them lies outside the ring."""
         for env in range(self.n_envs):
             times = np.arange(max(head[env] - self.rows + 1, 0), head[env] + 1)
             rows = times % self.rows
-            if (
-                kind[env, rows].max(initial=0) > LAST
-                or n_steps[env] != (kind[env, rows[:-1]] != LAST).sum()
-                or not ((since_start[env, rows] >= 0) & (since_start[env, rows] <= times)).all()
-                or not ((until_end[env, rows] >= 0) & (times + until_end[env, rows] <= head[env])).all()
-            ):
+            if kind[env, rows].max(initial=0) > LAST or n_steps[env] != (kind[env, rows[:-1]] != LAST).sum():
                 return False
+            if counters:
+                since_start, until_end = (counters[name][env, rows] for name in COUNTERS)
+                begins, ends = times - since_start, times + until_end
+                if not ((begins >= 0) & (begins <= times) & (ends >= times) & (ends <= head[env])).all():
+                    return False
         return True
+
+
+def episode_counters(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns ``since_start`` and ``until_end`` of successive rows of one environment by their kinds, ``int64 (n,)``.
+
+    The first counts the steps from the row at which the row's episode began, or from the first row given if that is later;
+    the second those to the episode's ``LAST`` row, and is 0 where there is none.
+
+    >>> since_start, until_end = episode_counters(np.array([STEP, LAST, STEP, STEP, LAST, STEP, STEP]))
+    >>> since_start.tolist(), until_end.tolist()
+    ([0, 1, 0, 1, 2, 0, 1], [1, 0, 2, 1, 0, 0, 0])
+    """
+    places, ends = np.arange(len(kind)), np.flatnonzero(kind == LAST)
+    episode = np.searchsorted(ends, places)
+    until_end = np.where(episode < len(ends), np.append(ends, 0)[episode] - places, 0)
+    return places - np.append(0, ends + 1)[episode], until_end
 
 
 def is_stack(leaf: Leaf, frame_stack: int | None) -> bool:

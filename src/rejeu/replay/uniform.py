@@ -49,7 +49,7 @@ class ReplayBuffer:
         index = self.ring.index(*rows)
         step, obs = self.ring.read(index)
         if self.n_steps == 1:
-            reward, terminated = step["reward"], step["kind"] == TERMINATED
+            reward, terminated = step["reward"], self.ring.kind.take(index) == TERMINATED
             steps: int | np.ndarray = 1
         else:
             window = look_ahead(self.ring, rows, self.n_steps)
