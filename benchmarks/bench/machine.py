@@ -77,6 +77,10 @@ def versions(python: str, library: str) -> dict[str, str | None]:
     return json.loads(done.stdout)
 
 
+SETTLE = 0.3
+"""Seconds that the threads of a matrix product go on spinning after it."""
+
+
 def others_busy(seconds: float = 0.25) -> float | None:
     """Returns how many cores other programs use at this moment, None where the system does not tell.
 
@@ -90,6 +94,7 @@ def others_busy(seconds: float = 0.25) -> float | None:
         numbers = [float(word) for word in stat.read_text(encoding="ascii").splitlines()[0].split()[1:9]]
         return sum(numbers), numbers[3] + numbers[4]
 
+    time.sleep(SETTLE)
     (total, idle), _ = ticks(), time.sleep(seconds)
     total_after, idle_after = ticks()
     passed = total_after - total
