@@ -397,7 +397,9 @@ class Agent(ABC):
                 "learn needs total_timesteps, episodes or minutes (or an agent from resume(), to go on with)"
             )
         if call.is_over(self._run.step, self._run.episode):
-            raise ValueError("the run is complete; give total_timesteps, episodes or minutes to train on")
+            raise ValueError(
+                "the run is complete; to train on, say how long: total_timesteps (--steps), episodes or minutes (--minutes)"
+            )
         return call
 
     def _stop_learning(self, loggers: list[Sink], bar: Any, own_outputs: list[Sink]) -> None:

@@ -135,6 +135,9 @@ class Checkpoint:
             self._check_owner(agent)
             for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote
                 path.unlink(missing_ok=True)
+            for path in run_files(self.folder):
+                if step_of(path) > agent._run.step:  # a damaged one, which resume has passed over
+                    path.rename(path.with_name(f"{path.name}.damaged"))
             self._last_step, self._last_time = agent._run.step, time.monotonic()
             if not run_files(self.folder):
                 self.save(agent)
@@ -242,6 +245,13 @@ def run_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted((path for path in folder.iterdir() if RUN_FILE.fullmatch(path.name)), reverse=True)
+
+
+def step_of(path: Path) -> int:
+    """Returns the environment steps that had been taken at a checkpoint."""
+    found = RUN_FILE.fullmatch(path.name)
+    assert found is not None
+    return int(found[1])
 
 
 def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
