@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import inspect
 import math
+import sys
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -243,6 +244,21 @@ def field_names(kind: type) -> list[str]:
     return [field.name for field in dataclasses.fields(kind)]
 
 
+def _definition(kind: type) -> ast.ClassDef:
+    """Returns the source of a class, parsed; parsing a module once is quicker than finding each class's own lines."""
+    for node in _parsed(kind.__module__).body:
+        if isinstance(node, ast.ClassDef) and node.name == kind.__qualname__:
+            return node
+    alone = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    assert isinstance(alone, ast.ClassDef)
+    return alone
+
+
+@cache
+def _parsed(module: str) -> ast.Module:
+    return ast.parse(inspect.getsource(sys.modules[module]))
+
+
 @cache
 def field_docs(kind: type) -> dict[str, str]:
     """Returns the attribute docstring of each field of a dataclass, its bases' included, each on one line."""
@@ -250,8 +266,7 @@ def field_docs(kind: type) -> dict[str, str]:
     for owner in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(owner):
             continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
-        assert isinstance(body, ast.ClassDef)
+        body = _definition(owner)
         for statement, following in zip(body.body, body.body[1:], strict=False):
             if (
                 isinstance(statement, ast.AnnAssign)

@@ -176,9 +176,10 @@ class Agent(ABC):
         weights = [leaf.size for leaf in jax.tree.leaves(self._compiled.shapes) if len(leaf.shape) > 1]
         return self._batch_size(n_envs) * max(weights, default=0)
 
-    def _start(self, env: VectorEnv) -> None:
-        """Begins a run on ``env`` with a fresh state and an empty buffer."""
-        self._run: Run = host.initial_run(env, self._make_buffer(env), self._compiled, self._learn_from(0), self.seed)
+    def _start(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
+        """Begins a run on ``env`` with a fresh state, or the given one, and an empty buffer; None only predicts."""
+        buffer, learn_from = (None, 0) if env is None else (self._make_buffer(env), self._learn_from(0))
+        self._run: Run = host.initial_run(env, buffer, self._compiled, learn_from, self.seed, state)
 
     @abstractmethod
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
@@ -765,12 +766,8 @@ class Agent(ABC):
 
     def _stand(self, vector: VectorEnv | None, state: Any, counters: dict[str, int], rng: dict[str, int]) -> None:
         """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
-        if vector is not None:
-            self._start(vector)
-        else:
-            self._run = host.initial_run(None, None, self._compiled, 0, self.seed)
+        self._start(vector, self._compiled.pack(state))
         run = self._run
-        run.state = self._compiled.pack(state)
         run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
         run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": rng}
         run.learn_from = self._learn_from(run.step)

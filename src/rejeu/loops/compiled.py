@@ -114,10 +114,6 @@ class Compiled:
 
         self.init = init
         """``init(key) -> state``, packed."""
-        self.state = jax.jit(lambda state: copied(packing.unpack(state)))
-        """``state(packed) -> state`` as the algorithm's own class, in buffers of its own."""
-        self.pack = jax.jit(lambda tree: copied(packing.pack(tree)))
-        """``pack(state) -> packed``: the inverse, likewise."""
         self.copy = jax.jit(copied)
         """``copy(packed) -> packed`` in buffers of its own."""
         self.observe = None if algorithm.observe is None else self._observe_packed
@@ -156,6 +152,17 @@ class Compiled:
         """
         weighted = isinstance(batches, Transition) and batches.weight is not None
         return self._update(state, *self._update_packer((batches, clock), (batches.reward.shape, weighted)))
+
+    def state(self, packed: PackedState) -> PyTree:
+        """Returns a packed state as the algorithm's own class, in buffers of its own; waits for it.
+
+        This and :meth:`pack` are done on the host: they are called seldom, and compiling them took longer.
+        """
+        return jax.tree.map(jnp.array, self._packing.unpack([np.asarray(array) for array in packed]))
+
+    def pack(self, state: PyTree) -> PackedState:
+        """Returns a state packed, in buffers of its own: the inverse of :meth:`state`."""
+        return [jnp.array(a) for a in self._packing.pack_leaves([np.asarray(leaf) for leaf in jax.tree.leaves(state)])]
 
     def bad_leaves(self, state: PackedState) -> list[str]:
         """Returns the names of the leaves of a state that hold a number that is not finite; waits for it."""

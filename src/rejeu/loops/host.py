@@ -279,16 +279,18 @@ def check_state(run: Run, compiled: Compiled) -> None:
         )
 
 
-def initial_run(env: VectorEnv | None, buffer: Any, compiled: Compiled, learn_from: int, seed: int) -> Run:
+def initial_run(
+    env: VectorEnv | None, buffer: Any, compiled: Compiled, learn_from: int, seed: int, state: PackedState | None = None
+) -> Run:
     """Returns the beginning of a run; ``seed`` determines everything that is drawn in it.
 
-    Without environment and buffer it serves an agent that only predicts.
+    Without environment and buffer it serves an agent that only predicts. ``state`` is what has been learnt already.
     """
     learner_key, explore_key = jax.random.split(jax.random.PRNGKey(seed))
     return Run(
         env=env,
         replay=buffer,
-        state=compiled.init(learner_key),
+        state=compiled.init(learner_key) if state is None else state,
         key=explore_key,
         rng=np.random.default_rng(seed),
         carry=compiled.initial_carry(1 if env is None else env.n_envs),
