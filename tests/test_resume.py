@@ -186,7 +186,10 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path):
         agent = rejeu.SAC.resume(tmp_path)
     assert agent.num_timesteps == 20
     assert agent.learn(callback=Checkpoint(tmp_path, every=10)).num_timesteps == 60
-    assert [path.name for path in run_files(tmp_path)] == ["run_000000000060.safetensors", "run_000000000050.safetensors"]
+    assert [path.name for path in run_files(tmp_path)] == [
+        "run_000000000060.safetensors",
+        "run_000000000050.safetensors",
+    ]
     assert newest.with_name(f"{newest.name}.damaged").exists()  # nothing is thrown away
 
 
