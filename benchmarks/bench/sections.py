@@ -294,8 +294,8 @@ def memory(samples: Sequence[Sample]) -> str:
 
 Bytes a transition, of a million transitions, every byte of them written. A transition must take its observation once (the
 next observation is the next transition's own), its action, its reward and a flag for its end: `4 (observation + action + 1)
-+ 1` bytes with numbers of four bytes. rejeu adds where the step stands in its episode, two numbers, and aligns its rows, of
-which one for each episode holds the last observation (here one in 101; they count as transitions);
++ 1` bytes with numbers of four bytes. For hindsight, rejeu adds how far off the end of the episode is, a number of four bytes;
+of its rows one for each episode holds the last observation (here one in 101; they count as transitions);
 highway-env declares its observations as float64, which Stable-Baselines3 keeps and rejeu halves.
 
 {table(header, rows)}"""
