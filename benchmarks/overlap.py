@@ -1,10 +1,10 @@
-"""What acting with the weights of the update before the newest does to learning, and what it saves.
+"""What acting with the weights of the update before the newest does to learning.
 
     python benchmarks/overlap.py
 
 With ``overlap=True``, the default, the environments step while the newest update is computed; with False every action
 waits for it. Both train the preset of each environment on the same seeds, in turn; the last weights play 100 episodes.
-Means over the seeds, 95 % intervals by Student's t, and seconds of training go to ``benchmarks/results/overlap.json``.
+Means over the seeds and 95 % intervals by Student's t go to ``benchmarks/results/overlap.json``.
 """
 
 from __future__ import annotations
@@ -32,15 +32,14 @@ def train(env_id: str, algorithm: str, overlap: bool, seed: int) -> dict[str, fl
     agent.learn(preset.total_steps)
     evaluation = agent.evaluate(100, env=env_id, seed=1000 + seed)
     env.close()
-    return {"seed": seed, "return": evaluation.mean_return, "seconds": agent.seconds["total"]}
+    return {"seed": seed, "return": evaluation.mean_return}
 
 
 def summary(rows: list[dict[str, float]]) -> dict[str, float | list[float]]:
     returns = [row["return"] for row in rows]
     half = stats.t.ppf(0.975, len(returns) - 1) * np.std(returns, ddof=1) / len(returns) ** 0.5
     mean = float(np.mean(returns))
-    seconds = float(np.median([row["seconds"] for row in rows]))
-    return {"mean_return": mean, "interval": [mean - half, mean + half], "median_seconds": seconds}
+    return {"mean_return": mean, "interval": [mean - half, mean + half]}
 
 
 def main() -> None:

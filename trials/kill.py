@@ -3,8 +3,8 @@
     python trials/kill.py --kills 200 --sb3-python PATH
 
 The run is SAC on ``rejeu/Ball-v0`` with a checkpoint every 100 environment steps. Each life of it is a process of its own
-that goes on from the newest checkpoint and says every step that it takes; ``SIGKILL`` ends it at a random moment, in two
-lives out of three while a file is being written. After every death the folder must hold a checkpoint that loads and is at
+that goes on from the newest checkpoint and says every step that it takes; ``SIGKILL`` ends it at a random moment, two lives
+out of three as soon as a file is being written. After every death the folder must hold a checkpoint that loads and is at
 most one interval older than the last step said. At the end the run is taken to a fixed step and compared, bit for bit, with
 one that nothing interrupted.
 
@@ -81,7 +81,7 @@ def check_sb3(folder: str) -> None:
                 model.load_replay_buffer(f"{folder}/replay")
             said[what] = ""
         except Exception as error:  # whatever it is, the file is lost
-            said[what] = f"{type(error).__name__}: {error}"[:100]
+            said[what] = f"{type(error).__name__}: {error}".replace(folder, "FOLDER")[:100]
     print(json.dumps(said))
 
 

@@ -33,7 +33,7 @@ def kills() -> str:
     own, peer = found["rejeu"], found.get("stable_baselines3")
     rows = [
         ("kills (SIGKILL)", f"{own['kills']:,}"),
-        ("of these while a file was being written", f"{own['while_a_file_was_written']:,}"),
+        ("of these with a file half written", f"{own['while_a_file_was_written']:,}"),
         ("checkpoints that did not load afterwards", own["checkpoints_that_did_not_load"]),
         ("environment steps between two checkpoints", own["interval"]),
         ("most steps lost by a kill", own["most_steps_lost"]),
@@ -46,7 +46,7 @@ def kills() -> str:
     text = f"""## Killed at random moments
 
 SAC on the ball, a checkpoint every {own["interval"]} steps. Each life of the run is a process that goes on from the newest
-checkpoint, until `SIGKILL` ends it at a random moment, in two lives out of three while a file is being written.
+checkpoint, until `SIGKILL` ends it at a random moment; two lives out of three are ended as soon as a file is being written.
 
 {table(("", "rejeu"), rows)}
 """
@@ -54,14 +54,9 @@ checkpoint, until `SIGKILL` ends it at a random moment, in two lives out of thre
         text += f"""
 Stable-Baselines3 2.9.2, saving model and replay buffer over and over under the same names, as a run that keeps its newest
 model does, killed {peer["kills"]} times: {peer["models_lost"]} models and {peer["replay_buffers_lost"]} replay buffers could
-not be loaded afterwards ({"; ".join(f"`{error}`" for error in shortened(peer["errors"])) or "no errors"}).
+not be loaded afterwards ({"; ".join(f"`{error}`" for error in peer["errors"]) or "no errors"}).
 """
     return text
-
-
-def shortened(errors: list[str]) -> list[str]:
-    """The kinds of errors, without paths."""
-    return sorted({error.split("/tmp")[0].strip().rstrip(":")[:80] for error in errors})
 
 
 def resumed() -> str:

@@ -12,13 +12,15 @@ it offers: model and replay buffer saved and loaded, episodes begun anew.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import copy
 import json
 import random
 import shlex
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +82,8 @@ def make(algorithm: str, env_id: str, n_envs: int, backend: str) -> Callable[[],
     else:
         settings |= OFF_POLICY
     if algorithm == "DDPG":
-        settings["action_noise"] = rejeu.OrnsteinUhlenbeckActionNoise([0.0], [0.2])
+        n = vector(env_id, 1, backend).action_space.shape[0]
+        settings["action_noise"] = rejeu.OrnsteinUhlenbeckActionNoise([0.0] * n, [0.2] * n)
     nested = env_id.startswith("parking")
     policy = "MultiInputPolicy" if nested else "MlpPolicy"
     return lambda: rejeu.AGENTS[algorithm](policy, vector(env_id, n_envs, backend), seed=5, **settings)
@@ -92,23 +95,41 @@ def vector(env_id: str, n_envs: int, backend: str) -> Any:
     return rejeu.make_vector(env_id, n_envs, backend, seed=3)
 
 
+@contextlib.contextmanager
+def compiled_once() -> Iterator[None]:
+    """Within, agents of one kind share what is compiled, which holds no state: compiling takes most of the time."""
+    from unittest import mock
+
+    import rejeu
+    from rejeu.loops.compiled import Compiled
+
+    made: list[Any] = []
+
+    def make(*arguments: Any) -> Any:
+        made.extend([] if made else [Compiled(*arguments)])
+        return copy.copy(made[0])
+
+    with mock.patch.object(rejeu.agents.base, "Compiled", make):
+        yield
+
+
 def try_case(algorithm: str, env_id: str, n_envs: int, backend: str, cut: int) -> dict[str, Any]:
     import rejeu
     from rejeu.callbacks import Checkpoint
 
     made = make(algorithm, env_id, n_envs, backend)
     whole_rows, first, second = Rows(), Rows(), Rows()
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), compiled_once():
         warnings.simplefilter("ignore", UserWarning)
         stop = lambda agent, turn: turn.step < cut  # noqa: E731
         broken = made().learn(STEPS, [stop, Checkpoint(folder, every=300)], log_interval=1, sinks=[first])
         again = rejeu.AGENTS[algorithm].resume(folder, vector(env_id, n_envs, backend))
         exact, equal_at_break = again.resumed.exact, same(facts(again), facts(broken))
         again.learn(sinks=[second])
+        whole = made().learn(STEPS, log_interval=1, sinks=[whole_rows]) if exact else None
     result = {"algorithm": algorithm, "env": env_id, "n_envs": n_envs, "backend": backend, "cut": broken.num_timesteps}
     result |= {"exact": exact, "equal_at_the_break": equal_at_break, "steps": again.num_timesteps}
-    if exact:
-        whole = made().learn(STEPS, log_interval=1, sinks=[whole_rows])
+    if whole is not None:
         result["equal_at_the_end"] = same(facts(again), facts(whole)) and whole_rows.rows == first.rows + second.rows
     return result
 
