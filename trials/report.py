@@ -162,7 +162,9 @@ def soaked() -> str:
     found = read("soak")
     return f"""## An hour with everything on
 
-{found["steps"]:,} steps of SAC with hindsight on parking-v0, {found["evaluations"]} evaluations, {
+{found["minutes"]:.0f} minutes, {
+        found["minutes_suspended"]:.0f} of which the process was suspended for other work on the
+machine: {found["steps"]:,} steps of SAC with hindsight on parking-v0, {found["evaluations"]} evaluations, {
         found["films"]
     } films,
 checkpoints every minute, {

@@ -110,8 +110,11 @@ def judge(rows: list[dict[str, float]], minutes: float) -> dict[str, float]:
     tenth = max(len(late) // 10, 1)
     first, last = late[:tenth], late[-tenth:]
     mean = lambda part, key: float(np.mean([row[key] for row in part]))  # noqa: E731
+    gaps = np.diff([row["seconds"] for row in rows]) - EVERY_SECONDS
     slope = np.polyfit([row["seconds"] / 3600 for row in late], [row["mib"] for row in late], 1)[0]
     return {
+        "minutes": minutes,
+        "minutes_suspended": float(gaps[gaps > EVERY_SECONDS].sum() / 60),  # by something else on the machine
         "mib_after_warm_up": mean(first, "mib"),
         "mib_at_the_end": mean(last, "mib"),
         "growth_percent": 100 * (mean(last, "mib") / mean(first, "mib") - 1),

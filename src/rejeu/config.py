@@ -12,7 +12,6 @@ import dataclasses
 import difflib
 import inspect
 import math
-import sys
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -246,7 +245,7 @@ def field_names(kind: type) -> list[str]:
 
 def _definition(kind: type) -> ast.ClassDef:
     """Returns the source of a class, parsed; parsing a module once is quicker than finding each class's own lines."""
-    for node in _parsed(kind.__module__).body:
+    for node in _parsed(inspect.getmodule(kind)).body:
         if isinstance(node, ast.ClassDef) and node.name == kind.__qualname__:
             return node
     alone = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
@@ -255,8 +254,8 @@ def _definition(kind: type) -> ast.ClassDef:
 
 
 @cache
-def _parsed(module: str) -> ast.Module:
-    return ast.parse(inspect.getsource(sys.modules[module]))
+def _parsed(module: Any) -> ast.Module:
+    return ast.parse(inspect.getsource(module))
 
 
 @cache
