@@ -6,6 +6,7 @@ import contextlib
 import copy
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -333,6 +334,14 @@ def test_a_replay_buffer_that_was_replaced_is_written_whole(tmp_path):
     agent.load_replay_buffer(agent.save_replay_buffer(tmp_path / "replay"))
     agent.learn(20, Checkpoint(tmp_path / "run", every=10), reset_num_timesteps=False)
     assert_same(rejeu.SAC.resume(tmp_path / "run").replay_buffer.arrays(), agent.replay_buffer.arrays())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not delete what is open")
+def test_a_folder_that_vanishes_is_filled_anew(tmp_path):
+    folder = tmp_path / "run"
+    clear = lambda agent, turn: shutil.rmtree(folder) if turn.step == 25 else None  # noqa: E731
+    agent = small_sac(BALL).learn(40, [clear, Checkpoint(folder, every=10)])
+    assert_same(facts(rejeu.SAC.resume(folder)), facts(agent))
 
 
 def test_an_error_of_the_environment_leaves_a_checkpoint_of_all_that_was_learnt(tmp_path):

@@ -214,6 +214,8 @@ class Checkpoint:
             error.add_note(f"and no checkpoint could be written: {second}")
 
     def _write_rows(self, ring: Ring, row_files: RowFiles, step: int) -> None:
+        if not all((self.folder / name).exists() for name, _ in row_files.files):
+            row_files.files = []  # somebody has cleared the folder: everything is written anew
         rows = ring.rows_since(row_files.heads(ring))
         name = f"rows_{step:012d}_{secrets.token_hex(4)}.safetensors"
         checkpoint.write(self.folder / name, "rows", rows, {})
