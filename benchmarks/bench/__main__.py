@@ -62,7 +62,7 @@ def parser() -> argparse.ArgumentParser:
 def shown_command(arguments: Sequence[str]) -> str:
     """Returns the command as anybody could run it: paths of this machine left out.
 
-    >>> shown_command(["--rounds", "2", "--sb3-python", "/home/me/python"])
+    >>> shown_command(["--rounds", "2", "--sb3-python", "envs/sb3/python"])
     'scripts/bench --rounds 2 --sb3-python PATH'
     """
     words, hide = [], False

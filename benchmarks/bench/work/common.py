@@ -64,6 +64,16 @@ def algorithm_of(library: str, name: str) -> Any:
     return getattr(module, name)
 
 
+def threads_used(agent: Any, library: str, n_envs: int) -> dict[str, Any]:
+    """Returns how many threads torch has, and whether rejeu takes one (1) or all (0) for an agent's updates."""
+    used: dict[str, Any] = {"torch_threads": threads_of(library)}
+    if library == "rejeu":
+        from rejeu import compilation
+
+        used["threads"] = 1 if agent._work(n_envs) <= compilation.LITTLE_WORK else 0
+    return used
+
+
 def threads_of(library: str) -> int | None:
     """Returns how many threads torch works with, None where the library has no torch in its updates."""
     if library != "sb3":

@@ -34,11 +34,7 @@ def measure(
     unit = max(settings["n_steps"] * n_envs, 1)
     unit *= max(1, 320 // unit)
     result = common.time_learning(agent, library, warm_up=unit, unit=unit, seconds=seconds)
-    result["torch_threads"] = common.threads_of(library)
-    if library == "rejeu":
-        from rejeu import compilation
-
-        result["threads"] = 1 if agent._work(n_envs) <= compilation.LITTLE_WORK else 0
+    result |= common.threads_used(agent, library, n_envs)
     if count:
         from benchmarks.bench.work import flops
 

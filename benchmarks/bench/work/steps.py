@@ -33,11 +33,7 @@ def measure(
         settings["device"] = "cpu"
     agent = common.algorithm_of(library, algorithm)("MlpPolicy", given, seed=0, **settings)
     result = common.time_learning(agent, library, warm_up=WARM_UP, unit=UNIT, seconds=seconds)
-    result["torch_threads"] = common.threads_of(library)
-    if library == "rejeu":
-        from rejeu import compilation
-
-        result["threads"] = 1 if agent._work(n_envs) <= compilation.LITTLE_WORK else 0
+    result |= common.threads_used(agent, library, n_envs)
     if count:
         from benchmarks.bench.work import flops
 
