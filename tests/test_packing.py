@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from rejeu.loops import packing
-from rejeu.loops.packing import HostPacker, Packing, Readings
+from rejeu.loops.packing import HostPacker, Message, Packing, Readings
 
 DTYPES = ("float32", "int32", "uint32", "uint8", "bool")
 SHAPES = ((), (1,), (3,), (2, 3), (0, 2), (4, 1, 2), (5, 7))
@@ -43,6 +43,38 @@ def test_unpacking_gives_the_tree_back(tree, large):
     n_large = sum(leaf.size > large for leaf in jax.tree.leaves(tree))
     small = {leaf.dtype for leaf in jax.tree.leaves(tree) if leaf.size <= large}
     assert len(on_host) == len(on_device) == n_large + len(small)
+
+
+@given(trees(), st.sampled_from([3, 10, packing.LARGE]))
+def test_a_message_arrives_as_it_was_sent(tree, large):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(packing, "LARGE", large)
+        plan = Message(tree)
+    sent = plan.pack(tree)
+    assert_same(jax.jit(plan.unpack)(sent), tree)
+    assert len(sent) == 1 + sum(leaf.size > large for leaf in jax.tree.leaves(tree))
+
+
+def test_every_bit_of_a_message_arrives():
+    words = np.array([0x7FC12345, 0x7F812345, 0x80000000, 0x00000001, 0xFFFFFFFF], np.uint32)  # NaN, -0, denormal
+    tree = {"f": words.view(np.float32), "u": words, "i": words.view(np.int32)}
+    plan = Message(tree)
+    arrived = jax.jit(plan.unpack)(plan.pack(tree))
+    assert {key: np.asarray(a).view(np.uint32).tolist() for key, a in arrived.items()} == {
+        k: words.tolist() for k in tree
+    }
+
+
+def test_numbers_of_64_bits_arrive_as_jax_has_them_and_views_as_their_elements():
+    table = np.zeros(4, [("a", np.float32, 2), ("b", np.int64)])
+    table["a"], table["b"] = np.arange(8).reshape(4, 2), -np.arange(4)
+    tree = (table["a"], table["b"], np.float64(0.1), np.float16([0.5, np.inf]))
+    plan = Message(tree)
+    a, b, c, d = jax.jit(plan.unpack)(plan.pack(tree))
+    np.testing.assert_array_equal(a, np.arange(8, dtype=np.float32).reshape(4, 2))
+    assert (b.dtype, b.tolist()) == (np.int32, [0, -1, -2, -3])
+    assert (c.dtype, float(c)) == (np.float32, float(np.float32(0.1)))
+    assert (d.dtype, d.tolist()) == (np.float16, [0.5, np.inf])
 
 
 def test_vectors_are_copies_and_large_arrays_are_not():

@@ -19,7 +19,7 @@ from rejeu.checkpoint import names
 from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Rollout, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
-from rejeu.loops.packing import HostPacker, Packing, Readings
+from rejeu.loops.packing import HostPacker, Message, Packing, Readings
 from rejeu.randomness import nth
 
 PackedState = list[Array]
@@ -49,24 +49,24 @@ class Compiled:
 
         @partial(jax.jit, static_argnums=4)
         def act(
-            state: PackedState, carry: PyTree, key: Array, vectors: list[Array], plan: Packing
+            state: PackedState, carry: PyTree, key: Array, vectors: list[Array], plan: Message
         ) -> tuple[Array, PyTree]:
             obs, ended, clock = plan.unpack(vectors)
             actor = algorithm.actor(packing.unpack(state))
             return explorer.act(carry, actor, obs, ended, nth(key, clock.step), clock)
 
         @partial(jax.jit, static_argnums=2)
-        def exploit(state: PackedState, vectors: list[Array], plan: Packing) -> Array:
+        def exploit(state: PackedState, vectors: list[Array], plan: Message) -> Array:
             return algorithm.exploit(algorithm.actor(packing.unpack(state)), plan.unpack(vectors))
 
         @partial(jax.jit, static_argnums=3)
-        def recall(state: PackedState, carry: PyTree, vectors: list[Array], plan: Packing) -> tuple[Array, PyTree]:
+        def recall(state: PackedState, carry: PyTree, vectors: list[Array], plan: Message) -> tuple[Array, PyTree]:
             assert algorithm.recall is not None
             obs, ended = plan.unpack(vectors)
             return algorithm.recall(carry, algorithm.actor(packing.unpack(state)), obs, ended)
 
         @partial(jax.jit, donate_argnums=0, static_argnums=2)
-        def observe(state: PackedState, vectors: list[Array], plan: Packing) -> PackedState:
+        def observe(state: PackedState, vectors: list[Array], plan: Message) -> PackedState:
             assert algorithm.observe is not None
             return packing.pack(algorithm.observe(packing.unpack(state), *plan.unpack(vectors)))
 
@@ -88,7 +88,7 @@ class Compiled:
 
         @partial(jax.jit, donate_argnums=0, static_argnums=2)
         def update(
-            state: PackedState, vectors: list[Array], plan: Packing
+            state: PackedState, vectors: list[Array], plan: Message
         ) -> tuple[PackedState, Readings, Array | None]:
             batches, clock = plan.unpack(vectors)
             is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
