@@ -557,9 +557,9 @@ def test_td_errors_that_are_not_finite_leave_priorities_as_they_are(bad):
     for _ in range(4):
         priorities.add(*ring.add(np.zeros((1, 1)), np.zeros(1), np.zeros(1, bool), np.zeros((1, 1), np.float32)))
     rows, _ = priorities.draw(np.random.default_rng(0), 4, 0.0)
-    before = priorities.tree[ring.index(*rows)].copy()
+    before = priorities.tree[rows.position].copy()
     priorities.update([np.array([2.0, bad, 0.5, bad], np.float32)])
-    after = priorities.tree[ring.index(*rows)]
+    after = priorities.tree[rows.position]
     np.testing.assert_allclose(after, [2.001, before[1], 0.501, before[3]])
     assert priorities.largest == pytest.approx(2.001)
     assert priorities.tree.total == pytest.approx(after.sum())

@@ -88,7 +88,7 @@ def off_policy(
         last_obs = last_of(run, step)
         run.obs = step.obs if last_obs is None else reset_done(run, run.ended)
         t3 = time.perf_counter()
-        if run.ended.any():
+        if np.count_nonzero(run.ended):
             run.replay.begin(run.obs, np.flatnonzero(run.ended))
 
         if compiled.observe is not None:

@@ -144,19 +144,17 @@ class HerReplayBuffer:
         """
         ring, k = self.ring, self.config.n_sampled_goal
         rows, weight = draw(ring, self.priorities, rng, math.prod(shape), progress)
-        index = ring.index(*rows)
-        step, obs = ring.read(index)
+        step, obs = ring.read(rows.position)
         relabelled = relabelled_positions(shape, k)
 
-        relabelled_rows = Rows(rows.env[relabelled], rows.time[relabelled])
-        goal_index = self._goal_index(rng, relabelled_rows, step[relabelled])
+        goal_index = self._goal_index(rng, Rows(*(column[relabelled] for column in rows)), step[relabelled])
         goal = ring.read(goal_index)[1][self.achieved]
         steps: int | np.ndarray = 1
         if self.n_steps > 1:
             reward, steps, terminated = self._n_step(rows, relabelled, goal)
         _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
-            reward, terminated = step["reward"], ring.kind.take(index) == TERMINATED
+            reward, terminated = step["reward"], rows.kind == TERMINATED
             reached = next_obs[self.achieved][relabelled]
             if len(goal):
                 reward[relabelled] = self.goals.reward(reached, goal)

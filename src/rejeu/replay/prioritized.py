@@ -56,7 +56,7 @@ class SumTree:
         return self.nodes[self.n_leaves + index]
 
     def set(self, index: np.ndarray, value: Any) -> None:
-        """Puts ``value`` at the positions ``index``, ``(n,)``; where one is repeated, its last value counts."""
+        """Puts ``value`` at the positions ``index``, ``(n,)`` or one; where one is repeated, its last value counts."""
         node = index + self.n_leaves
         self.nodes[node] = value
         for _ in range(self.n_leaves.bit_length() - 1):
@@ -120,7 +120,7 @@ class Priorities:
         probability = tree[index] / tree.total
         weight = (len(ring) * probability) ** -float(schedules.at(self.config.beta, progress))
         self._drawn.append((index, time))
-        return Rows(env, time), weight.astype(np.float32)
+        return Rows(env, time, index, ring.kind.take(index)), weight.astype(np.float32)
 
     def update(self, td_errors: Iterable[np.ndarray]) -> None:
         """Takes the absolute TD errors of the oldest draws; of steps overwritten since then they are passed over.

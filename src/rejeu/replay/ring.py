@@ -26,10 +26,16 @@ COUNTERS = ("since_start", "until_end")
 
 
 class Rows(NamedTuple):
-    """Addresses of steps: which environment, at which absolute time; both ``int64[n]``."""
+    """Rows that were chosen, ``(n,)`` each."""
 
     env: np.ndarray
+    """Of which environments, ``int64``."""
     time: np.ndarray
+    """At which absolute times, ``int64``."""
+    position: np.ndarray
+    """Where in the ring they stand, ``int64``."""
+    kind: np.ndarray
+    """Of which kind they are, ``uint8``."""
 
 
 class Ring:
@@ -99,9 +105,11 @@ class Ring:
         self.start = np.zeros(n_envs, np.int64)
         """Absolute time at which the episode of each environment's newest row began."""
         self.base = np.arange(n_envs, dtype=np.int64) * self.rows
-        self._newest = self.base
+        self._newest = self.base.copy()
         """Positions of the newest rows, by environment."""
         self.all_envs = np.arange(n_envs)
+        self._every: slice | int = 0 if n_envs == 1 and frame_stack is None else slice(None)
+        """Picks all environments out of an array. For a single one that is a number, with which NumPy is much faster."""
         self.version = 0
         """Rises when rows were replaced otherwise than by being written in turn."""
         self._keys = flat_keys(obs_structure)
@@ -142,9 +150,9 @@ class Ring:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Records one step of each environment in ``envs``; the arrays cover all environments, ``(n_envs, ...)``.
 
-        Returns the positions of the steps and of the rows after them.
+        Returns the positions of the steps and of the rows after them, as numbers if there is a single environment.
         """
-        chosen = slice(None) if envs is None else envs
+        chosen = self._every if envs is None else envs
         index = self._newest[chosen]
         self.action[index] = action[chosen]
         self.reward[index] = reward[chosen]
@@ -159,6 +167,11 @@ class Ring:
     def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Returns the position in the arrays of rows given by environment and absolute time."""
         return time % self.rows if self.n_envs == 1 else self.base[env] + time % self.rows
+
+    def at(self, env: np.ndarray, time: np.ndarray) -> Rows:
+        """Returns the rows of these environments at these absolute times, all ``(n,)``."""
+        index = self.index(env, time)
+        return Rows(env, time, index, self.kind.take(index))
 
     def oldest(self) -> np.ndarray:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
@@ -175,22 +188,24 @@ class Ring:
         if not np.count_nonzero(self.n_steps):
             raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
         rows = self._draw_rows(rng, n)
-        again = np.flatnonzero(self.kind.take(self.index(*rows)) == LAST)
-        while len(again):
-            redrawn = self._draw_rows(rng, len(again))
-            rows.env[again], rows.time[again] = redrawn
-            again = again[self.kind.take(self.index(*redrawn)) == LAST]
+        while LAST in rows.kind.tobytes():  # a search of bytes, much the fastest look at so few
+            again = np.flatnonzero(rows.kind == LAST)
+            for column, redrawn in zip(rows, self._draw_rows(rng, len(again)), strict=True):
+                column[again] = redrawn
         return rows
 
     def _draw_rows(self, rng: np.random.Generator, n: int) -> Rows:
         if self.n_envs == 1:
             head = int(self.head[0])
             oldest = max(head - self.rows + 1, 0)
-            return Rows(np.zeros(n, np.int64), oldest + (rng.random(n) * (head - oldest)).astype(np.int64))
+            time = (rng.random(n) * (head - oldest)).astype(np.int64)
+            if oldest:
+                time += oldest
+            return self.at(np.zeros(n, np.int64), time)
         ends = np.cumsum(np.maximum(self.head - self.oldest(), 0))
         ticket = (rng.random(n) * ends[-1]).astype(np.int64)
         env = np.searchsorted(ends, ticket, side="right")
-        return Rows(env, self.head[env] - 1 - (ends[env] - 1 - ticket))
+        return self.at(env, self.head[env] - 1 - (ends[env] - 1 - ticket))
 
     def read(self, index: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
         """Returns copies of the rows at positions ``index`` as records, and their observation leaves, stacks rebuilt.
@@ -220,14 +235,18 @@ class Ring:
         """Returns observation leaves in the nesting of the environment's space."""
         return jax.tree.unflatten(self.obs_structure, obs_leaves)
 
-    def _advance(self, envs: np.ndarray | slice) -> np.ndarray:
+    def _advance(self, envs: np.ndarray | slice | int) -> np.ndarray:
         """Moves the heads on by one row, forgetting what stood there, and returns the positions of the new rows."""
         head = self.head[envs] + 1
         self.head[envs] = head
         index = self.base[envs] + head % self.rows
-        self._newest = index if isinstance(envs, slice) else self.base + self.head % self.rows
-        if head.max() >= self.rows:
-            self.n_steps[envs] -= (head >= self.rows) & (self.kind[index] != LAST)
+        if isinstance(envs, slice):
+            self._newest = index
+        else:
+            self._newest[envs] = index
+        full = head >= self.rows
+        if full if isinstance(envs, int) else np.count_nonzero(full):
+            self.n_steps[envs] -= full & (self.kind[index] != LAST)
         self.kind[index] = STEP
         if self.until_end is not None:
             self.until_end[index] = 0
@@ -241,7 +260,7 @@ class Ring:
             times = np.arange(max(int(self.start[env]), head - self.rows + 1), head + 1)
             self.until_end[self.base[env] + times % self.rows] = head - times
 
-    def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray | slice) -> None:
+    def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray | slice | int) -> None:
         """Writes observations ``(n_envs, ...)`` at ``index``, of stacks the newest frame.
 
         Raises:

@@ -21,6 +21,8 @@ class ReplayBuffer:
         self.gamma = gamma
         self.n_steps = n_steps
         self.priorities = priorities
+        self._discounts = bootstrap_discount(gamma, 1, np.arange(3) == TERMINATED)
+        """Of single steps, by the kind of their row."""
 
     def size(self) -> int:
         """Returns the number of transitions kept."""
@@ -46,18 +48,15 @@ class ReplayBuffer:
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
         """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances, ``progress`` anneals the weights."""
         rows, weight = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
-        index = self.ring.index(*rows)
-        step, obs = self.ring.read(index)
+        step, obs = self.ring.read(rows.position)
+        steps: int | np.ndarray = 1
         if self.n_steps == 1:
-            reward, terminated = step["reward"], self.ring.kind.take(index) == TERMINATED
-            steps: int | np.ndarray = 1
+            reward, discount = step["reward"], self._discounts.take(rows.kind)
         else:
             window = look_ahead(self.ring, rows, self.n_steps)
             reward = discounted_sum(self.ring.reward[window.position], window.valid, self.gamma)
-            steps, terminated = window.steps, window.terminated
-        following = self.ring.index(rows.env, rows.time + steps)
-        _, next_obs = self.ring.read(following)
-        discount = bootstrap_discount(self.gamma, steps, terminated)
+            steps, discount = window.steps, bootstrap_discount(self.gamma, window.steps, window.terminated)
+        _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
         return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight)
 
     def reprioritise(self, td_errors: list[Any]) -> None:
@@ -154,4 +153,4 @@ def discounted_sum(rewards: np.ndarray, valid: np.ndarray, gamma: float) -> np.n
 
 def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
     """Returns ``gamma^steps``, and 0 where the MDP terminated, ``float32``."""
-    return np.where(terminated, 0.0, gamma**steps).astype(np.float32)
+    return np.where(terminated, np.float32(0.0), np.asarray(gamma**steps, np.float32))
