@@ -57,7 +57,7 @@ ALLOWED = {
     "replay/rollout.py": {"getattr"},
     "config.py": {"getattr"},
     "exploration/noise.py": {"getattr"},
-    "networks.py": {"getattr"},
+    "networks/shape.py": {"getattr"},
     "summary.py": {"getattr"},
     # The attribute that the program asks a wrapper for, passed on to the wrapped environments.
     "envs/vec_env.py": {"getattr"},

@@ -1,0 +1,71 @@
+"""The networks of the off-policy algorithms: an encoder, hidden layers and one linear head each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rejeu.core import PyTree
+from rejeu.networks.encoder import Encoder
+from rejeu.networks.layers import Linear
+from rejeu.networks.shape import PolicyConfig
+from rejeu.networks.torsos import Branches, Torso, make_torso
+from rejeu.spaces import Leaf
+
+
+class Actor(eqx.Module):
+    """Observation to the parameters of an action: encoder, hidden layers, one linear head."""
+
+    encoder: Encoder
+    torso: Torso
+    head: Linear
+
+    def __init__(
+        self, key: Array, leaves: tuple[Leaf, ...], n_outputs: int, widths: Sequence[int], shape: PolicyConfig
+    ):
+        torso_key, head_key = jax.random.split(key)
+        self.encoder = Encoder(leaves, jax.random.fold_in(key, 2))
+        self.torso, n_hidden = make_torso(torso_key, self.encoder.n_features, None, widths, shape)
+        self.head = Linear(head_key, n_hidden, n_outputs)
+
+    def __call__(self, obs: PyTree) -> Array:
+        """Maps observations ``(batch, ...)`` to ``(batch, n_outputs)``."""
+        return self.head(self.torso(self.encoder(obs)))
+
+
+class Critic(eqx.Module):
+    """Observation and continuous action to action values: encoder, hidden layers, one linear head."""
+
+    encoder: Encoder
+    torso: Torso
+    head: Linear
+
+    def __init__(
+        self,
+        key: Array,
+        leaves: tuple[Leaf, ...],
+        action_dim: int,
+        widths: Sequence[int],
+        shape: PolicyConfig,
+        n_outputs: int = 1,
+    ):
+        torso_key, head_key = jax.random.split(key)
+        self.encoder = Encoder(leaves, jax.random.fold_in(key, 2))
+        self.torso, n_hidden = make_torso(torso_key, self.encoder.n_features, action_dim, widths, shape)
+        self.head = Linear(head_key, n_hidden, n_outputs)
+
+    def __call__(self, obs: PyTree, action: Array) -> Array:
+        """Maps observations ``(batch, ...)`` and actions ``(batch, action_dim)`` to ``(batch, n_outputs)``."""
+        features = self.encoder(obs)
+        if isinstance(self.torso, Branches):
+            return self.head(self.torso(features, action))
+        return self.head(self.torso(jnp.concatenate([features, action], axis=-1)))
+
+
+def action_values(critics: Critic, obs: PyTree, action: Array) -> Array:
+    """Returns the value that each of the stacked critics gives, ``(n_critics, batch)``."""
+    return jax.vmap(lambda critic: critic(obs, action)[:, 0])(critics)

@@ -1,0 +1,185 @@
+"""From an observation of any structure to one vector of features: numbers, one-hot vectors, images by convolution."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rejeu.core import PyTree
+from rejeu.networks.layers import Linear
+from rejeu.spaces import Leaf
+
+
+class Convolutions(NamedTuple):
+    """A stack of convolutions and the width of the linear layer after it."""
+
+    layers: tuple[tuple[int, int, int], ...]
+    """Filters, side of the kernel and stride of each."""
+    n_outputs: int
+
+
+NATURE = Convolutions(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512)
+"""For images whose shorter side has 36 pixels or more: Mnih et al. 2015, "Human-level control through deep
+reinforcement learning" (Nature 518)."""
+SMALL = Convolutions(((32, 4, 2), (64, 3, 1)), 256)
+"""For images of 8 to 35 pixels on their shorter side. Our own choice; smaller ones are flattened."""
+
+
+class Convolution(eqx.Module):
+    """A two-dimensional convolution without padding, plus a bias. The stride divides the side of the kernel."""
+
+    weight: Array
+    """``(kernel, kernel, n_channels, n_filters)``."""
+    bias: Array
+    """``(n_filters,)``."""
+    stride: int = eqx.field(static=True)
+
+    def __init__(self, key: Array, n_channels: int, n_filters: int, kernel: int, stride: int) -> None:
+        """Draws weight and bias uniformly within ``1 / sqrt(inputs of a filter)`` of 0, PyTorch's default."""
+        assert kernel % stride == 0
+        bound = 1.0 / math.sqrt(kernel * kernel * n_channels)
+        weight_key, bias_key = jax.random.split(key)
+        shape = (kernel, kernel, n_channels, n_filters)
+        self.weight = jax.random.uniform(weight_key, shape, jnp.float32, -bound, bound)
+        self.bias = jax.random.uniform(bias_key, (n_filters,), jnp.float32, -bound, bound)
+        self.stride = stride
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, height, width, n_channels)`` to ``(batch, rows, columns, n_filters)``.
+
+        One matrix product over patches: on a CPU half the time of XLA's own convolution, which becomes a grouped one
+        where critics are stacked. The image is cut into cells of ``stride`` by ``stride`` pixels, so that a patch is a
+        few neighbouring cells.
+        """
+        kernel, _, n_channels, n_filters = self.weight.shape
+        stride, cells = self.stride, kernel // self.stride
+        rows, columns = ((side - kernel) // stride + 1 for side in x.shape[1:3])
+        down, across = rows + cells - 1, columns + cells - 1
+        x = x[:, : down * stride, : across * stride]
+        x = x.reshape(-1, down, stride, across, stride, n_channels).transpose(0, 1, 3, 2, 4, 5)
+        x = x.reshape(-1, down, across, stride * stride * n_channels)
+        patches = [x[:, i : i + rows, j : j + columns] for i in range(cells) for j in range(cells)]
+        weight = self.weight.reshape(cells, stride, cells, stride, n_channels, n_filters).transpose(0, 2, 1, 3, 4, 5)
+        weight = weight.reshape(kernel * kernel * n_channels, n_filters)
+        return jnp.concatenate(patches, axis=-1) @ weight + self.bias[None, None, None]
+
+
+class CNN(eqx.Module):
+    """Pixels to features: convolutions and one linear layer, each followed by a relu."""
+
+    layers: tuple[Convolution, ...]
+    linear: Linear
+
+    def __init__(self, key: Array, shape: tuple[int, ...], kind: Convolutions) -> None:
+        *layer_keys, linear_key = jax.random.split(key, len(kind.layers) + 1)
+        height, width, channels = image_shape(shape)
+        layers = []
+        for layer_key, (n_filters, kernel, stride) in zip(layer_keys, kind.layers, strict=True):
+            layers.append(Convolution(layer_key, channels, n_filters, kernel, stride))
+            height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, n_filters
+        self.layers = tuple(layers)
+        self.linear = Linear(linear_key, height * width * channels, kind.n_outputs)
+
+    def __call__(self, x: Array) -> Array:
+        """Maps images ``(batch, ...)`` of 0 to 255 to features ``(batch, n_outputs)``."""
+        x = channels_last(x).astype(jnp.float32) / 255.0
+        for layer in self.layers:
+            x = jax.nn.relu(layer(x))
+        return jax.nn.relu(self.linear(x.reshape(x.shape[0], -1)))
+
+
+class Encoder(eqx.Module):
+    """Turns an observation of any structure into one feature vector, leaf by leaf; every image has a CNN of its own."""
+
+    leaves: tuple[Leaf, ...] = eqx.field(static=True)
+    images: tuple[CNN, ...]
+    """In the order of the leaves that are images."""
+
+    def __init__(self, leaves: tuple[Leaf, ...], key: Array | None = None) -> None:
+        """Builds an encoder of these leaves; only images need the key.
+
+        Raises:
+            TypeError: if there are images and no key.
+        """
+        self.leaves = leaves
+        images: list[CNN] = []
+        for leaf in leaves:
+            if (kind := convolutions(leaf)) is not None:
+                if key is None:
+                    raise TypeError(
+                        "Encoder(leaves, key): the encoder of an image has weights and needs a key to draw them"
+                    )
+                images.append(CNN(jax.random.fold_in(key, len(images)), leaf.shape, kind))
+        self.images = tuple(images)
+
+    @property
+    def n_features(self) -> int:
+        """Length of the feature vector."""
+        return sum(n_features(leaf) for leaf in self.leaves)
+
+    def __call__(self, obs: PyTree) -> Array:
+        """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
+        images = iter(self.images)
+        parts = [
+            encode_leaf(leaf, x) if convolutions(leaf) is None else next(images)(x)
+            for leaf, x in zip(self.leaves, jax.tree.leaves(obs), strict=True)
+        ]
+        return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+
+
+def convolutions(leaf: Leaf) -> Convolutions | None:
+    """Returns the convolutions that an observation goes through, None if it is no image or too small for any."""
+    if leaf.dtype != "uint8" or len(leaf.shape) not in (3, 4):
+        return None
+    side = min(image_shape(leaf.shape)[:2])
+    return NATURE if side >= 36 else SMALL if side >= 8 else None
+
+
+def image_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """Returns height, width and channels of an image of 3 axes, or of a stack of images of 4.
+
+    The channels come first where the first axis is the shortest, else last, as Stable-Baselines3 has it. Frames of a
+    stack become channels.
+
+    >>> image_shape((84, 84, 3)), image_shape((4, 84, 84)), image_shape((4, 96, 96, 3))
+    ((84, 84, 3), (84, 84, 4), (96, 96, 12))
+    """
+    if len(shape) == 4:
+        height, width, channels = image_shape(shape[1:])
+        return height, width, shape[0] * channels
+    first = min(shape) == shape[0]
+    return (shape[1], shape[2], shape[0]) if first else (shape[0], shape[1], shape[2])
+
+
+def channels_last(x: Array) -> Array:
+    """Returns a batch of images ``(batch, ...)`` as ``(batch, height, width, channels)``; see :func:`image_shape`."""
+    if x.ndim == 5:
+        n, frames = x.shape[:2]
+        x = channels_last(x.reshape(n * frames, *x.shape[2:]))
+        x = jnp.moveaxis(x.reshape(n, frames, *x.shape[1:]), 1, 3)
+        return x.reshape(*x.shape[:3], -1)
+    return jnp.moveaxis(x, 1, 3) if min(x.shape[1:]) == x.shape[1] else x
+
+
+def n_features(leaf: Leaf) -> int:
+    """Returns how many features an observation leaf becomes."""
+    kind = convolutions(leaf)
+    return leaf.n_features if kind is None else kind.n_outputs
+
+
+def encode_leaf(leaf: Leaf, x: Array) -> Array:
+    """Returns ``(batch, leaf.n_features)``: flattened numbers, pixels in [0, 1], or one-hot vectors."""
+    x = x.reshape(x.shape[0], -1)
+    if leaf.kind == "categorical":
+        parts = [
+            jax.nn.one_hot(x[:, i] - start, size, dtype=jnp.float32)
+            for i, (start, size) in enumerate(zip(leaf.starts, leaf.sizes, strict=True))
+        ]
+        return jnp.concatenate(parts, axis=-1)
+    x = x.astype(jnp.float32)
+    return x / 255.0 if leaf.kind == "image" else x

@@ -1,0 +1,86 @@
+"""The layers that every network is made of: affine maps, layer norm, and stacks of both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "relu": jax.nn.relu,
+    "tanh": jnp.tanh,
+    "elu": jax.nn.elu,
+    "gelu": jax.nn.gelu,
+    "silu": jax.nn.silu,
+    "leaky_relu": jax.nn.leaky_relu,
+    "leakyrelu": jax.nn.leaky_relu,
+    "sigmoid": jax.nn.sigmoid,
+}
+
+
+class Linear(eqx.Module):
+    """An affine map ``x @ weight + bias``."""
+
+    weight: Array
+    """``(n_inputs, n_outputs)``."""
+    bias: Array
+    """``(n_outputs,)``."""
+
+    def __init__(self, key: Array, n_inputs: int, n_outputs: int) -> None:
+        """Draws weight and bias uniformly within ``1 / sqrt(n_inputs)`` of 0, PyTorch's default."""
+        bound = 1.0 / math.sqrt(max(n_inputs, 1))
+        weight_key, bias_key = jax.random.split(key)
+        self.weight = jax.random.uniform(weight_key, (n_inputs, n_outputs), jnp.float32, -bound, bound)
+        self.bias = jax.random.uniform(bias_key, (n_outputs,), jnp.float32, -bound, bound)
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)``."""
+        return x @ self.weight + self.bias[None]
+
+
+class LayerNorm(eqx.Module):
+    """Layer normalisation over the last axis (Ba et al. 2016, arXiv 1607.06450)."""
+
+    scale: Array
+    """``(width,)``."""
+    offset: Array
+    """``(width,)``."""
+
+    def __init__(self, width: int) -> None:
+        self.scale = jnp.ones((width,), jnp.float32)
+        self.offset = jnp.zeros((width,), jnp.float32)
+
+    def __call__(self, x: Array) -> Array:
+        """Returns ``x`` with mean 0 and variance 1 along its last axis, scaled and shifted."""
+        mean = jnp.mean(x, axis=-1, keepdims=True)
+        centred = x - mean
+        variance = jnp.mean(jnp.square(centred), axis=-1, keepdims=True)
+        return centred * jax.lax.rsqrt(variance + 1e-5) * self.scale[None] + self.offset[None]
+
+
+class MLP(eqx.Module):
+    """Hidden layers, each a linear map, an optional layer norm and a nonlinearity. No output layer."""
+
+    layers: tuple[Linear, ...]
+    norms: tuple[LayerNorm, ...]
+    activation: str = eqx.field(static=True)
+
+    def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str, layer_norm: bool) -> None:
+        keys = jax.random.split(key, max(len(widths), 1))
+        sizes = (n_inputs, *widths)
+        self.layers = tuple(Linear(k, i, o) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=False))
+        self.norms = tuple(LayerNorm(width) for width in widths) if layer_norm else ()
+        self.activation = activation
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, widths[-1])``."""
+        for i, layer in enumerate(self.layers):
+            x = layer(x)
+            if self.norms:
+                x = self.norms[i](x)
+            x = ACTIVATIONS[self.activation](x)
+        return x

@@ -1,0 +1,147 @@
+"""Hidden layers beyond a plain stack (branches, SimBa, a module of the user's), and the choice among all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear
+from rejeu.networks.shape import PolicyConfig
+
+
+class Branches(eqx.Module):
+    """Hidden layers that observation and action go through apart before they meet; see ``docs/networks.md``."""
+
+    state: MLP
+    action: MLP | None
+    """None in an actor."""
+    common: MLP
+    last: MLP
+
+    def __init__(
+        self, key: Array, n_features: int, action_dim: int | None, widths: Sequence[int], shape: PolicyConfig
+    ) -> None:
+        """Builds the branches of ``shape``, ``widths`` being those of the last part; no action branch for None."""
+        keys = jax.random.split(key, 4)
+        layers = lambda k, n_inputs, sizes: MLP(k, n_inputs, sizes, shape.activation_fn, shape.layer_norm)  # noqa: E731
+        self.state = layers(keys[0], n_features, shape.state_layers)
+        self.action = None if action_dim is None else layers(keys[1], action_dim, shape.action_layers)
+        n_joined = (n_features, *shape.state_layers)[-1]
+        n_joined += 0 if action_dim is None else (action_dim, *shape.action_layers)[-1]
+        self.common = layers(keys[2], n_joined, shape.common_layers)
+        self.last = layers(keys[3], (n_joined, *shape.common_layers)[-1], widths)
+
+    def __call__(self, features: Array, action: Array | None = None) -> Array:
+        """Maps features ``(batch, n_features)`` and actions ``(batch, action_dim)`` to ``(batch, n_outputs)``."""
+        x = self.state(features)
+        if self.action is not None:
+            assert action is not None
+            x = jnp.concatenate([x, self.action(action)], axis=-1)
+        return self.last(self.common(x))
+
+
+class ResidualBlock(eqx.Module):
+    """``x + W2 f(W1 LayerNorm(x))``, four times as wide inside."""
+
+    norm: LayerNorm
+    expand: Linear
+    contract: Linear
+    activation: str = eqx.field(static=True)
+
+    def __init__(self, key: Array, width: int, activation: str) -> None:
+        expand_key, contract_key = jax.random.split(key)
+        self.norm = LayerNorm(width)
+        self.expand = Linear(expand_key, width, 4 * width)
+        self.contract = Linear(contract_key, 4 * width, width)
+        self.activation = activation
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, width)`` to the same shape."""
+        return x + self.contract(ACTIVATIONS[self.activation](self.expand(self.norm(x))))
+
+
+class SimBa(eqx.Module):
+    """A linear embedding, residual blocks and a final layer norm.
+
+    Source: Lee et al. 2024, "SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement Learning" (arXiv
+    2410.09754). The paper's running normalisation of observations is not part of it: give the agent ``normalize=True`` if
+    their scales differ much. Nor is there a layer norm at the entrance, which would mix the units of unlike observations.
+    Weights are drawn as in all our layers rather than as the authors draw them.
+    """
+
+    embedding: Linear
+    blocks: tuple[ResidualBlock, ...]
+    norm: LayerNorm
+
+    def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str) -> None:
+        """Builds ``len(widths)`` blocks of the one width that ``widths`` repeats."""
+        embedding_key, *block_keys = jax.random.split(key, 1 + len(widths))
+        self.embedding = Linear(embedding_key, n_inputs, widths[0])
+        self.blocks = tuple(ResidualBlock(k, width, activation) for k, width in zip(block_keys, widths, strict=True))
+        self.norm = LayerNorm(widths[-1])
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, width)``."""
+        x = self.embedding(x)
+        for block in self.blocks:
+            x = block(x)
+        return self.norm(x)
+
+
+Torso = MLP | Branches | SimBa | Any
+"""Hidden layers: rejeu's own, or any module of the user's."""
+
+
+def make_torso(
+    key: Array, n_features: int, action_dim: int | None, widths: Sequence[int], shape: PolicyConfig
+) -> tuple[Torso, int]:
+    """Returns the hidden layers that ``shape`` asks for, and how many numbers come out of them.
+
+    Args:
+        key: draws their weights.
+        n_features: length of the encoded observation.
+        action_dim: of a critic that is given actions; None for a network without.
+        widths: what ``shape.actor_widths`` or ``shape.critic_widths`` said.
+        shape: which kind of torso.
+    """
+    n_inputs = n_features + (action_dim or 0)
+    if shape.torso is not None:
+        torso = own_torso(shape.torso, key, n_inputs)
+        return torso, torso.n_outputs
+    if shape.has_branches:
+        branches = Branches(key, n_features, action_dim, widths, shape)
+        joined = (n_features, *shape.state_layers)[-1]
+        joined += 0 if action_dim is None else (action_dim, *shape.action_layers)[-1]
+        return branches, (joined, *shape.common_layers, *widths)[-1]
+    if shape.architecture == "simba":
+        return SimBa(key, n_inputs, widths, shape.activation_fn), widths[-1]
+    return MLP(key, n_inputs, widths, shape.activation_fn, shape.layer_norm), (n_inputs, *widths)[-1]
+
+
+def own_torso(make: Callable[[Array, int], Any], key: Array, n_inputs: int) -> Any:
+    """Returns the user's module, checked: all that it holds must be learnable or static.
+
+    Raises:
+        TypeError: if it is no ``equinox.Module``, has no ``n_outputs``, or has leaves that are no float32 arrays.
+    """
+    torso = make(key, n_inputs)
+    name = getattr(make, "__name__", repr(make))
+    if not isinstance(torso, eqx.Module):
+        raise TypeError(f"torso={name} made {type(torso).__name__}, expected an equinox.Module")
+    n_outputs = getattr(torso, "n_outputs", None)
+    if not isinstance(n_outputs, int) or n_outputs < 1:
+        raise TypeError(f"torso={name} needs the attribute n_outputs: int = eqx.field(static=True), got {n_outputs!r}")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(torso):
+        if not isinstance(leaf, jax.Array) or leaf.dtype != jnp.float32:
+            kind = f"array of {leaf.dtype}" if isinstance(leaf, jax.Array) else type(leaf).__name__
+            where = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise TypeError(
+                f"torso={name} holds {where}, which is of type {kind} and cannot be learnt; declare that field "
+                "eqx.field(static=True)"
+            )
+    return torso
