@@ -1,0 +1,201 @@
+"""The network of policy and value, for every kind of action."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms.actor_critic.config import ActorCriticConfig
+from rejeu.core import Masked, PyTree
+from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
+from rejeu.exploration.state_dependent import sde_log_std
+from rejeu.networks import Convolution, Encoder, Linear, Torso, make_torso
+from rejeu.spaces import Leaf
+
+HIDDEN_LAYERS = (64, 64)
+"""Default widths of policy and value."""
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Bounds of a log standard deviation that depends on the observation, in nats."""
+POLICY_GAIN, VALUE_GAIN, HIDDEN_GAIN = 0.01, 1.0, math.sqrt(2.0)
+"""Gains of the orthogonal initialisation: a policy that begins nearly the same everywhere explores evenly."""
+
+
+class ActionKind(NamedTuple):
+    """What a policy must give for an action space; static and hashable."""
+
+    kind: Literal["box", "categorical", "binary"]
+    sizes: tuple[int, ...]
+    """Box: the number of components. Discrete and MultiDiscrete: possibilities of each choice. MultiBinary: the bits."""
+    single: bool
+    """Whether an action is one choice without an axis (Discrete)."""
+
+    @property
+    def n_outputs(self) -> int:
+        """Numbers that the policy's head gives, leaving out a standard deviation."""
+        return sum(self.sizes)
+
+
+def action_kind(space: spaces.Space) -> ActionKind:
+    """Returns the kind of a checked action space (see :func:`rejeu.spaces.check_action`)."""
+    if isinstance(space, spaces.Box):
+        return ActionKind("box", (int(np.prod(space.shape, dtype=int)),), False)
+    if isinstance(space, spaces.Discrete):
+        return ActionKind("categorical", (int(space.n),), True)
+    if isinstance(space, spaces.MultiDiscrete):
+        return ActionKind("categorical", tuple(int(n) for n in space.nvec.ravel()), False)
+    assert isinstance(space, spaces.MultiBinary)
+    return ActionKind("binary", (int(np.prod(space.shape, dtype=int)),), False)
+
+
+Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli
+
+
+class ActorCritic(eqx.Module):
+    """Observation to a distribution over actions and to a value."""
+
+    encoder: Encoder
+    torso: Torso
+    head: Linear
+    log_std: Array | None
+    """``(action_dim,)``, with gSDE ``(width, action_dim)``; None where the head gives it or there is none."""
+    value_encoder: Encoder | None
+    """None where the policy's is shared."""
+    value_torso: Torso | None
+    """None where the policy's is shared."""
+    value_head: Linear
+    action: ActionKind = eqx.field(static=True)
+    shape: ActorCriticConfig = eqx.field(static=True)
+
+    def __init__(
+        self,
+        key: Array,
+        leaves: tuple[Leaf, ...],
+        action: ActionKind,
+        shape: ActorCriticConfig,
+        use_sde: bool = False,
+    ) -> None:
+        """Draws the weights."""
+        keys = jax.random.split(key, 6)
+        widths, value_widths = shape.actor_widths(HIDDEN_LAYERS), shape.critic_widths(HIDDEN_LAYERS)
+        std = shape.state_dependent_std and action.kind == "box"
+        encoder = Encoder(leaves, keys[0])
+        torso, n_hidden = make_torso(keys[1], encoder.n_features, None, widths, shape)
+        head = Linear(keys[2], n_hidden, action.n_outputs * (2 if std else 1))
+        value_encoder = None if shape.share_features_extractor else Encoder(leaves, keys[3])
+        value_torso, n_value = (
+            (None, n_hidden)
+            if shape.share_layers
+            else make_torso(keys[4], encoder.n_features, None, value_widths, shape)
+        )
+        value_head = Linear(keys[5], n_value, 1)
+        if shape.ortho_init:
+            fresh = jax.random.split(jax.random.fold_in(key, 1), 6)
+            encoder, torso = orthogonal(encoder, fresh[0], HIDDEN_GAIN), orthogonal(torso, fresh[1], HIDDEN_GAIN)
+            value_encoder = orthogonal(value_encoder, fresh[3], HIDDEN_GAIN)
+            value_torso = orthogonal(value_torso, fresh[4], HIDDEN_GAIN)
+            head, value_head = orthogonal(head, fresh[2], POLICY_GAIN), orthogonal(value_head, fresh[5], VALUE_GAIN)
+        if std:
+            bias = head.bias.at[action.n_outputs :].set(shape.log_std_init)
+            head = eqx.tree_at(lambda linear: linear.bias, head, bias)
+        self.encoder, self.torso, self.head = encoder, torso, head
+        self.value_encoder, self.value_torso, self.value_head = value_encoder, value_torso, value_head
+        has_log_std = action.kind == "box" and not std
+        std_shape = (n_hidden, action.n_outputs) if use_sde else (action.n_outputs,)
+        self.log_std = jnp.full(std_shape, shape.log_std_init, jnp.float32) if has_log_std else None
+        self.action, self.shape = action, shape
+
+    def policy(self, obs: PyTree) -> Distribution:
+        """Returns the distribution of actions at observations ``(batch, ...)``, which may be :class:`Masked`."""
+        obs, mask = unmasked(obs)
+        return self.distribution(self.hidden(obs), mask)
+
+    def hidden(self, obs: PyTree) -> Array:
+        """Returns the policy's last hidden layer at observations ``(batch, ...)``."""
+        return self.torso(self.encoder(obs))
+
+    def value(self, obs: PyTree) -> Array:
+        """Returns the values of observations ``(batch, ...)``, ``(batch,)``."""
+        obs, _ = unmasked(obs)
+        encoder = self.encoder if self.value_encoder is None else self.value_encoder
+        torso = self.torso if self.value_torso is None else self.value_torso
+        return self.value_head(torso(encoder(obs)))[:, 0]
+
+    def both(self, obs: PyTree) -> tuple[Distribution, Array]:
+        """Returns :meth:`policy` and :meth:`value`, computing what they share once."""
+        obs, mask = unmasked(obs)
+        features = self.encoder(obs)
+        hidden = self.torso(features)
+        value_features = features if self.value_encoder is None else self.value_encoder(obs)
+        value_hidden = hidden if self.value_torso is None else self.value_torso(value_features)
+        return self.distribution(hidden, mask), self.value_head(value_hidden)[:, 0]
+
+    def distribution(self, hidden: Array, mask: Array | None) -> Distribution:
+        """Returns the distribution that the last hidden layer ``(batch, width)`` asks for."""
+        outputs = self.head(hidden)
+        if self.action.kind == "box":
+            if self.log_std is None:
+                outputs, log_std = jnp.split(outputs, 2, axis=-1)
+                log_std = jnp.clip(log_std, *LOG_STD_RANGE)
+            else:
+                log_std = self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden)
+                if not self.shape.learn_std:
+                    log_std = jax.lax.stop_gradient(log_std)
+            return (TanhNormal if self.shape.squash_output else Normal)(outputs, log_std)
+        if mask is not None:
+            outputs = jnp.where(mask, outputs, jnp.float32(FORBIDDEN))
+        if self.action.kind == "binary":
+            return Bernoulli(outputs)
+        if self.action.single:
+            return Categorical(outputs)
+        ends = np.cumsum(self.action.sizes)[:-1].tolist()
+        return MultiCategorical(tuple(Categorical(part) for part in jnp.split(outputs, ends, axis=-1)))
+
+
+def unmasked(obs: PyTree) -> tuple[PyTree, Array | None]:
+    """Returns an observation and its mask, None where it has none."""
+    return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)
+
+
+def orthogonal(module: Any, key: Array, gain: float) -> Any:
+    """Returns ``module`` with the weights of every linear layer and convolution orthogonal times ``gain``, biases 0.
+
+    Source: Saxe et al. 2014, "Exact solutions to the nonlinear dynamics of learning" (arXiv 1312.6120). None stays None.
+    """
+    drawn = 0
+
+    def draw(node: Any) -> Any:
+        nonlocal drawn
+        if not isinstance(node, Linear | Convolution):
+            return node
+        drawn += 1
+        initializer = jax.nn.initializers.orthogonal(gain)
+        weight = node.weight.reshape(-1, node.weight.shape[-1])
+        fresh = initializer(jax.random.fold_in(key, drawn), weight.shape, jnp.float32).reshape(node.weight.shape)
+        return eqx.tree_at(lambda n: (n.weight, n.bias), node, (fresh, jnp.zeros_like(node.bias)))
+
+    return jax.tree.map(draw, module, is_leaf=lambda node: isinstance(node, Linear | Convolution))
+
+
+def is_value(network: Any) -> Any:
+    """Returns a tree like ``network``, an :class:`ActorCritic` or a module that holds one, of bools.
+
+    They say of each array whether it belongs to the value alone.
+    """
+    if not isinstance(network, ActorCritic):
+        mark = lambda node: is_value(node) if isinstance(node, ActorCritic) else False  # noqa: E731
+        return jax.tree.map(mark, network, is_leaf=lambda node: isinstance(node, ActorCritic))
+    parts = (network.value_encoder, network.value_torso, network.value_head)
+    flags = jax.tree.map(lambda _: False, network)
+    return eqx.tree_at(
+        lambda n: (n.value_encoder, n.value_torso, n.value_head),
+        flags,
+        jax.tree.map(lambda _: True, parts),
+        is_leaf=lambda node: node is None,
+    )
