@@ -10,8 +10,7 @@ import pytest
 from rich.console import Console
 
 import rejeu
-from rejeu import callbacks
-from rejeu.callbacks import Evaluate, Film, ProgressBar, better, crossed, stop_on_return, stop_on_success
+from rejeu.callbacks import Evaluate, Film, ProgressBar, better, crossed, progress_bar, stop_on_return, stop_on_success
 from rejeu.evaluation import Evaluation
 from rejeu.history import History
 from rejeu.loops.host import Episode, Progress
@@ -161,7 +160,7 @@ def test_progress_bar_prints_plain_lines_without_a_terminal():
 
 def test_progress_bar_prints_a_line_every_ten_seconds_without_a_terminal(monkeypatch):
     ticks = iter(range(0, 1000, 3))
-    monkeypatch.setattr(callbacks.time, "perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr(progress_bar.time, "perf_counter", lambda: float(next(ticks)))
     text = shown(20, None, range(1, 21), Console(file=io.StringIO(), force_terminal=False, width=200))
     lines = text.splitlines()
     assert [line.split("/20")[0].split()[-1] for line in lines] == ["5", "9", "13", "17", "20"]
@@ -183,7 +182,7 @@ def steps_that_grow_slower(step):
 
 def test_progress_bar_says_what_the_time_went_into_lately(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr(callbacks.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(progress_bar.time, "perf_counter", lambda: clock[0])
 
     def spent(step):
         clock[0] = float(step)

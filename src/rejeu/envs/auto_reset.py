@@ -18,6 +18,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs import answers, conversions, faults
 from rejeu.envs.contract import VectorEnv
+from rejeu.envs.in_process import InProcess
 from rejeu.envs.vec_env import Indices, StepResult, VecEnv, VecEnvWrapper, is_wrapped, tile
 from rejeu.errors import BadEnvironmentError
 from rejeu.video import VideoFile, check_renders, rgb_frame
@@ -154,6 +155,14 @@ def around(envs: Sequence[gym.Env]) -> DummyVecEnv:
     """Returns a vector environment of environments that are there already."""
     remaining = iter(envs)
     return DummyVecEnv([lambda: next(remaining)] * len(envs))
+
+
+def identities(env: VectorEnv | VecEnv) -> set[int]:
+    """Identifies a vector and the environments behind it, so that two vectors around the same ones are recognised."""
+    venv = env if isinstance(env, VecEnv) else env.venv
+    vectors = (env, env if venv is None else venv.unwrapped)
+    inside = [one for vector in vectors if isinstance(vector, InProcess | DummyVecEnv) for one in vector.envs]
+    return {id(one) for one in (*vectors, *inside)}
 
 
 class AutoResetView(VecEnv):

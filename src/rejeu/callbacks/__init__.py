@@ -1,0 +1,43 @@
+"""What else happens while an agent learns: evaluation, checkpoints, a progress bar, stopping early.
+
+A callback is anything that ``agent.learn`` can call after every step of the environments as
+``callback(agent, progress)``; ``False``, and nothing else, stops training. All frequencies are in environment steps,
+whatever the number of environments.
+"""
+
+from rejeu.agents.checkpoints import Checkpoint
+from rejeu.callbacks.due import crossed, step_before
+from rejeu.callbacks.evaluate import EVALUATED, EVALUATION, Evaluate, Evaluated, better, merit
+from rejeu.callbacks.film import Film
+from rejeu.callbacks.progress_bar import (
+    LINE_SECONDS,
+    RATE_SECONDS,
+    REFRESH_SECONDS,
+    ProgressBar,
+    duration,
+    status,
+    time_spent,
+)
+from rejeu.callbacks.stopping import stop_on_return, stop_on_success
+
+__all__ = [
+    "EVALUATED",
+    "EVALUATION",
+    "LINE_SECONDS",
+    "RATE_SECONDS",
+    "REFRESH_SECONDS",
+    "Checkpoint",
+    "Evaluate",
+    "Evaluated",
+    "Film",
+    "ProgressBar",
+    "better",
+    "crossed",
+    "duration",
+    "merit",
+    "status",
+    "step_before",
+    "stop_on_return",
+    "stop_on_success",
+    "time_spent",
+]

@@ -1,0 +1,147 @@
+"""Evaluation in the course of training, and which of two evaluations is the better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.callbacks.due import crossed, step_before
+from rejeu.config import whole
+from rejeu.envs.auto_reset import identities
+from rejeu.envs.vector import VectorEnv, make_vector
+from rejeu.evaluation import Evaluation
+from rejeu.loops.host import Progress
+
+if TYPE_CHECKING:
+    from rejeu.agents import Agent
+
+EVALUATED = ("returns", "lengths", "successes")
+"""The arrays of an :class:`Evaluation`."""
+EVALUATION = 0x4556
+"""Sets the random numbers of evaluations apart from all others."""
+
+
+class Evaluated(NamedTuple):
+    """One evaluation during a run."""
+
+    step: int
+    """Environment steps taken in all when it was made."""
+    evaluation: Evaluation
+    """What it came to."""
+
+
+class Evaluate:
+    """Evaluates the deterministic policy every so many steps, on environments of its own, and keeps the best model.
+
+    ``agent.restore_best()`` puts the best weights back.
+
+    >>> import rejeu
+    >>> evaluate = Evaluate("Pendulum-v1", every=200, episodes=2, seed=0)
+    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", learning_starts=400, seed=0).learn(400, evaluate)
+    >>> [result.step for result in evaluate.results]
+    [200, 400]
+    """
+
+    def __init__(
+        self,
+        env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv | VectorEnv,
+        every: int,
+        episodes: int = 20,
+        best_path: str | Path | None = None,
+        seed: int | None = None,
+        report: Callable[[Evaluated, bool], object] | None = None,
+    ) -> None:
+        """Makes the environments at once, so that a wrong name is found before training.
+
+        Args:
+            env: as for the agent; an id or a function is made into at most 16 environments. Never the agent's own.
+            every: environment steps between two evaluations.
+            episodes: of each evaluation.
+            best_path: where the best model so far is saved, replacing the one before it; None for nowhere.
+            seed: with the number of steps taken, of the environments at each evaluation; None takes the agent's.
+            report: called with each result and whether it is the best so far.
+        """
+        self.every = whole("every", every, least=1)
+        self.episodes = whole("episodes", episodes, least=1)
+        self.best_path = None if best_path is None else Path(best_path)
+        self.report = report
+        self.results: list[Evaluated] = []
+        """Every evaluation so far, oldest first."""
+        self.best: Evaluated | None = None
+        """The best so far: by success rate, then by mean return."""
+        self._made_here = isinstance(env, str) or callable(env)
+        self.env = make_vector(env, min(self.episodes, 16) if self._made_here else 1, seed=seed)
+        self.seed = seed
+        self._last_step: int | None = None
+
+    def __call__(self, agent: Agent, progress: Progress) -> None:
+        """Evaluates if an evaluation has fallen due in this step."""
+        before = step_before(agent, progress) if self._last_step is None else self._last_step
+        self._last_step = progress.step
+        if crossed(before, progress.step, self.every):
+            self.run(agent, progress.step)
+
+    def run(self, agent: Agent, step: int) -> Evaluated:
+        """Evaluates now, whatever ``every`` says, and returns the result, which is also kept.
+
+        Raises:
+            ValueError: if the environments are those that the agent trains on.
+        """
+        if agent.env is not None and identities(agent.env) & identities(self.env):
+            raise ValueError("Evaluate was given the environments that the agent trains on; give it others, or an id")
+        root = agent.seed if self.seed is None else self.seed
+        seed = int(np.random.SeedSequence([root, step, EVALUATION]).generate_state(1)[0])
+        result = Evaluated(step, agent.evaluate(self.episodes, env=self.env, seed=seed))
+        self.results.append(result)
+        is_best = self.best is None or better(result.evaluation, self.best.evaluation)
+        if is_best:
+            self.best = result
+            agent.remember_best(merit(result.evaluation), "evaluation")
+            if self.best_path is not None:
+                agent.save(self.best_path)
+        if self.report is not None:
+            self.report(result, is_best)
+        return result
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns every result so far, as plain data for a checkpoint."""
+        parts = [r.evaluation for r in self.results]
+        columns = {key: [getattr(part, key) for part in parts] for key in EVALUATED}
+        return {
+            "steps": np.array([r.step for r in self.results], np.int64),
+            "counts": np.array([len(part.returns) for part in parts], np.int64),
+            **{key: np.concatenate([np.zeros(0), *arrays]) for key, arrays in columns.items()},
+            "best": None if self.best is None else self.results.index(self.best),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes back what :meth:`state_dict` returned."""
+        ends = np.cumsum(state["counts"])[:-1]
+        returns, lengths, successes = (np.split(state[key], ends) for key in EVALUATED)
+        parts = zip(state["steps"].tolist(), returns, lengths, successes, strict=False)
+        self.results = [Evaluated(step, Evaluation(r, n.astype(int), s)) for step, r, n, s in parts]
+        self.best = None if state["best"] is None else self.results[state["best"]]
+
+    def close(self) -> None:
+        """Releases the environments, unless they were given ready-made."""
+        if self._made_here:
+            self.env.close()
+
+
+def better(evaluation: Evaluation, other: Evaluation) -> bool:
+    """Returns whether an evaluation beats another: by success rate, then by mean return.
+
+    An unknown success rate counts as none, so where the environment does not say, the return decides.
+    """
+    return merit(evaluation) > merit(other)
+
+
+def merit(evaluation: Evaluation) -> tuple[float, float]:
+    """Returns what evaluations are compared by: success rate, -1 where it is unknown, and mean return."""
+    rate = evaluation.success_rate
+    return (-1.0 if math.isnan(rate) else rate), evaluation.mean_return

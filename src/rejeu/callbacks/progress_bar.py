@@ -1,0 +1,186 @@
+"""How far training has come, as a bar or as lines, and what its time went into."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+from rejeu.callbacks.due import step_before
+from rejeu.loops.host import Progress, time_shares
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rejeu.agents import Agent
+
+REFRESH_SECONDS = 0.125
+"""Least time between two refreshes of the progress bar on a terminal."""
+LINE_SECONDS = 10.0
+"""Least time between two lines of progress where the output is no terminal."""
+RATE_SECONDS = 10.0
+"""Stretch over which the shown steps per second and shares of time are measured."""
+
+
+class _Mark(NamedTuple):
+    """Where a run stood at a moment."""
+
+    time: float
+    step: int
+    seconds: dict[str, float]
+    """See :attr:`Agent.seconds`."""
+
+
+class ProgressBar:
+    """Shows how far training has come; on a terminal as a bar, elsewhere as a line every ten seconds.
+
+    Beneath the bar, or at the end of the line, stands what the time went into: the environment's steps and resets, the replay
+    buffer, the update (off-policy: the time that the loop waited for the device) and everything else.
+
+    Between two refreshes a call costs a look at the clock.
+    """
+
+    def __init__(
+        self,
+        n_steps: int | None,
+        seconds: float | None,
+        console: Console | None = None,
+        taken: int = 0,
+        spent: float = 0.0,
+    ) -> None:
+        """Starts counting time; the bar appears with the first step.
+
+        Args:
+            n_steps: environment steps that will be taken, None if only time ends the run.
+            seconds: wall time after which the run ends, None if only steps do.
+            console: where to write; None: standard output.
+            taken: how many of the steps a resumed run had taken before.
+            spent: how much of the wall time it had taken, in seconds.
+        """
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
+
+        self.n_steps, self.seconds = n_steps, seconds
+        self._console = Console() if console is None else console
+        widgets = self._console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
+        self._animated = widgets or (self._console.is_terminal and not self._console.is_dumb_terminal)
+        columns = (BarColumn(bar_width=None), TaskProgressColumn(), TextColumn("{task.description}", markup=False))
+        self._bar = RichProgress(*columns, console=self._console, auto_refresh=False, expand=True)
+        self._task = self._bar.add_task("", total=1.0)
+        self._began = time.perf_counter()
+        self._refresh_at = 0.0
+        self._taken, self._spent = taken, spent
+        self._first_step = 0
+        self._latest: tuple[Agent, int] | None = None
+        self._shown_step = -1
+        self._marks: deque[_Mark] = deque()
+
+    def __call__(self, agent: Agent, progress: Progress) -> None:
+        """Takes note of the step, and shows it if the last refresh is long enough ago."""
+        now = time.perf_counter()
+        if self._latest is None:
+            self._start(agent, progress, now)
+        self._latest = agent, progress.step
+        if now >= self._refresh_at:
+            self._refresh(agent, progress.step, now)
+
+    def close(self) -> None:
+        """Shows where the run ended and gives the terminal back."""
+        if self._latest is None:
+            return
+        agent, step = self._latest
+        if step != self._shown_step:
+            self._refresh(agent, step, time.perf_counter())
+        if self._animated:
+            self._bar.stop()
+
+    def _start(self, agent: Agent, progress: Progress, now: float) -> None:
+        before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
+        self._first_step = before - self._taken
+        self._marks.append(_Mark(self._began, before, agent.seconds))
+        if self._animated:
+            self._bar.start()
+        else:
+            self._refresh_at = now + LINE_SECONDS
+
+    def _refresh(self, agent: Agent, step: int, now: float) -> None:
+        self._shown_step = step
+        self._refresh_at = now + (REFRESH_SECONDS if self._animated else LINE_SECONDS)
+        self._marks.append(_Mark(now, step, agent.seconds))
+        while len(self._marks) > 2 and self._marks[1].time <= now - RATE_SECONDS:
+            self._marks.popleft()
+        then, done = self._marks[0], step - self._first_step
+        rate = (step - then.step) / max(now - then.time, 1e-9)
+        shares, left = [], []
+        if self.n_steps is not None:
+            shares.append(done / self.n_steps)
+            left.append((self.n_steps - done) / max(rate, 1e-9))
+        if self.seconds is not None:
+            spent_seconds = self._spent + now - self._began
+            shares.append(spent_seconds / self.seconds)
+            left.append(max(self.seconds - spent_seconds, 0.0))
+        share = min(max(shares, default=0.0), 1.0)
+        text = status(
+            done, self.n_steps, rate, _mean(e["r"] for e in agent.ep_info_buffer), _mean(agent.ep_success_buffer),
+            min(left, default=math.nan),
+        )  # fmt: skip
+        spent = time_spent(then.seconds, agent.seconds)
+        if self._animated:
+            self._bar.update(self._task, completed=share, description="\n".join(filter(None, (text, spent))))
+            self._bar.refresh()
+        else:
+            line = " · ".join(filter(None, (text, spent)))
+            self._console.print(f"{share:4.0%}  {line}", soft_wrap=True, highlight=False, markup=False)
+            self._console.file.flush()
+
+
+def status(
+    step: int, n_steps: int | None, rate: float, mean_return: float, success_rate: float, seconds_left: float
+) -> str:
+    """Returns one line on a run: steps, steps per second, return, success rate, time left; NaN is left out.
+
+    >>> status(1500, 20_000, 812.3, -1204.5, math.nan, 22.8)
+    '1,500/20,000 steps · 812/s · return -1,204.50 · 0:23 left'
+    """
+    parts = [f"{step:,}" + ("" if n_steps is None else f"/{n_steps:,}") + " steps", f"{rate:,.0f}/s"]
+    if not math.isnan(mean_return):
+        parts.append(f"return {mean_return:,.2f}")
+    if not math.isnan(success_rate):
+        parts.append(f"success {success_rate:.0%}")
+    if not math.isnan(seconds_left):
+        parts.append(f"{duration(seconds_left)} left")
+    return " · ".join(parts)
+
+
+def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
+    """Returns what the time between two readings of ``agent.seconds`` went into, empty if none has passed.
+
+    >>> time_spent(
+    ...     {"env": 1.0, "replay": 0.5, "update": 3.0, "total": 5.0},
+    ...     {"env": 2.2, "replay": 1.4, "update": 10.0, "total": 15.0},
+    ... )
+    'env 12% · replay 9% · update 70% · rest 9%'
+    """
+    passed = {part: now[part] - before[part] for part in now}
+    if passed["total"] <= 0.0:
+        return ""
+    return " · ".join(f"{part} {max(share, 0.0):.0%}" for part, share in time_shares(passed).items())
+
+
+def duration(seconds: float) -> str:
+    """Returns a time as ``m:ss`` or ``h:mm:ss``.
+
+    >>> duration(59.6), duration(3725)
+    ('1:00', '1:02:05')
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _mean(values: Iterable[float]) -> float:
+    values = list(values)
+    return sum(values) / len(values) if values else math.nan

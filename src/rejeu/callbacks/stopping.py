@@ -1,0 +1,48 @@
+"""Callbacks that stop training once the policy is good enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rejeu.config import whole
+from rejeu.loops.host import Episode, Progress
+
+if TYPE_CHECKING:
+    from rejeu.agents import Agent, Callback
+
+
+def stop_on_return(threshold: float, episodes: int = 100) -> Callback:
+    """Returns a callback that stops once the mean return of the last ``episodes`` episodes is at least ``threshold``.
+
+    >>> import rejeu
+    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", learning_starts=10_000, seed=0)
+    >>> agent.learn(10_000, stop_on_return(-5_000, episodes=2)).num_timesteps
+    400
+    """
+    return _stop_on_mean(threshold, episodes, lambda episode: episode.episode_return)
+
+
+def stop_on_success(rate: float, episodes: int = 100) -> Callback:
+    """Returns a callback that stops once at least ``rate`` (in [0, 1]) of the last ``episodes`` episodes succeeded.
+
+    In an environment that does not say whether an episode succeeded it never stops.
+
+    Raises:
+        ValueError: if ``rate`` is not a share.
+    """
+    if not 0 <= rate <= 1:
+        raise ValueError(f"rate={rate} must be a share in [0, 1]; for 90 % write 0.9")
+    return _stop_on_mean(rate, episodes, lambda episode: episode.success)
+
+
+def _stop_on_mean(least: float, episodes: int, value: Callable[[Episode], float]) -> Callback:
+    whole("episodes", episodes, least=1)
+
+    def stop(agent: Agent, progress: Progress) -> bool:
+        last = agent.history.last(episodes) if progress.episodes else []
+        return not (len(last) == episodes and np.mean([value(episode) for episode in last]) >= least)
+
+    return stop
