@@ -48,6 +48,7 @@ ALLOWED = {
     "evaluation.py": {"globals()"},
     # The names of the fields of our own dataclasses, and settings that a class lists in its own source.
     "agents/base.py": {"getattr"},
+    "agents/description.py": {"getattr"},
     "agents/checkpoints.py": {"getattr"},
     "agents/resuming.py": {"getattr"},
     "callbacks/evaluate.py": {"getattr"},

@@ -12,60 +12,41 @@ import secrets
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import jax
 import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, finite, spaces, summary
-from rejeu.agents import files, resuming
+from rejeu.agents import best, evaluating, files, learning, predicting, resuming, statistics
 from rejeu.agents.call import Call
-from rejeu.agents.checkpoints import Checkpoint, RowFiles
+from rejeu.agents.checkpoints import RowFiles
+from rejeu.agents.description import ClassOnly, describe
 from rejeu.agents.files import AGENT_ARGUMENTS
 from rejeu.agents.loading import whole_seed
+from rejeu.agents.policies import check_policy
 from rejeu.agents.resuming import Resumed
 from rejeu.envs.auto_reset import AutoResetView, around
 from rejeu.envs.masks import split
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vec_normalize import VecNormalize, unwrap_vec_normalize
 from rejeu.envs.vector import Backend, InProcess, VectorEnv
-from rejeu.errors import NonFiniteError
-from rejeu.evaluation import Evaluation, evaluate
+from rejeu.evaluation import Evaluation
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.history import History
-from rejeu.hooks import BaseCallback, Hooks, told_apart
-from rejeu.interrupt import Interrupt
-from rejeu.logging import Console, Logger, Sink, TensorBoard, next_folder
+from rejeu.hooks import BaseCallback
+from rejeu.logging import Logger, Sink
 from rejeu.loops import host
 from rejeu.loops.compiled import Compiled, PackedState
-from rejeu.loops.host import Episode, Progress, Run
+from rejeu.loops.host import Progress, Run
 from rejeu.running_stats import normalised
 
 Callback = Callable[["Agent", Progress], bool | None]
 """Called after every step of the environments; ``False``, and nothing else, stops training."""
-
-POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
-
-BEST_WINDOW = 20
-"""Training episodes over whose mean return the best weights are judged."""
-
-
-class Best(NamedTuple):
-    """The best weights of a run so far."""
-
-    score: float | tuple[float, ...]
-    """Mean training return, or what evaluations are judged by: success rate and mean return."""
-    by: str
-    """``"training"`` or ``"evaluation"``."""
-    step: int
-    """Environment steps taken when they were kept."""
-    state: PackedState
-    """The algorithm's whole state at that moment, packed."""
 
 
 class Agent(ABC):
@@ -110,7 +91,7 @@ class Agent(ABC):
         )
         self._own_env = isinstance(env, str)
         vector = self._vector(env, 1, seed=self.seed)
-        self._check_policy(policy, vector.observation_space)
+        check_policy(policy, vector.observation_space)
         self._build(vector.observation_space, vector.action_space, vector.n_envs)
         self._start(vector)
 
@@ -138,7 +119,7 @@ class Agent(ABC):
         """The number of that signal."""
         self.logger = Logger()
         """Takes further numbers for the rows of statistics."""
-        self.best: Best | None = None
+        self.best: best.Best | None = None
         """The best weights so far, by smoothed training return or by evaluation."""
         self.steps_per_second = math.nan
         """Environment steps per second of the present or last ``learn``."""
@@ -208,20 +189,6 @@ class Agent(ABC):
     @abstractmethod
     def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         """Returns the loop."""
-
-    @staticmethod
-    def _check_policy(policy: str, space: gym.Space) -> None:
-        if policy not in POLICIES:
-            raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
-        is_dict = isinstance(space, gym.spaces.Dict)
-        if policy == "MlpPolicy" and is_dict:
-            raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
-        if policy == "MultiInputPolicy" and not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-            raise ValueError(
-                f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'"
-            )
-        if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in spaces.leaves(space)):
-            raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
 
     @property
     def name(self) -> str:
@@ -295,146 +262,14 @@ class Agent(ABC):
         Raises:
             ValueError: without an environment, or if no limit is given.
         """
-        if self._run.env is None:
-            raise ValueError(
-                "this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)"
-            )
-        goes_on = total_timesteps is None and minutes is None and episodes is None
-        if goes_on:
-            call = self._call_to_go_on_with()
-        else:
-            call = Call(
-                n_steps=None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1),
-                n_episodes=None if episodes is None else configs.whole("episodes", episodes, least=1),
-                seconds=None if minutes is None else 60 * configs.number("minutes", minutes, above=0),
-                first_step=self._run.step,
-                first_episode=self._run.episode,
-                log_interval=log_interval,
-                logged=len(self.history),
-            )
-            if reset_num_timesteps:
-                self._steps_before = self._run.step
-        if self._run.env.venv is not None and (reset_num_timesteps or goes_on):  # may have been stepped by hand since
-            self._run.obs = self._run.action = None
-        hooks, callbacks = told_apart(callback)
-        savers = [one for one in callbacks if isinstance(one, Checkpoint)]
-        callbacks = [one for one in callbacks if not isinstance(one, Checkpoint)]
-        self._call = call
-        self._callbacks = [one for one in (*callbacks, hooks.callback) if hasattr(one, "state_dict")]
-        loggers = self.logger.outputs
-        own_outputs: list[Sink] = []
-        if not loggers and self.tensorboard_log is not None:
-            own_outputs.append(TensorBoard(next_folder(self.tensorboard_log, tb_log_name or self.name)))
-        outputs: list[Sink] = [*sinks, *loggers, *([Console()] if self.verbose and not loggers else []), *own_outputs]
-        bar = None
-        if progress_bar:
-            from rejeu.callbacks import ProgressBar
-
-            taken = self._run.step - call.first_step
-            bar = ProgressBar(call.n_steps, call.seconds, taken=taken, spent=call.spent)
-            callbacks.append(bar)
-        self.interrupted, self.interrupted_by = False, None
-        self._run.success_threshold = self.success_threshold
-        self.logger.outputs, self._learning = outputs, True
-        with ExitStack() as held:
-            held.callback(self._stop_learning, loggers, bar, own_outputs)
-            for saver in savers:
-                held.enter_context(saver.held(self))
-            remaining = None if call.last_step is None else call.last_step - self._run.step
-            hooks.begin(self, remaining, {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps})
-            self._restore_callbacks()
-            try:
-                with Interrupt() as interrupt:
-                    self._iterate(call, callbacks, hooks, savers, outputs, interrupt)
-                finite.settle(self)
-            except finite.Broken as broken:
-                raise finite.reported(self, broken) from None
-            except NonFiniteError:
-                raise
-            except Exception as error:
-                for saver in savers:
-                    saver.save_after(error, self)
-                raise
-            hooks.end()
-            for saver in savers:
-                saver.save(self)
+        call = learning.begin(self, total_timesteps, episodes, minutes, log_interval, reset_num_timesteps)
+        arguments = {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps}
+        learning.carry_out(self, call, callback, tb_log_name, progress_bar, sinks, arguments)
         return self
-
-    def _iterate(
-        self,
-        call: Call,
-        callbacks: list[Callback],
-        hooks: Hooks,
-        savers: list[Checkpoint],
-        outputs: list[Sink],
-        interrupt: Interrupt,
-    ) -> None:
-        """Trains until a limit is reached, a callback says so or Ctrl-C is pressed."""
-        run, first = self._run, self._run.step
-        remaining = None if call.last_step is None else call.last_step - first
-        for turn in self._turns(remaining, lambda taken: call.progress(first + taken, run.episode)):
-            self.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
-            for episode in turn.episodes:
-                self._record(episode)
-            if len(self.history) - call.logged >= call.log_interval and outputs:
-                call.logged = len(self.history)
-                row = self.statistics() | self.logger.take()
-                for output in outputs:
-                    output.write(self.num_timesteps, row)
-            if turn.episodes:
-                self._note_training_return()
-            answers = [*(callback(self, turn) for callback in callbacks), hooks.step(self, turn, run.obs)]
-            for saver in savers:  # last, so that they hold what the others did
-                saver(self, turn)
-            self.interrupted, self.interrupted_by = interrupt.requested, interrupt.signal
-            refused = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
-            if refused or self.interrupted or call.is_over(turn.step, run.episode):
-                break
-
-    def _call_to_go_on_with(self) -> Call:
-        call = self._call if self.resumed is not None else None
-        if call is None:
-            raise ValueError(
-                "learn needs total_timesteps, episodes or minutes (or an agent from resume(), to go on with)"
-            )
-        if call.is_over(self._run.step, self._run.episode):
-            raise ValueError(
-                "the run is complete; to train on, say how long: total_timesteps (--steps), episodes or minutes (--minutes)"
-            )
-        return call
-
-    def _stop_learning(self, loggers: list[Sink], bar: Any, own_outputs: list[Sink]) -> None:
-        """Gives back what ``learn`` held, however it ended."""
-        self.logger.outputs, self._learning = loggers, False
-        if bar is not None:
-            bar.close()
-        for output in own_outputs:
-            output.close()
-
-    def _restore_callbacks(self) -> None:
-        """Gives callbacks what they remembered when the run was saved, once."""
-        saved, self._saved_callbacks = self._saved_callbacks, None
-        if saved is not None:
-            resuming.restore_callbacks(self._callbacks, saved)
-
-    def _record(self, episode: Episode) -> None:
-        self.history.append(episode)
-        self.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
-        if not math.isnan(episode.success):
-            self.ep_success_buffer.append(episode.success)
 
     def _fill_windows(self) -> None:
         """Fills the windows of statistics from the history."""
-        episodes = self.history.last(self.stats_window_size)
-        self.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
-        successes = self.history["success"]
-        self.ep_success_buffer.extend(successes[~np.isnan(successes)][-self.stats_window_size :].tolist())
-
-    def _note_training_return(self) -> None:
-        """Remembers the present weights if the mean of the last episodes' returns is the best so far."""
-        returns = [e["r"] for e in self.ep_info_buffer]
-        if len(returns) >= BEST_WINDOW and (self.best is None or self.best.by == "training"):
-            self.remember_best(float(np.mean(returns[-BEST_WINDOW:])), "training")
+        statistics.fill_windows(self)
 
     def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
         """Keeps the present weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
@@ -443,14 +278,10 @@ class Agent(ABC):
         success rate and mean return; once it was called with the score of an evaluation, evaluations alone count.
         Scores of one kind must compare with each other.
         """
-        if self.best is not None and self.best.by == by and score <= self.best.score:  # type: ignore[operator]
-            return False
-        finite.settle(self)
-        self._put_best(score, by, self._run.step, self._compiled.copy(self._run.state))
-        return True
+        return best.remember(self, score, by)
 
     def _put_best(self, score: float | tuple[float, ...], by: str, step: int, state: PackedState) -> None:
-        self.best = Best(score, by, step, state)
+        self.best = best.Best(score, by, step, state)
 
     def restore_best(self) -> Self:
         """Puts back the best weights so far: actor, critics, their targets and optimizers as they were together.
@@ -458,35 +289,12 @@ class Agent(ABC):
         Raises:
             ValueError: if none were kept yet, which takes 20 finished episodes or one evaluation.
         """
-        if self.best is None:
-            raise ValueError(
-                f"no best weights are known yet: they are kept from the {BEST_WINDOW}th finished episode on, and at every "
-                "evaluation by rejeu.callbacks.Evaluate"
-            )
-        self._run.state = self._compiled.copy(self.best.state)
+        best.restore(self)
         return self
 
     def statistics(self) -> dict[str, float]:
         """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
-        row: dict[str, float] = {}
-        if self.ep_info_buffer:
-            row["rollout/ep_len_mean"] = float(np.mean([e["l"] for e in self.ep_info_buffer]))
-            row["rollout/ep_rew_mean"] = float(np.mean([e["r"] for e in self.ep_info_buffer]))
-        if self.ep_success_buffer:
-            row["rollout/success_rate"] = float(np.mean(self.ep_success_buffer))
-        seconds = self._run.seconds
-        row["time/episodes"] = self._run.episode
-        row["time/steps_per_second"] = float(self.steps_per_second)
-        row["time/seconds"] = seconds["total"]
-        for part, share in host.time_shares(seconds).items():
-            row[f"time/{part}_share"] = share
-        row["time/compile_seconds"] = compilation.seconds()
-        row["train/n_updates"] = self._run.n_updates
-        if self._compiled.skips:
-            row["train/skipped_updates"] = self._run.watch.n_skipped
-        for key, value in (self._run.metrics or {}).items():
-            row[f"train/{key}"] = float(value)
-        return row
+        return statistics.row(self)
 
     def predict(
         self,
@@ -513,72 +321,17 @@ class Agent(ABC):
         """
         if self.takes_masks:
             observation, action_masks = split(observation, action_masks)
-        batch, single = self._as_batch(observation)
+        batch, single = predicting.as_batch(observation, self.observation_space, self._obs_leaves)
         batch = self._with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
-        action, memory = self._act(batch, deterministic, state, ended)
+        action, memory = predicting.act(self, batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
         return (scaled[0] if single else scaled), state if memory is None else memory
 
     @abstractmethod
     def _with_masks(self, obs: Any, masks: Any) -> Any:
         """Returns a batch of observations as the algorithm takes it, with the given masks where it takes any."""
-
-    def _as_batch(self, observation: Any) -> tuple[Any, bool]:
-        expected = spaces.structure(self.observation_space)
-        try:
-            parts, tree = jax.tree.flatten(spaces.plain(self.observation_space, observation))
-        except (KeyError, IndexError, TypeError, ValueError):
-            parts, tree = jax.tree.flatten(observation)
-        if tree != expected:
-            raise ValueError(
-                f"the observation has the structure {tree}, expected {expected} of {self.observation_space}"
-            )
-        arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(parts, self._obs_leaves, strict=True)]
-        single = arrays[0].ndim == len(self._obs_leaves[0].shape)
-        if not single and len({array.shape[:1] for array in arrays}) > 1:
-            raise ValueError(
-                f"the parts of the observations are batches of {[a.shape[:1] for a in arrays]}, not of one size"
-            )
-        for array, leaf in zip(arrays, self._obs_leaves, strict=True):
-            if (array.shape if single else array.shape[1:]) != leaf.shape:
-                where = f" of {leaf.path!r}" if leaf.path else ""
-                raise ValueError(
-                    f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it"
-                )
-        return jax.tree.unflatten(tree, [array[None] if single else array for array in arrays]), single
-
-    def _act(self, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
-        """Returns actions in the algorithm's range for a batch of cast observations, and what the policy remembers.
-
-        ``memory`` None stands for episodes that have not begun, as ``ended`` does for each.
-        """
-        finite.settle(self)
-        packed, n = self._run.state, len(ended)
-        has_memory = self._compiled.algorithm.recall is not None
-        if deterministic and not has_memory:
-            return np.asarray(self._compiled.exploit(packed, obs)), None
-        carry = memory if has_memory and memory is not None else self._compiled.initial_carry(n)
-        if deterministic:
-            action, carry = self._compiled.recall(packed, carry, obs, ended)
-            return np.asarray(action), carry
-        clock = host.clock_of(self._run, 1.0)._replace(step=np.uint32(2**32 - 1 - self._n_predictions % 2**31))
-        self._n_predictions += 1
-        ended = ended if has_memory else np.ones(n, bool)
-        action, carry = self._compiled.act(packed, carry, obs, ended, self._run.key, clock)
-        return np.asarray(action), carry if has_memory else None
-
-    def _player(self, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
-        """Returns the policy as :func:`rejeu.evaluation.evaluate` takes it; it remembers from call to call."""
-        memory: Any = None
-
-        def act(obs: Any, ended: np.ndarray) -> np.ndarray:
-            nonlocal memory
-            action, memory = self._act(obs, deterministic, memory, ended)
-            return action
-
-        return act
 
     def evaluate(
         self,
@@ -599,35 +352,7 @@ class Agent(ABC):
             success_threshold: return from which on an episode counts as a success where the environment does not say;
                 None takes the agent's own.
         """
-        threshold = self.success_threshold if success_threshold is None else success_threshold
-        if env is None and self._run.env is None:
-            raise ValueError("this agent has no environment; give one: evaluate(env=...)")
-        own = env is None and not self._own_env
-        if own:
-            vector = self._run.env
-        elif env is None:
-            vector = self._vector(self._run.env.env_id, min(episodes, 16), self._run.env.backend, seed)
-        else:
-            vector = self._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
-        try:
-            self._check_spaces(vector, "the environment to evaluate in")
-            self._check_scaled(vector)
-            again = seed if isinstance(env, VectorEnv) else None  # others have just been made with it
-            return evaluate(self._player(deterministic), vector, episodes, threshold, again)
-        finally:
-            if own:
-                self._run.obs = self._run.action = None
-            elif env is None or isinstance(env, str) or callable(env):
-                vector.close()
-
-    def _check_scaled(self, vector: VectorEnv) -> None:
-        """Raises ``ValueError`` if the agent learns from a ``VecNormalize`` and ``vector`` is none."""
-        has_statistics = vector.venv is not None and unwrap_vec_normalize(vector.venv) is not None
-        if self.get_vec_normalize_env() is not None and not has_statistics:
-            raise ValueError(
-                "this agent learns in a VecNormalize, so it must be evaluated in one that has the same statistics; wrap the "
-                "environment alike and use sync_envs_normalization, or let the agent scale: normalize=True"
-            )
+        return evaluating.play(self, episodes, env, deterministic, seed, success_threshold)
 
     def get_env(self) -> VecEnv | None:
         """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
@@ -764,16 +489,6 @@ class Agent(ABC):
         """
         return resuming.resume(cls, Path(folder), env, changes)
 
-    def _stand(self, vector: VectorEnv | None, state: Any, counters: dict[str, int], rng: dict[str, int]) -> None:
-        """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
-        self._start(vector, self._compiled.pack(state))
-        run = self._run
-        run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
-        run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": rng}
-        run.learn_from = self._learn_from(run.step)
-        run.seed = int(np.random.SeedSequence([self.seed, run.step]).generate_state(1)[0])
-        self._steps_before = counters["steps_before"]
-
     def summary(self) -> str:
         """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.summary`."""
         return summary.describe(self._compiled.shapes, self._obs_leaves)
@@ -786,40 +501,7 @@ class Agent(ABC):
         """Writes signature and docstring from the configuration, where every hyper-parameter is declared once."""
         if "algorithm" not in cls.__dict__:
             return
-        config = cls.algorithm.Config
-        docs = configs.field_docs(config)
-        lines = [f"{(config.__doc__ or '').strip()}", "", "Args:"]
-        lines += [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
-        defaults = config()
-        parameters = list(inspect.signature(Agent.__init__).parameters.values())[:-1]
-        for key in configs.field_names(config):
-            default = getattr(defaults, key)
-            lines.append(f"    {key}: {docs[key]} Default: {default!r}.")
-            parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
-        cls.__doc__ = "\n".join([f"{(cls.__doc__ or '').strip()}", "", *lines])
-        cls.__signature__ = inspect.Signature(parameters[1:])  # type: ignore[attr-defined]
+        describe(cls, inspect.signature(Agent.__init__))
 
 
-def refuse_masks(masks: Any, name: str) -> None:
-    """Raises ``TypeError`` if masks are given to an agent that takes none."""
-    if masks is not None:
-        raise TypeError(f"{name}.predict takes no action_masks; use MaskablePPO")
-
-
-class _ClassOnly:
-    """Makes ``load`` refuse to be called on an instance, where it would silently leave that instance as it was."""
-
-    def __init__(self, method: Any) -> None:
-        self.method = method
-        self.__doc__ = method.__func__.__doc__
-
-    def __get__(self, instance: Any, owner: type) -> Any:
-        if instance is not None:
-            raise TypeError(
-                f"load is called on the class and returns a new agent: agent = {owner.__name__}.load(path); "
-                "to change this one in place use agent.set_parameters(path)"
-            )
-        return self.method.__get__(None, owner)
-
-
-Agent.load = _ClassOnly(Agent.__dict__["load"])  # type: ignore[method-assign,assignment]
+Agent.load = ClassOnly(Agent.__dict__["load"])  # type: ignore[method-assign,assignment]

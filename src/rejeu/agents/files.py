@@ -84,7 +84,7 @@ def load(
     own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
     given = {key: own.pop(key) for key in loading.GIVEN if key in own}
     try:
-        saved = loading.interpret(header, arrays, cls.algorithm.Config, cls._check_policy, given, changes)
+        saved = loading.interpret(header, arrays, cls.algorithm.Config, given, changes)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
     checkpoint.require_finite(arrays, path)
@@ -103,9 +103,20 @@ def load(
     if vector is not None:
         agent._check_spaces(vector, "the given environment")
     try:
-        agent._stand(vector, state, saved.counters, saved.rng)
+        stand(agent, vector, state, saved)
     except (ArithmeticError, MemoryError, ValueError) as error:
         if changes.keys() & {"buffer_size", "n_steps", "n_episodes"}:
             raise
         raise CheckpointError(f"{path}: {loading.brief(error)}") from None
     return agent
+
+
+def stand(agent: Agent, vector: VectorEnv | None, state: Any, saved: loading.Saved) -> None:
+    """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
+    agent._start(vector, agent._compiled.pack(state))
+    run, counters = agent._run, saved.counters
+    run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
+    run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": saved.rng}
+    run.learn_from = agent._learn_from(run.step)
+    run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
+    agent._steps_before = counters["steps_before"]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 from rejeu import config as configs, spaces
+from rejeu.agents.policies import check_policy
 from rejeu.errors import CheckpointError
 
 COUNTERS = ("step", "steps_before", "episode", "n_updates")
@@ -45,7 +46,6 @@ def interpret(
     header: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
     kind: type,
-    check_policy: Callable[[str, gym.Space], None],
     given: Mapping[str, Any],
     changes: Mapping[str, Any],
 ) -> Saved:
@@ -55,7 +55,6 @@ def interpret(
         header: JSON values of schema ``checkpoint.SCHEMA``.
         arrays: of the same file; of them only the sizes are used.
         kind: class of the algorithm's configuration.
-        check_policy: raises unless the name of a policy fits a space.
         given: some of ``GIVEN`` as the user has them.
         changes: hyper-parameters as the user has them.
 
@@ -64,11 +63,11 @@ def interpret(
         TypeError, ValueError: where ``given`` or ``changes`` are.
     """
     try:
-        return _interpret({**header, **given}, arrays, kind, check_policy, changes)
+        return _interpret({**header, **given}, arrays, kind, changes)
     except WRONG as error:
         own = _torso(changes)
         others = given or changes.keys() - own.keys()
-        if isinstance(error, CheckpointError) or (others and _is_sound(header, arrays, kind, check_policy, own)):
+        if isinstance(error, CheckpointError) or (others and _is_sound(header, arrays, kind, own)):
             raise
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
 
@@ -102,7 +101,6 @@ def _interpret(
     header: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
     kind: type,
-    check_policy: Callable[[str, gym.Space], None],
     changes: Mapping[str, Any],
 ) -> Saved:
     try:

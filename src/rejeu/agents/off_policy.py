@@ -11,7 +11,8 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu import checkpoint, spaces
-from rejeu.agents.base import Agent, refuse_masks
+from rejeu.agents.base import Agent
+from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.config import OffPolicyConfig
 from rejeu.envs.vector import Backend, VectorEnv, make_vector

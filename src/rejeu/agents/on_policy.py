@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from rejeu import spaces
-from rejeu.agents.base import Agent, refuse_masks
+from rejeu.agents.base import Agent
+from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.core import Masked

@@ -1,0 +1,69 @@
+"""The policy of an agent played for whole episodes, without disturbing its training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rejeu.agents import predicting
+from rejeu.envs.vec_normalize import unwrap_vec_normalize
+from rejeu.envs.vector import VectorEnv
+from rejeu.evaluation import Evaluation, evaluate
+
+if TYPE_CHECKING:
+    from rejeu.agents.base import Agent
+
+
+def play(
+    agent: Agent, episodes: int, env: Any, deterministic: bool, seed: int | None, success_threshold: float | None
+) -> Evaluation:
+    """Returns what whole episodes came to; the arguments are those of :meth:`Agent.evaluate`.
+
+    Raises:
+        ValueError: without environments, or in those of other spaces or without the agent's ``VecNormalize``.
+    """
+    threshold = agent.success_threshold if success_threshold is None else success_threshold
+    run = agent._run
+    if env is None and run.env is None:
+        raise ValueError("this agent has no environment; give one: evaluate(env=...)")
+    own = env is None and not agent._own_env
+    if own:
+        vector = run.env
+    elif env is None:
+        vector = agent._vector(run.env.env_id, min(episodes, 16), run.env.backend, seed)
+    else:
+        vector = agent._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
+    try:
+        agent._check_spaces(vector, "the environment to evaluate in")
+        check_scaled(agent, vector)
+        again = seed if isinstance(env, VectorEnv) else None  # others have just been made with it
+        return evaluate(policy(agent, deterministic), vector, episodes, threshold, again)
+    finally:
+        if own:
+            run.obs = run.action = None
+        elif env is None or isinstance(env, str) or callable(env):
+            vector.close()
+
+
+def policy(agent: Agent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
+    """Returns the policy as :func:`rejeu.evaluation.evaluate` takes it; it remembers from call to call."""
+    memory: Any = None
+
+    def act(obs: Any, ended: np.ndarray) -> np.ndarray:
+        nonlocal memory
+        action, memory = predicting.act(agent, obs, deterministic, memory, ended)
+        return action
+
+    return act
+
+
+def check_scaled(agent: Agent, vector: VectorEnv) -> None:
+    """Raises ``ValueError`` if the agent learns from a ``VecNormalize`` and ``vector`` is none."""
+    has_statistics = vector.venv is not None and unwrap_vec_normalize(vector.venv) is not None
+    if agent.get_vec_normalize_env() is not None and not has_statistics:
+        raise ValueError(
+            "this agent learns in a VecNormalize, so it must be evaluated in one that has the same statistics; wrap the "
+            "environment alike and use sync_envs_normalization, or let the agent scale: normalize=True"
+        )

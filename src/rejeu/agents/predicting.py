@@ -1,0 +1,80 @@
+"""From observations as users have them to actions of the policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import jax
+import numpy as np
+
+from rejeu import finite, spaces
+from rejeu.loops import host
+from rejeu.spaces import Leaf
+
+if TYPE_CHECKING:
+    from rejeu.agents.base import Agent
+
+
+def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
+    """Returns observations as a batch of arrays of the right types, and whether a single one was given.
+
+    Args:
+        observation: one of ``space``, or several with a leading axis.
+        space: of observations.
+        leaves: of ``space``.
+
+    Raises:
+        ValueError: if structure or shapes are others, or if the parts are batches of different sizes.
+    """
+    expected = spaces.structure(space)
+    try:
+        parts, tree = jax.tree.flatten(spaces.plain(space, observation))
+    except (KeyError, IndexError, TypeError, ValueError):
+        parts, tree = jax.tree.flatten(observation)
+    if tree != expected:
+        raise ValueError(f"the observation has the structure {tree}, expected {expected} of {space}")
+    arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(parts, leaves, strict=True)]
+    single = arrays[0].ndim == len(leaves[0].shape)
+    if not single and len({array.shape[:1] for array in arrays}) > 1:
+        raise ValueError(
+            f"the parts of the observations are batches of {[a.shape[:1] for a in arrays]}, not of one size"
+        )
+    for array, leaf in zip(arrays, leaves, strict=True):
+        if (array.shape if single else array.shape[1:]) != leaf.shape:
+            where = f" of {leaf.path!r}" if leaf.path else ""
+            raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
+    return jax.tree.unflatten(tree, [array[None] if single else array for array in arrays]), single
+
+
+def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
+    """Returns actions in the algorithm's range, and what the policy remembers (None without a memory).
+
+    Args:
+        agent: whose policy; its updates under way are waited for.
+        obs: a batch of observations, cast.
+        deterministic: the policy's mode; False draws from the policy.
+        memory: what the last call returned; None stands for episodes that have not begun.
+        ended: where an episode begins with these observations, ``bool (batch,)``.
+    """
+    finite.settle(agent)
+    run, compiled, n = agent._run, agent._compiled, len(ended)
+    has_memory = compiled.algorithm.recall is not None
+    if deterministic and not has_memory:
+        return np.asarray(compiled.exploit(run.state, obs)), None
+    carry = memory if has_memory and memory is not None else compiled.initial_carry(n)
+    if deterministic:
+        action, carry = compiled.recall(run.state, carry, obs, ended)
+        return np.asarray(action), carry
+    clock = host.clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent._n_predictions % 2**31))
+    agent._n_predictions += 1
+    ended = ended if has_memory else np.ones(n, bool)
+    action, carry = compiled.act(run.state, carry, obs, ended, run.key, clock)
+    return np.asarray(action), carry if has_memory else None
+
+
+def refuse_masks(masks: Any, name: str) -> None:
+    """Raises ``TypeError`` if masks are given to an agent that takes none."""
+    if masks is not None:
+        raise TypeError(f"{name}.predict takes no action_masks; use MaskablePPO")
