@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import gymnasium as gym
 import jax
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu import checkpoint
 from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.make_vec_env import make_vec_env
 from rejeu.envs.monitor import Monitor
@@ -358,6 +361,23 @@ def test_statistics_are_saved_without_pickle(tmp_path):
     obs = np.array([[1.0, 2.0, 0.6], [2.0, -1.0, 0.5]], np.float32)
     np.testing.assert_array_equal(loaded.normalize_obs(obs), env.normalize_obs(obs))
     np.testing.assert_allclose(env.unnormalize_obs(env.normalize_obs(obs)), obs, rtol=1e-5)
+
+
+def test_statistics_without_clipping_are_saved(tmp_path):
+    env = VecNormalize(walks(), clip_obs=math.inf, clip_reward=math.inf)
+    env.reset()
+    path = env.save(tmp_path / "statistics")
+    loaded = VecNormalize.load(path, walks())
+    assert (loaded.clip_obs, loaded.clip_reward) == (math.inf, math.inf)
+    assert loaded.observation_space == env.observation_space
+    far = np.full((2, 3), 1e6, np.float32)
+    np.testing.assert_array_equal(loaded.normalize_obs(far), env.normalize_obs(far))
+    assert loaded.normalize_obs(far).min() > 1e3
+    header, arrays = checkpoint.read(path, "vec_normalize")
+    for key, value in (("gamma", None), ("epsilon", None), ("clip_obs", "Infinity"), ("clip_obs", -1.0)):
+        bad = {"settings": {**header["settings"], key: value}, "keys": None}
+        with pytest.raises(CheckpointError, match=f"{key}="):
+            VecNormalize.load(checkpoint.write(tmp_path / "bad", "vec_normalize", arrays, bad), walks())
 
 
 def test_statistics_of_another_environment_are_refused(tmp_path):

@@ -29,6 +29,8 @@ FIRST_COUNT = 1e-4
 """How many values the mean 0 and the variance 1 at the beginning count for."""
 NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
 MOST = dict.fromkeys(NUMBERS, math.inf) | {"gamma": 1.0}
+BOUNDS = ("clip_obs", "clip_reward")
+"""Which of them may be infinite, for no clipping; a file then has null, since JSON has no such number."""
 SWITCHES = ("training", "norm_obs", "norm_reward")
 
 
@@ -80,8 +82,8 @@ class VecNormalize(VecEnvWrapper):
         training: whether the statistics take in what comes.
         norm_obs: whether observations are scaled.
         norm_reward: whether rewards are scaled.
-        clip_obs: largest magnitude of a scaled observation.
-        clip_reward: largest magnitude of a scaled reward.
+        clip_obs: largest magnitude of a scaled observation; ``math.inf`` for any.
+        clip_reward: largest magnitude of a scaled reward, likewise.
         gamma: discount of the sum of rewards; the agent's.
         epsilon: added to variances.
         norm_obs_keys: which parts of Dict observations are scaled; None for all.
@@ -263,7 +265,7 @@ class VecNormalize(VecEnvWrapper):
         """
         arrays = self.statistics()
         header = {
-            "settings": {key: float(getattr(self, key)) for key in NUMBERS}
+            "settings": {key: _written(key, float(getattr(self, key))) for key in NUMBERS}
             | {key: bool(getattr(self, key)) for key in SWITCHES},
             "keys": None if not isinstance(self.obs_rms, dict) else list(self.obs_rms),
         }
@@ -279,7 +281,7 @@ class VecNormalize(VecEnvWrapper):
         """
         header, arrays = checkpoint.read(load_path, KIND)
         try:
-            settings = {key: number(key, header["settings"][key], least=0, most=MOST[key]) for key in NUMBERS}
+            settings = {key: _read(key, header["settings"][key]) for key in NUMBERS}
             switches = {key: _check_switch(key, header["settings"][key]) for key in SWITCHES}
             new = VecNormalize(venv, **switches, **settings, norm_obs_keys=_check_keys(header["keys"]))  # type: ignore[arg-type]
         except (LookupError, TypeError, ValueError) as error:
@@ -333,6 +335,14 @@ def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, 
             raise CheckpointError(f"{path}: {name}.{part} has negative numbers, which it cannot have")
         found[part] = array
     moments.mean, moments.var, moments.count = found["mean"], found["var"], float(found["count"])
+
+
+def _written(key: str, value: float) -> float | None:
+    return None if key in BOUNDS and value == math.inf else value
+
+
+def _read(key: str, value: Any) -> float:
+    return math.inf if key in BOUNDS and value is None else number(key, value, least=0, most=MOST[key])
 
 
 def _check_keys(keys: Any) -> list[str] | None:
