@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 
 import gymnasium as gym
 import jax
@@ -16,7 +17,7 @@ from rejeu.algorithms.actor_critic import samples
 from rejeu.core import Clock, Masked
 from rejeu.envs.masks import make_masked
 from rejeu.envs.vector import InProcess, make_vector
-from rejeu.errors import BadEnvironmentError
+from rejeu.errors import BadEnvironmentError, WorkerError
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
 
@@ -144,6 +145,48 @@ def test_masks_come_out_of_worker_processes():
         assert agent.env.backend == "gymnasium-async"
     finally:
         env.close()
+
+
+class Leaving(gym.Env):
+    """Allows both of two actions, at the second of which its process ends."""
+
+    observation_space = spaces.Box(0.0, 9.0, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {"action_mask": [1, 1]}
+
+    def step(self, action):
+        if action == 1:
+            os._exit(3)
+        return np.ones(1, np.float32), 0.0, False, False, {"action_mask": [1, 1]}
+
+
+def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
+    env = make_masked(Leaving, 2, "gymnasium-async", seed=0, worker_timeout=60.0, restart_workers=1)
+    try:
+        env.reset()
+        with pytest.warns(RuntimeWarning, match=r"started anew \(1 of at most 1 times\)"):
+            step = env.step(np.array([0, 1]))
+        assert step.truncated.tolist() == [False, True]
+        assert env.reset_done(step.truncated).mask.tolist() == [[True, True]] * 2
+        with pytest.raises(WorkerError, match="and 1 restarts are spent"):
+            env.step(np.array([0, 1]))
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"restart_workers": 1}, "restart_workers=1 is for worker processes, got backend='auto'"),
+        ({"worker_timeout": 0.0}, "worker_timeout=0.0 must be a number of seconds above 0"),
+    ],
+)
+def test_worker_options_without_meaning_are_refused_for_masks_too(given, message):
+    for env in (Leaving, Leaving(), vector("discrete")):
+        with pytest.raises(ValueError, match=message):
+            make_masked(env, **given)
 
 
 @pytest.mark.parametrize("normalize", [True, {"norm_reward": False}])

@@ -18,7 +18,8 @@ from gymnasium import spaces
 from rejeu.core import Masked
 from rejeu.envs.registry import maker
 from rejeu.envs.vec_env import VecEnv
-from rejeu.envs.vector import Backend, InProcess, Step, VectorEnv, make_vector
+from rejeu.envs.vector import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
+from rejeu.envs.workers import TIMEOUT
 from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import Leaf
@@ -161,12 +162,22 @@ def mask_leaf(action_space: spaces.Space, env_id: str) -> Leaf:
     return Leaf(MASK, "binary", (n_choices(action_space, env_id),), "bool")
 
 
-def make_masked(env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> MaskedVector:
+def make_masked(
+    env: Any,
+    n_envs: int = 1,
+    backend: Backend = "auto",
+    seed: int | None = None,
+    *,
+    worker_timeout: float | None = TIMEOUT,
+    restart_workers: int = 0,
+) -> MaskedVector:
     """Returns ``n_envs`` environments with their masks as one; arguments as for :func:`make_vector`.
 
     Raises:
         TypeError: for a vector environment whose single environments cannot be reached.
+        ValueError: for worker options out of range, or ``restart_workers`` where there are no worker processes.
     """
+    check_workers(env, backend, worker_timeout, restart_workers)
     if isinstance(env, VecEnv):
         env = make_vector(env, seed=seed)
     if isinstance(env, MaskedVector):
@@ -185,7 +196,10 @@ def make_masked(env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int 
     if not callable(env):
         raise TypeError(f"env must be an id, an environment or a function that makes one, got {type(env).__name__}")
     chosen: Backend = "gymnasium" if backend in ("auto", "envpool") else backend
-    return MaskedVector(make_vector(MaskedMaker(env), n_envs, chosen, seed))
+    vector = make_vector(
+        MaskedMaker(env), n_envs, chosen, seed, worker_timeout=worker_timeout, restart_workers=restart_workers
+    )
+    return MaskedVector(vector)
 
 
 def describe(env: gym.Env) -> str:

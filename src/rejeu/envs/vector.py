@@ -69,12 +69,7 @@ def make_vector(
         raise ValueError(f"backend={backend!r} must be one of {', '.join(BACKENDS)}")
     if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
-    check_options(worker_timeout, restart_workers)
-    if restart_workers and (backend != "gymnasium-async" or not (isinstance(env, str) or is_maker(env))):
-        raise ValueError(
-            f"restart_workers={restart_workers} is for worker processes, got backend={backend!r} and an env of type "
-            f"{type(env).__name__}; use backend='gymnasium-async' and an id or a function"
-        )
+    check_workers(env, backend, worker_timeout, restart_workers)
     if isinstance(env, VectorEnv):
         return env
     if isinstance(env, VecEnv):
@@ -122,6 +117,16 @@ def make_vector(
         worker_timeout=worker_timeout,
         restart_workers=restart_workers,
     )
+
+
+def check_workers(env: Any, backend: Backend, worker_timeout: float | None, restart_workers: int) -> None:
+    """Raises ``ValueError`` if options of worker processes are out of range, or given where there will be none."""
+    check_options(worker_timeout, restart_workers)
+    if restart_workers and (backend != "gymnasium-async" or not (isinstance(env, str) or is_maker(env))):
+        raise ValueError(
+            f"restart_workers={restart_workers} is for worker processes, got backend={backend!r} and an env of type "
+            f"{type(env).__name__}; use backend='gymnasium-async' and an id or a function"
+        )
 
 
 def is_maker(env: Any) -> bool:
