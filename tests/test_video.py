@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import builtins
+import importlib.util
 import os
 import re
 import subprocess
@@ -16,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import rejeu
 from rejeu import video
 from rejeu.errors import MissingExtra
 from rejeu.video import VideoFile, record_video, show_videos
@@ -90,6 +92,52 @@ def test_frames_are_those_of_every_reset_and_step_with_the_last_one_held(lamp, t
     # half a second at 8 frames per second is 4 more of the last one; H.264 changes grey values by a little
     episode = [0, 40, 80, 120, 160, 160, 160, 160, 160]
     np.testing.assert_allclose(decode(path).frames[:, :33, :51].mean((1, 2, 3)), episode * 2, atol=4)
+
+
+class Dark(Lamp):
+    """Raises, where it should render, an error of this module and name."""
+
+    def __init__(self, module, name):
+        super().__init__("rgb_array")
+        self.error = type(name, (Exception,), {"__module__": module})
+
+    def render(self):
+        raise self.error("no context")
+
+
+def test_mujoco_without_a_screen_is_told_how_to_draw(tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(ValueError, match=r"no OpenGL context with MUJOCO_GL=glfw, .* set .*MUJOCO_GL=egl") as caught:
+        record_video(Still(), tmp_path / "v.mp4", Dark("mujoco", "FatalError"))
+    assert "\n" not in str(caught.value)
+    assert str(caught.value.__cause__) == "no context"
+    assert not (tmp_path / "v.mp4").exists()
+
+
+@pytest.mark.parametrize(("module", "name"), [("mujoco", "UnexpectedError"), ("elsewhere", "FatalError")])
+def test_other_errors_of_drawing_are_left_as_they_are(module, name, tmp_path):
+    env = Dark(module, name)
+    with pytest.raises(env.error, match=r"^no context$"):
+        record_video(Still(), tmp_path / "v.mp4", env)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a screen")
+@pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="MuJoCo is not installed")
+def test_the_command_line_says_in_one_line_what_mujoco_lacks(tmp_path):
+    model = rejeu.SAC("MlpPolicy", gym.make("InvertedPendulum-v5"), seed=0).save(tmp_path / "agent")
+    shown = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    result = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "rejeu", "record", str(model)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=shown | {"MUJOCO_GL": "glfw"},
+    )
+    assert result.returncode == 2
+    errors = [line for line in result.stderr.splitlines() if "rror" in line]
+    assert errors[0].startswith("rejeu: error: ")
+    assert "set the environment variable MUJOCO_GL=egl (or osmesa)" in errors[0]
+    assert "Traceback" not in result.stderr
 
 
 def test_odd_sizes_are_padded_to_even_ones(lamp, tmp_path):

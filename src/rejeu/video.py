@@ -176,9 +176,9 @@ def rgb_frame(env: gym.Env) -> np.ndarray:
     """Returns what an environment renders, ``uint8 (height, width, 3)``; needs no display.
 
     Raises:
-        ValueError: if it renders anything else.
+        ValueError: if it renders anything else, or if MuJoCo finds nothing to draw with.
     """
-    with display_for_pygame():
+    with display_for_pygame(), said_of_mujoco(env):
         frame = env.render()
     if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3:
         got = f"an array of shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
@@ -213,6 +213,22 @@ def display_for_pygame() -> Iterator[None]:
             os.environ.pop("SDL_VIDEODRIVER", None)
         else:
             os.environ["SDL_VIDEODRIVER"] = before
+
+
+@contextmanager
+def said_of_mujoco(env: gym.Env) -> Iterator[None]:
+    """Raises ``ValueError``, which names the fix, where MuJoCo cannot draw for want of a screen."""
+    try:
+        yield
+    except Exception as error:
+        kind = type(error)
+        if (kind.__module__, kind.__name__) != ("mujoco", "FatalError"):
+            raise
+        chosen = os.environ.get("MUJOCO_GL")
+        raise ValueError(
+            f"{env} cannot be drawn: MuJoCo got no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a screen or "
+            "drawing without one; set the environment variable MUJOCO_GL=egl (or osmesa) before starting Python"
+        ) from error
 
 
 def ffmpeg() -> str:
