@@ -705,6 +705,18 @@ def test_the_defaults_are_those_of_stable_baselines3():
             "share_layers=True leaves share_features_extractor=False without meaning; .* one",
         ),
         (
+            {"policy_kwargs": {"share_layers": True, "net_arch": {"pi": [32], "vf": [64, 64]}}},
+            r"one stack of hidden layers, of the policy's widths \[32\], and leaves vf=\[64, 64\] without meaning; leave",
+        ),
+        (
+            {"policy_kwargs": {"share_layers": True, "vf": [32]}},
+            r"of the policy's widths \[64, 64\], and leaves vf=\[32\] without meaning",
+        ),
+        (
+            {"policy_kwargs": {"share_layers": True, "actor_layers": [8], "critic_layers": [4]}},
+            r"of the policy's widths \[8\], and leaves critic_layers=\[4\] without meaning",
+        ),
+        (
             {"critic_learning_rate": 1e-3, "policy_kwargs": {"share_layers": True}},
             "critic_learning_rate gives the value an optimizer of its own, which share_layers=True forbids; leave one",
         ),
@@ -714,6 +726,14 @@ def test_an_impossible_setting_is_refused_in_one_line(settings, message):
     with pytest.raises((ValueError, TypeError), match=message) as caught:
         ppo.Config(**settings)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "shape", [{"net_arch": {"pi": [8], "vf": [8]}}, {"pi": [8]}, {"net_arch": None, "actor_layers": [8]}]
+)
+def test_shared_layers_may_have_the_widths_of_both_or_of_the_policy(shape):
+    network = build(OBS_SPACE, share_layers=True, **shape)
+    assert network.head.weight.shape[0] == network.value_head.weight.shape[0] == 8
 
 
 @pytest.mark.parametrize("algorithm", [rejeu.PPO, rejeu.A2C])

@@ -5,10 +5,15 @@ distribution over actions and into a value. Actions may be Box (a normal distrib
 MultiDiscrete or MultiBinary. A policy with memory puts a recurrent cell between the features and the hidden layers.
 """
 
-from rejeu.algorithms.actor_critic.config import ActorCriticConfig, OnPolicyConfig, check_flag, check_value_rate
+from rejeu.algorithms.actor_critic.config import (
+    HIDDEN_LAYERS,
+    ActorCriticConfig,
+    OnPolicyConfig,
+    check_flag,
+    check_value_rate,
+)
 from rejeu.algorithms.actor_critic.network import (
     HIDDEN_GAIN,
-    HIDDEN_LAYERS,
     LOG_STD_RANGE,
     POLICY_GAIN,
     VALUE_GAIN,

@@ -14,6 +14,9 @@ from rejeu.running_stats import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
 
+HIDDEN_LAYERS = (64, 64)
+"""Default widths of policy and value."""
+
 
 @dataclass(frozen=True)
 class ActorCriticConfig(PolicyConfig):
@@ -59,6 +62,17 @@ class ActorCriticConfig(PolicyConfig):
         if self.share_layers and not self.share_features_extractor:
             raise ValueError(
                 "policy_kwargs: share_layers=True leaves share_features_extractor=False without meaning; leave out one"
+            )
+        self._check_shared_widths()
+
+    def _check_shared_widths(self) -> None:
+        """Raises ``ValueError`` if layers that policy and value share are given widths for each."""
+        key, own = ("critic_layers", self.critic_layers or None) if self.has_branches else ("vf", self.vf)
+        widths = self.actor_widths(HIDDEN_LAYERS)
+        if self.share_layers and own is not None and own != widths:
+            raise ValueError(
+                f"policy_kwargs: share_layers=True has one stack of hidden layers, of the policy's widths {list(widths)}, "
+                f"and leaves {key}={list(own)} without meaning; leave out one"
             )
 
 

@@ -12,15 +12,13 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms.actor_critic.config import ActorCriticConfig
+from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig
 from rejeu.core import Masked, PyTree
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
 from rejeu.exploration.state_dependent import sde_log_std
 from rejeu.networks import Convolution, Encoder, Linear, Torso, make_torso
 from rejeu.spaces import Leaf
 
-HIDDEN_LAYERS = (64, 64)
-"""Default widths of policy and value."""
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
 POLICY_GAIN, VALUE_GAIN, HIDDEN_GAIN = 0.01, 1.0, math.sqrt(2.0)
