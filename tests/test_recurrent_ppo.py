@@ -502,6 +502,32 @@ def test_a_shared_memory_is_one():
     assert one.learn(12).n_updates > 0
 
 
+IMAGES = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+
+def test_policy_and_value_may_read_images_through_convolutions_of_their_own():
+    """What one encoder sees moves its own cell's memory, and nothing of the other's."""
+    shape = RecurrentConfig(lstm_hidden_size=SIZE, net_arch=(5,), share_features_extractor=False)
+    kind = recurrent_ppo.action_kind(gym.spaces.Discrete(2))
+    network = RecurrentActorCritic(jax.random.PRNGKey(0), leaves(IMAGES), kind, shape)
+    blind = jax.tree.map(jnp.zeros_like, network.value_encoder)
+    other = eqx.tree_at(lambda n: n.value_encoder, network, blind)
+    pixels = np.random.default_rng(0).integers(256, size=(6, 2, 8, 8, 3), dtype=np.uint8)
+    started = np.zeros((6, 2), bool)
+    for read in (
+        lambda n: n.remember(n.empty(2), pixels[0], np.zeros(2, bool)),
+        lambda n: n.unroll(n.empty(2), pixels, started),
+    ):
+        (policy, value), (policy_too, value_too) = read(network), read(other)
+        np.testing.assert_array_equal(policy[0], policy_too[0])
+        assert np.abs(value[0] - value_too[0]).max() > 1e-3
+    shared = RecurrentActorCritic(jax.random.PRNGKey(0), leaves(IMAGES), kind, RecurrentConfig(lstm_hidden_size=SIZE))
+    assert shared.value_encoder is None
+    weights = [n.encoder.images[0].linear.weight for n in (network, shared)]
+    np.testing.assert_array_equal(*weights)
+    assert not np.array_equal(network.value_encoder.images[0].linear.weight, weights[0])
+
+
 def test_learning_is_determined_by_the_seed(agent):
     assert_same_parameters(agent, small().learn(12))
     assert not same_parameters(agent, small(seed=1).learn(12))
@@ -538,6 +564,11 @@ def test_memory_is_begun_anew_when_training_is(agent):
         ({"policy_kwargs": {"lstm_hidden_size": 0}}, ValueError, "lstm_hidden_size=0"),
         ({"policy_kwargs": {"shared_lstm": 1}}, TypeError, "shared_lstm=1 must be True or False"),
         ({"policy_kwargs": {"share_layers": True}}, ValueError, "needs shared_lstm=True"),
+        (
+            {"policy_kwargs": {"shared_lstm": True, "share_features_extractor": False}},
+            ValueError,
+            "shared_lstm=True leaves share_features_extractor=False without meaning: .*; leave out one",
+        ),
         ({"policy_kwargs": {"lstm_size": 4}}, TypeError, "lstm_hidden_size"),
     ],
 )

@@ -66,6 +66,11 @@ class RecurrentConfig(ActorCriticConfig):
         check_flag("shared_lstm", self.shared_lstm)
         if self.share_layers and not self.shared_lstm:
             raise ValueError("share_layers=True needs shared_lstm=True: layers cannot share what reads two memories")
+        if self.shared_lstm and not self.share_features_extractor:
+            raise ValueError(
+                "policy_kwargs: shared_lstm=True leaves share_features_extractor=False without meaning: one memory reads "
+                "through one encoder; leave out one"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +174,8 @@ class RecurrentActorCritic(eqx.Module):
     """Observation and memory to a distribution over actions and to a value."""
 
     encoder: Encoder
+    value_encoder: Encoder | None
+    """Of the value's cell; None where the policy's is shared."""
     cells: tuple[Cell, ...]
     """The policy's, and the value's where it has its own."""
     readers: ActorCritic
@@ -178,7 +185,12 @@ class RecurrentActorCritic(eqx.Module):
         """Draws the weights."""
         encoder_key, cell_key, reader_key = jax.random.split(key, 3)
         encoder = Encoder(leaves, encoder_key)
-        self.encoder = orthogonal(encoder, encoder_key, HIDDEN_GAIN) if shape.ortho_init else encoder
+        value_key = jax.random.fold_in(encoder_key, 1)
+        value_encoder = None if shape.share_features_extractor else Encoder(leaves, value_key)
+        if shape.ortho_init:
+            encoder = orthogonal(encoder, encoder_key, HIDDEN_GAIN)
+            value_encoder = orthogonal(value_encoder, value_key, HIDDEN_GAIN)
+        self.encoder, self.value_encoder = encoder, value_encoder
         size = shape.lstm_hidden_size
         n_cells = 1 if shape.shared_lstm else 2
         keys = jax.random.split(cell_key, n_cells)
@@ -197,9 +209,10 @@ class RecurrentActorCritic(eqx.Module):
 
     def remember(self, memory: Memory, obs: PyTree, ended: Array) -> Memory:
         """Returns the memory after observations ``(n, ...)``; begun anew where ``ended``, ``bool (n,)``."""
-        features = self.encoder(unmasked(obs)[0])
+        features = self.features(unmasked(obs)[0])
         memory = renew(ended, self.empty(ended.shape[0]), memory)
-        return tuple(cell.step(m, cell.project(features)) for cell, m in zip(self.cells, memory, strict=True))
+        parts = zip(self.cells, memory, features, strict=True)
+        return tuple(cell.step(m, cell.project(read)) for cell, m, read in parts)
 
     def unroll(self, memory: Memory, obs: PyTree, started: Array) -> Memory:
         """Returns the memory after each observation, ``(steps, n, size)`` each.
@@ -209,9 +222,11 @@ class RecurrentActorCritic(eqx.Module):
             obs: ``(steps, n, ...)``.
             started: where an episode begins with an observation, ``bool (steps, n)``.
         """
-        features = self.features(obs, started.shape)
+        n_steps, n = started.shape
+        flat = jax.tree.map(lambda x: x.reshape(n_steps * n, *x.shape[2:]), unmasked(obs)[0])
+        features = [read.reshape(n_steps, n, -1) for read in self.features(flat)]
         after = []
-        for cell, first in zip(self.cells, memory, strict=True):
+        for cell, first, read in zip(self.cells, memory, features, strict=True):
             fresh = cell.empty(started.shape[1])
 
             def step(
@@ -221,13 +236,15 @@ class RecurrentActorCritic(eqx.Module):
                 memory = cell.step(renew(began, fresh, memory), projected)
                 return memory, memory
 
-            after.append(jax.lax.scan(step, first, (cell.project(features), started))[1])
+            after.append(jax.lax.scan(step, first, (cell.project(read), started))[1])
         return tuple(after)
 
-    def features(self, obs: PyTree, shape: tuple[int, ...]) -> Array:
-        """Returns the features of observations ``(steps, n, ...)``, ``(steps, n, n_features)``."""
-        flat = jax.tree.map(lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), unmasked(obs)[0])
-        return self.encoder(flat).reshape(*shape, -1)
+    def features(self, obs: PyTree) -> tuple[Array, ...]:
+        """Returns what each cell is given of observations ``(n, ...)``, ``(n, n_features)`` each."""
+        features = self.encoder(obs)
+        if self.value_encoder is None:
+            return (features,) * len(self.cells)
+        return features, self.value_encoder(obs)
 
     def policy(self, memory: Memory, mask: Array | None = None) -> Distribution:
         """Returns the distribution of actions with memories ``(n, size)``."""
