@@ -502,6 +502,33 @@ def test_a_shared_memory_is_one():
     assert one.learn(12).n_updates > 0
 
 
+@pytest.mark.parametrize(
+    ("state", "received"),
+    [
+        (tuple((np.zeros((1, SIZE + 1)), np.zeros((1, SIZE + 1))) for _ in range(2)), rf"\(1, {SIZE + 1}\)"),
+        (tuple((np.zeros((3, SIZE)), np.zeros((3, SIZE))) for _ in range(2)), rf"\(3, {SIZE}\)"),
+        ((np.zeros((1, SIZE)), np.zeros((1, SIZE))), rf"\(\(1, {SIZE}\), \(1, {SIZE}\)\),"),
+        ("nothing", r"\(\)"),
+    ],
+)
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_a_memory_of_another_size_is_refused_in_one_line(bold, state, received, deterministic):
+    """One of three episodes would otherwise be taken for one of one, by broadcasting."""
+    with pytest.raises(
+        ValueError, match=rf"given a state of the shapes .*{received}.* expected .*\(1, {SIZE}\).*; give what its last"
+    ) as caught:
+        bold.predict(np.zeros(3, np.float32), state, deterministic=deterministic)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_memory_may_have_been_kept_as_numpy_arrays(bold):
+    obs = np.ones((2, 3), np.float32)
+    _, memory = bold.predict(obs, deterministic=True)
+    kept = jax.tree.map(np.array, memory)
+    for one, other in zip(*(jax.tree.leaves(bold.predict(obs, m)[1]) for m in (memory, kept)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 IMAGES = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 
 

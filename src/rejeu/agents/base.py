@@ -132,6 +132,8 @@ class Agent(ABC):
         self._saved_callbacks: list[Any] | None = None
         self._steps_before = 0
         self._n_predictions = 0
+        self._memory_form: Any = None
+        """The form of what the policy remembers of one episode, once somebody has given it."""
         self._own_env = False
         """Whether the environment was given by its id."""
         compilation.enable_cache()
@@ -317,7 +319,8 @@ class Agent(ABC):
                 allows all.
 
         Raises:
-            ValueError: if the observation or the mask does not have the space's structure or shape.
+            ValueError: if the observation or the mask does not have the space's structure or shape, or ``state`` that of
+                the policy's memory.
         """
         if self.takes_masks:
             observation, action_masks = split(observation, action_masks)

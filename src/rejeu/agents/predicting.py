@@ -57,13 +57,20 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
         deterministic: the policy's mode; False draws from the policy.
         memory: what the last call returned; None stands for episodes that have not begun.
         ended: where an episode begins with these observations, ``bool (batch,)``.
+
+    Raises:
+        ValueError: if ``memory`` is not of this policy, or of another number of episodes.
     """
     finite.settle(agent)
     run, compiled, n = agent._run, agent._compiled, len(ended)
     has_memory = compiled.algorithm.recall is not None
     if deterministic and not has_memory:
         return np.asarray(compiled.exploit(run.state, obs)), None
-    carry = memory if has_memory and memory is not None else compiled.initial_carry(n)
+    if has_memory and memory is not None:
+        check_memory(agent, memory, n)
+        carry = memory
+    else:
+        carry = compiled.initial_carry(n)
     if deterministic:
         action, carry = compiled.recall(run.state, carry, obs, ended)
         return np.asarray(action), carry
@@ -72,6 +79,19 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
     ended = ended if has_memory else np.ones(n, bool)
     action, carry = compiled.act(run.state, carry, obs, ended, run.key, clock)
     return np.asarray(action), carry if has_memory else None
+
+
+def check_memory(agent: Agent, memory: Any, n: int) -> None:
+    """Raises ``ValueError`` unless ``memory`` is what the agent's policy remembers of ``n`` episodes."""
+    if agent._memory_form is None:  # found out once: it takes longer than a prediction
+        agent._memory_form = jax.eval_shape(lambda: agent._compiled.initial_carry(1))
+    given = jax.tree.map(np.shape, memory)
+    expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent._memory_form)
+    if given != expected:
+        raise ValueError(
+            f"{agent.name}.predict was given a state of the shapes {given}, expected {expected}; give what its last call "
+            "returned for as many observations, or None where episodes begin"
+        )
 
 
 def refuse_masks(masks: Any, name: str) -> None:
