@@ -271,11 +271,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network: Any = RecurrentActorCritic(network_key, obs_leaves, kind, config.policy_kwargs)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
-    def begin(actor: RecurrentActorCritic, n_envs: int) -> Memory:
-        size, n_parts = config.policy_kwargs.lstm_hidden_size, 2 if config.policy_kwargs.cell == "lstm" else 1
-        n_cells = 1 if config.policy_kwargs.shared_lstm else 2
-        return tuple(tuple(jnp.zeros((n_envs, size), jnp.float32) for _ in range(n_parts)) for _ in range(n_cells))
-
     def act(
         memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array, key: Array, clock: Clock
     ) -> tuple[Array, Memory]:
@@ -288,11 +283,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def explore(actor: RecurrentActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
         ended = jnp.ones((jax.tree.leaves(obs)[0].shape[0],), bool)
-        return act(begin(actor, ended.shape[0]), actor, obs, ended, key, clock)[0]
+        return act(actor.empty(ended.shape[0]), actor, obs, ended, key, clock)[0]
 
     def exploit(actor: RecurrentActorCritic, obs: PyTree) -> Array:
         ended = jnp.ones((jax.tree.leaves(obs)[0].shape[0],), bool)
-        return recall(begin(actor, ended.shape[0]), actor, obs, ended)[0]
+        return recall(actor.empty(ended.shape[0]), actor, obs, ended)[0]
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         n_steps, n_envs = rollout.reward.shape
@@ -322,7 +317,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = State(network, optimizer_state, state.key, state.n_updates + n_taken, state.n_rollouts + 1)
         return state, ppo.metrics_of(network, n_taken, losses, data.value, data.target, data.valid, config, clock)
 
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, Explorer(begin, act), recall)
+    return Algorithm(
+        init, lambda state: state.network, explore, exploit, update, Explorer(RecurrentActorCritic.empty, act), recall
+    )
 
 
 def samples(network: RecurrentActorCritic, rollout: Rollout, gae_lambda: float) -> tuple[Samples, Array]:

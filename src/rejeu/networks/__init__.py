@@ -21,7 +21,7 @@ from rejeu.networks.encoder import (
 )
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear
 from rejeu.networks.shape import BRANCHES, PolicyConfig
-from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, make_torso, own_torso
+from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_torso, own_torso
 
 __all__ = [
     "ACTIVATIONS",
@@ -47,6 +47,7 @@ __all__ = [
     "convolutions",
     "encode_leaf",
     "image_shape",
+    "joined_width",
     "make_torso",
     "n_features",
     "own_torso",

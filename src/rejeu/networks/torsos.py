@@ -31,8 +31,7 @@ class Branches(eqx.Module):
         layers = lambda k, n_inputs, sizes: MLP(k, n_inputs, sizes, shape.activation_fn, shape.layer_norm)  # noqa: E731
         self.state = layers(keys[0], n_features, shape.state_layers)
         self.action = None if action_dim is None else layers(keys[1], action_dim, shape.action_layers)
-        n_joined = (n_features, *shape.state_layers)[-1]
-        n_joined += 0 if action_dim is None else (action_dim, *shape.action_layers)[-1]
+        n_joined = joined_width(n_features, action_dim, shape)
         self.common = layers(keys[2], n_joined, shape.common_layers)
         self.last = layers(keys[3], (n_joined, *shape.common_layers)[-1], widths)
 
@@ -43,6 +42,12 @@ class Branches(eqx.Module):
             assert action is not None
             x = jnp.concatenate([x, self.action(action)], axis=-1)
         return self.last(self.common(x))
+
+
+def joined_width(n_features: int, action_dim: int | None, shape: PolicyConfig) -> int:
+    """Returns how many numbers the branches bring to where they meet; no action branch for None."""
+    from_state = (n_features, *shape.state_layers)[-1]
+    return from_state if action_dim is None else from_state + (action_dim, *shape.action_layers)[-1]
 
 
 class ResidualBlock(eqx.Module):
@@ -115,9 +120,7 @@ def make_torso(
         return torso, torso.n_outputs
     if shape.has_branches:
         branches = Branches(key, n_features, action_dim, widths, shape)
-        joined = (n_features, *shape.state_layers)[-1]
-        joined += 0 if action_dim is None else (action_dim, *shape.action_layers)[-1]
-        return branches, (joined, *shape.common_layers, *widths)[-1]
+        return branches, (joined_width(n_features, action_dim, shape), *shape.common_layers, *widths)[-1]
     if shape.architecture == "simba":
         return SimBa(key, n_inputs, widths, shape.activation_fn), widths[-1]
     return MLP(key, n_inputs, widths, shape.activation_fn, shape.layer_norm), (n_inputs, *widths)[-1]
