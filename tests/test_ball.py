@@ -131,6 +131,19 @@ def test_state_of_another_dimension_is_refused():
         Ball(3).set_state(ball.get_state())
 
 
+@pytest.mark.parametrize(
+    "part",
+    [{"position": [np.nan, 0.0]}, {"position": [11.0, 0.0]}, {"position": []}, {"n_steps": 500}, {"n_steps": -1}],
+)
+def test_a_state_in_which_no_ball_can_be_under_way_is_refused_and_changes_nothing(part):
+    ball = Ball(2)
+    ball.reset(seed=0)
+    before = ball.get_state()
+    with pytest.raises(ValueError, match="no ball is under way"):
+        ball.set_state(before | part)
+    assert ball.get_state() == before
+
+
 def survival(sigma: float, n_cells: int = 400, n_steps: int = 500) -> float:
     """Returns the probability that clip(-x, -2, 2) holds one dimension, from its transition kernel on a grid."""
     edges = np.linspace(-10, 10, n_cells + 1)

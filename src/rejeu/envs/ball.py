@@ -144,14 +144,17 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         """Continues where :meth:`get_state` was called, exactly; the trail that is drawn begins here.
 
         Raises:
-            ValueError: if the state is of another dimension.
+            ValueError: if the state is of another dimension, or no episode can stand there.
         """
         if len(state["position"]) not in (0, self.dimension):
             raise ValueError(f"the state is of {len(state['position'])} dimensions and this ball has {self.dimension}")
+        position = [float(x) for x in state["position"]]
+        n_steps, over = int(state["n_steps"]), bool(state["over"])
+        inside = all(-WALL <= x <= WALL for x in position) and position and 0 <= n_steps < N_STEPS
+        if not (over or inside) or not all(map(math.isfinite, position)):
+            raise ValueError(f"no ball is under way at {position} after {n_steps} steps")
         self.np_random.bit_generator.state = state["rng"]
-        self.position = [float(x) for x in state["position"]]
-        self.n_steps = int(state["n_steps"])
-        self.over = bool(state["over"])
+        self.position, self.n_steps, self.over = position, n_steps, over
         self._trail.clear()
         self._push = []
         if self.position:

@@ -21,6 +21,7 @@ import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs import classic_control
 
+from rejeu.envs.ball import Ball
 from rejeu.envs.masks import MaskedVector, MaskInObservation
 from rejeu.envs.monitor import Monitor
 from rejeu.envs.vector import InProcess, VectorEnv
@@ -55,7 +56,19 @@ REMEMBERED: dict[type, tuple[str, ...]] = {
     classic_control.AcrobotEnv: ("state",),
 }
 """Attributes that hold all that wrappers and environments remember, beside the random numbers of the latter."""
+SIZES: dict[type, int] = {
+    classic_control.CartPoleEnv: 4,
+    classic_control.MountainCarEnv: 2,
+    classic_control.Continuous_MountainCarEnv: 2,
+    classic_control.PendulumEnv: 2,
+    classic_control.AcrobotEnv: 4,
+}
+"""How many numbers the ``state`` of an environment is."""
 MUJOCO = "gymnasium.envs.mujoco."
+OPTIONAL = ("state", "steps_beyond_terminated", "last_u", "_elapsed_steps")
+"""Attributes that may be None, or not be there yet."""
+LISTS = ("rewards", "episode_returns", "episode_lengths", "episode_times")
+"""Attributes of a Monitor that are lists of numbers, one for each step or episode."""
 ABSENT = "absent"
 """Stands for an attribute that is not there yet, as ``last_u`` before the first step."""
 
@@ -137,6 +150,7 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
                     f"the state of {type(layer).__name__} has {sorted(state)}, expected {sorted(expected)}"
                 )
             for name in REMEMBERED.get(type(layer), ()):
+                _check_form(layer, name, state[name])
                 if not (isinstance(state[name], str) and state[name] == ABSENT):
                     setattr(layer, name, state[name])
             if isinstance(layer, wrappers.PassiveEnvChecker):  # which checked it where the run began
@@ -152,6 +166,47 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
         raise ValueError(f"the state is of another environment than {env}")
     if not answers_for_itself(layer) and state["rng"] is not None:
         layer.unwrapped.np_random.bit_generator.state = state["rng"]
+
+
+def over(env: VectorEnv) -> list[int]:
+    """Returns which environments must be reset before they can be stepped, as far as their layers say so."""
+    if isinstance(env, MaskedVector):
+        return over(env.inner)
+    return [i for i, one in enumerate(env.envs) if _is_over(one)] if isinstance(env, InProcess) else []
+
+
+def _is_over(env: gym.Env) -> bool:
+    layer = env
+    while isinstance(layer, gym.Wrapper):
+        if isinstance(layer, Monitor) and layer.needs_reset:
+            return True
+        if isinstance(layer, wrappers.OrderEnforcing) and not layer._has_reset:
+            return True
+        if isinstance(layer, wrappers.TimeLimit) and layer._elapsed_steps is None:
+            return True
+        layer = layer.env
+    return layer.over if isinstance(layer, Ball) else type(layer) in SIZES and getattr(layer, "state", None) is None
+
+
+def _check_form(layer: gym.Env, name: str, value: Any) -> None:
+    """Raises ``ValueError`` unless an attribute of a layer may have this value, which comes from a file."""
+    if name in OPTIONAL and (value is None or (isinstance(value, str) and value == ABSENT)):
+        return
+    if name == "state":  # an array, or after some steps a tuple of numbers
+        whole = isinstance(value, np.ndarray) or (isinstance(value, tuple) and all(map(_is_number, value)))
+        fits = whole and np.shape(value) == (SIZES[type(layer)],) and bool(np.isfinite(value).all())
+    elif name in ("_has_reset", "needs_reset"):
+        fits = isinstance(value, bool)
+    elif isinstance(layer, Monitor) and name in LISTS:
+        fits = isinstance(value, list) and all(map(_is_number, value))
+    else:
+        fits = _is_number(value) or (name == "episode_returns" and isinstance(value, np.ndarray) and value.size == 1)
+    if not fits:
+        raise ValueError(f"{name} of {type(layer).__name__} cannot be {str(value)[:40]!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def answers_for_itself(layer: gym.Env) -> bool:
