@@ -70,6 +70,9 @@ class History:
         """
         if table.dtype != np.float64 or table.shape[1:] != (len(COLUMNS),):
             raise ValueError(f"a history is float64[n, {len(COLUMNS)}], got {table.dtype}{list(table.shape)}")
+        for column in ("step", "env", "length"):
+            if not np.isfinite(table[:, COLUMNS.index(column)]).all():
+                raise ValueError(f"the column {column!r} of a history must be finite")
         self._values = array("d", table.ravel())
 
     def moving_average(self, column: str = "return", window: int = 50) -> np.ndarray:

@@ -155,15 +155,21 @@ class Priorities:
             values, drawn = state["values"], [(index, time) for index, time in state["drawn"]]
             steps = self._step_positions()
             within = all(
-                i.dtype == t.dtype == np.int64 and i.shape == t.shape and ((i >= 0) & (i < len(values))).all()
+                i.dtype == t.dtype == np.int64
+                and i.shape == t.shape == (len(i),)
+                and ((i >= 0) & (i < len(values))).all()
                 for i, t in drawn
             )
             if values.shape != (self.ring.rows * self.ring.n_envs,) or values.dtype != np.float64 or not within:
                 raise ValueError("the priorities are of another replay buffer")
-            if not np.isfinite(values).all() or not np.array_equal(np.flatnonzero(values > 0), np.sort(steps)):
+            largest = float(state["largest"])
+            most = float(np.finfo(np.float64).max) / self.tree.n_leaves  # so that their sum is finite
+            if not ((values >= 0) & (values <= most)).all() or not 0 < largest <= most:
+                raise ValueError("the priorities are not finite, or not positive")
+            if not np.array_equal(np.flatnonzero(values > 0), np.sort(steps)):
                 raise ValueError("the priorities do not belong to the steps of this replay buffer")
             self.tree.fill(values)
-            self.largest = float(state["largest"])
+            self.largest = largest
             self._drawn = deque(drawn)
             return
         nowhere = np.zeros(0, np.int64)

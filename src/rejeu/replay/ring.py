@@ -377,6 +377,8 @@ class Ring:
                     )
             if rows["kind"].max(initial=0) > LAST:
                 raise ValueError("rows of the replay buffer have damaged kinds")
+            if not (np.isfinite(rows["action"]).all() and np.isfinite(rows["reward"]).all()):
+                raise ValueError("rows of the replay buffer have actions or rewards that are not finite")
             spans = [np.arange(first[env], head[env] + 1) for env in range(self.n_envs)]
             index = np.concatenate([self.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
             for name, array in own.items():

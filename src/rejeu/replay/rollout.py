@@ -137,7 +137,8 @@ class RolloutBuffer:
         """Puts back what :meth:`arrays` returned.
 
         Raises:
-            ValueError: if names, shapes or dtypes are not those of this buffer; nothing is then changed.
+            ValueError: if names, shapes or dtypes are not those of this buffer, or if it would be full, as none is between
+                two steps; nothing is then changed.
         """
         self.length, length = self.n_steps, self.length
         own = self.arrays()
@@ -152,6 +153,8 @@ class RolloutBuffer:
                     f"{name} in the file is {given.dtype}{list(given.shape)}, expected {array.dtype} and at most "
                     f"{list(array.shape)}"
                 )
+        if n == self.n_steps:
+            raise ValueError(f"the rollout has {n} steps, and {self.n_steps} are learnt from as soon as they are there")
         for name, array in own.items():
             array[:n] = arrays[name]
         self.length = n
