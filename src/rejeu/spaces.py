@@ -243,6 +243,23 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.n
     raise TypeError(f"cannot draw random actions of {space}")
 
 
+def check_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
+    """Checks actions ``(..., action_dim)`` or, of Discrete, ``(...)`` of a file, as algorithms give them.
+
+    ``owner`` is what holds them, for the message.
+
+    Raises:
+        ValueError: if they are not finite, or choices that the space has not: nothing later would notice these.
+    """
+    if not np.isfinite(action).all():
+        raise ValueError(f"{owner} has actions that are not finite")
+    if isinstance(space, spaces.Box) or not action.size:
+        return
+    n = space.n if isinstance(space, spaces.Discrete) else getattr(space, "nvec", np.array(2)).ravel()
+    if (action < 0).any() or (action >= n).any():
+        raise ValueError(f"{owner} has actions from {action.min()} to {action.max()}, expected {space}")
+
+
 def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
     """Returns whether two spaces hold arrays of the same structure, shapes and dtypes, and the same bounds if asked.
 

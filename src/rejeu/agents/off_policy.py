@@ -7,7 +7,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 
 from rejeu import checkpoint, spaces
@@ -59,7 +58,8 @@ class OffPolicyAgent(Agent):
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
         _, arrays = checkpoint.read(path, "replay")
         try:
-            _check_actions(arrays.get("action"), self.action_space)
+            if (action := arrays.get("action")) is not None:
+                spaces.check_actions(self.action_space, action, "the replay file")
             self._run.replay.restore(arrays)
         except ValueError as error:
             raise CheckpointError(f"{path}: {error}") from None
@@ -160,11 +160,3 @@ class CrossQ(OffPolicyAgent):
     """SAC with batch renormalisation instead of target networks (Bhatt et al. 2024), for continuous actions."""
 
     algorithm: ClassVar[ModuleType] = crossq
-
-
-def _check_actions(action: np.ndarray | None, space: gym.Space) -> None:
-    """Raises ``ValueError`` if a file's Discrete actions are none of the space's, which nothing later would notice."""
-    if action is None or not isinstance(space, gym.spaces.Discrete) or not action.size:
-        return
-    if action.min() < 0 or action.max() >= space.n:
-        raise ValueError(f"the replay file has actions from {action.min()} to {action.max()}, expected {space}")

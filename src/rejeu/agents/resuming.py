@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ from rejeu.core import PyTree
 from rejeu.envs import state as env_state
 from rejeu.envs.vector import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
-from rejeu.loops.host import Run
+from rejeu.loops.host import Run, is_finite
 from rejeu.loops.packing import Readings
 from rejeu.replay.rollout import RolloutBuffer
 
@@ -64,46 +66,86 @@ def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
 
 
 def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
-    header, arrays = checkpoint.read(path, "run")
-    state = {name[6:]: array for name, array in arrays.items() if name.startswith("state.")}
-
-    def make_env(agent: Agent) -> VectorEnv:
-        if env is None:
-            env_id, n_envs, backend = environment(path, header)
-            vector = agent._vector(env_id, n_envs, backend, agent.seed)
-        else:
-            vector = agent._vector(env, seed=agent.seed)
-        if vector.n_envs != header.get("n_envs"):
-            raise CheckpointError(f"the run had {header.get('n_envs')} environments, and {vector.n_envs} are given")
-        return vector
-
-    agent = files.load(cls, path, header, state, make_env, changes)
-    try:
-        saved = plain.decode(header["run"], arrays)
-        rows = [_rows_name(name) for name in header["rows"]]
-        parts = [checkpoint.read(path.parent / name, "rows")[1] for name in rows]
-        restore(agent, saved, parts, {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}, path)
-        agent._run_id, agent._own_env = text(header["run_id"]), env is None
-    except FileNotFoundError as error:
-        raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
-    except CheckpointError:
-        raise
-    except loading.WRONG as error:
-        raise CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {loading.brief(error)}") from error
-    if parts:
-        ring = agent._run.replay.ring
-        heads = [part["head"] for part in parts]
-        agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
+    with ExitStack() as made:
+        agent = _resume_within(made, cls, path, env, changes)
+        made.pop_all()
     assert agent.resumed is not None
     if not agent.resumed.exact:
         warnings.warn(str(agent.resumed), UserWarning, stacklevel=4)
     return agent
 
 
+def _resume_within(made: ExitStack, cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
+    """Returns the agent; environments that are made for it are closed with ``made``, should it be refused."""
+    header, arrays = checkpoint.read(path, "run")
+    state = {name[6:]: array for name, array in arrays.items() if name.startswith("state.")}
+    try:
+        saved = plain.decode(header["run"], arrays)
+        rows = [_rows_name(name) for name in header["rows"]]
+        counted = saved["buffer"]["heads" if "heads" in saved["buffer"] else "started"]
+        if len(counted) != header["n_envs"]:
+            raise ValueError(f"it is of {header['n_envs']} environments, and its replay buffer of {len(counted)}")
+    except loading.WRONG as error:
+        raise refusal(path, error) from error
+
+    def make_env(agent: Agent) -> VectorEnv:
+        if env is not None:
+            vector = agent._vector(env, seed=agent.seed)
+            if vector.n_envs != header["n_envs"]:
+                raise CheckpointError(f"the run had {header['n_envs']} environments, and {vector.n_envs} are given")
+            return vector
+        env_id, n_envs, backend = environment(path, header)
+        try:
+            vector = agent._vector(env_id, n_envs, backend, agent.seed)
+            made.callback(vector.close)
+            agent._check_spaces(vector, f"{env_id} as it is here")
+        except (ValueError, TypeError, gym.error.Error) as error:
+            raise CheckpointError(
+                f"{path}: the environments of the run cannot be made again ({loading.brief(error)}); give them: "
+                "resume(folder, env=...)"
+            ) from error
+        return vector
+
+    agent = files.load(cls, path, header, state, make_env, changes)
+    try:
+        parts = [checkpoint.read(path.parent / name, "rows")[1] for name in rows]
+        restore(agent, saved, parts, {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}, path)
+        if "train_freq" not in changes:
+            check_owed(agent)
+        agent._run_id, agent._own_env = text(header["run_id"]), env is None
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
+    except loading.WRONG as error:
+        raise refusal(path, error) from error
+    if parts:
+        ring = agent._run.replay.ring
+        heads = [part["head"] for part in parts]
+        agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
+    return agent
+
+
+def refusal(path: Path, error: BaseException) -> CheckpointError:
+    """Returns what a checkpoint is refused with, from what was raised while its values were put in place."""
+    if isinstance(error, CheckpointError):
+        return error
+    return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {loading.brief(error)}")
+
+
 def _rows_name(name: Any) -> str:
     if not isinstance(name, str) or not ROWS_FILE.fullmatch(name):
         raise CheckpointError(f"{str(name)[:40]!r} is no file of rows")
     return name
+
+
+def check_owed(agent: Agent) -> None:
+    """Checks that no more gradient steps are due than a run of this configuration can owe between two steps.
+
+    Raises:
+        ValueError: if more are, which nothing but a damaged file can ask for.
+    """
+    frequency = getattr(agent.config, "train_freq", 1)
+    if agent._run.owed >= (frequency if isinstance(frequency, int) else frequency[0]):
+        raise ValueError(f"owed={agent._run.owed} is not below train_freq={frequency!r}")
 
 
 def environment(path: Path, header: dict[str, Any]) -> tuple[str, int, Backend]:
@@ -134,6 +176,7 @@ def restore(
     run, compiled = agent._run, agent._compiled
     for key in SCALARS:
         setattr(run, key, whole(key, saved[key], least=0))
+    whole("steps_since_update", run.steps_since_update, least=0, most=run.step)
     n_envs = run.env.n_envs
     run.rng.bit_generator.state = saved["rng"]
     run.carry = like(compiled.initial_carry(n_envs), saved["carry"], "carry")
@@ -145,16 +188,25 @@ def restore(
     run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
     for key in PER_ENV:
         setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
-    restore_buffer(run, saved["buffer"], rows, compiled.initial_carry(n_envs))
+    for part in rows:
+        spaces.check_actions(agent.action_space, part["action"], "a file of rows")
+    restore_buffer(run, saved["buffer"], rows, compiled.initial_carry(n_envs), begun=saved["envs"] is not None)
+    if isinstance(run.replay, RolloutBuffer):
+        spaces.check_actions(agent.action_space, saved["buffer"]["rollout"]["action"], "the rollout")
     if saved["envs"] is not None:
-        put_envs_back(run, saved)
+        put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
     elif saved["seed"] is not None:
         run.seed = loading.whole_seed(saved["seed"])
     agent.history.replace(saved["history"])
     agent._fill_windows()
     if saved["best"] is not None:
         packed = compiled.pack(checkpoint.arrays_to_tree(compiled.shapes, best, path))
-        agent._put_best(saved["best"]["score"], text(saved["best"]["by"]), int(saved["best"]["step"]), packed)
+        checkpoint.require_finite(best, path)
+        score, step = saved["best"]["score"], whole("step", saved["best"]["step"], least=0)
+        scores = score if isinstance(score, tuple) else (score,)
+        if not all(isinstance(part, int | float) for part in scores):
+            raise TypeError(f"the best score is {score!r}, expected a number, or several")
+        agent._put_best(score, text(saved["best"]["by"]), step, packed)
     values, counts = saved["logger"]
     agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
     agent.logger._counts = {key: whole(key, value, least=0) for key, value in counts.items()}
@@ -167,31 +219,56 @@ def restore(
     agent.resumed = Resumed(run.step, not text(saved["reason"]), saved["reason"])
 
 
-def put_envs_back(run: Run, saved: dict[str, Any]) -> None:
-    """Lets the environments stand where they stood, with the observations and the actions that were chosen there."""
+def put_envs_back(run: Run, saved: dict[str, Any], n_episodes: int | None) -> None:
+    """Lets the environments stand where they stood, with the observations and the actions that were chosen there.
+
+    Where rollouts are ``n_episodes`` whole episodes, those that have played theirs may stand at the end of one.
+    """
     n_envs = run.env.n_envs
     for key in PER_ENV:
-        if len(getattr(run, key)) not in (n_envs, 0):
+        if len(getattr(run, key)) != n_envs and (key != "playing" or n_episodes is not None):
             raise ValueError(f"{key} is not of {n_envs} environments")
+    if not isinstance(run.replay, RolloutBuffer) and (run.replay.ring.head < 0).any():
+        raise ValueError("the replay buffer does not hold the episodes under way")
+    waiting = None
+    if n_episodes is not None:
+        waiting = run.playing == 0
+        if waiting.all() or not ((run.playing >= 0) & (run.playing <= n_episodes)).all():
+            raise ValueError(f"playing={run.playing} is not between 0 and n_episodes={n_episodes}, or all 0")
     held = run.replay if isinstance(run.replay, RolloutBuffer) else run.replay.ring
     parts = zip(saved["obs"], held.obs_leaves, strict=True)
     obs = jax.tree.unflatten(
         held.obs_structure, [exactly(part, (n_envs, *leaf.shape), leaf.dtype, "obs") for part, leaf in parts]
     )
+    if not all(is_finite(leaf) for leaf in jax.tree.leaves(obs)):
+        raise ValueError("the observations are not finite")
     env_state.put_back(run.env, saved["envs"], obs)
+    if over := [i for i in env_state.over(run.env) if waiting is None or not waiting[i]]:
+        raise ValueError(f"the episode of environment {over[0]} is over, and it was not reset")
     run.obs = obs
     if saved["action"] is not None:
         expected = np.asarray(spaces.random_action(run.env.action_space, n_envs, np.random.default_rng(0)))
         run.action = exactly(saved["action"], expected.shape, expected.dtype, "action")
+        spaces.check_actions(run.env.action_space, run.action, "the checkpoint")
 
 
-def restore_buffer(run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], carry: PyTree) -> None:
-    """Puts the experience of a run back; ``carry`` is what exploration remembers, for its form."""
+def restore_buffer(
+    run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], carry: PyTree, begun: bool
+) -> None:
+    """Puts the experience of a run back.
+
+    Args:
+        run: mutated.
+        saved: what :func:`rejeu.agents.checkpoints.buffer_content` returned.
+        rows: of a ring.
+        carry: what exploration remembers, for its form.
+        begun: whether a rollout is under way; before the first there is nothing that was remembered at its beginning.
+    """
     buffer = run.replay
     if isinstance(buffer, RolloutBuffer):
         buffer.restore(saved["rollout"])
         buffer.started = exactly(saved["started"], (buffer.n_envs,), np.dtype(bool), "started")
-        buffer.carry = like(carry, saved["carry"], "carry") if buffer.length or saved["carry"] else ()
+        buffer.carry = like(carry, saved["carry"], "carry") if begun or buffer.length or saved["carry"] else ()
         return
     buffer.ring.put_rows(rows)
     if not np.array_equal(buffer.ring.head, saved["heads"]):
@@ -217,9 +294,11 @@ def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
     """Returns a tree of the form of ``expected`` with the given leaves.
 
     Raises:
-        ValueError: if shapes or dtypes differ.
+        ValueError: if shapes or dtypes differ, or a number is not finite.
     """
     parts = jax.tree.leaves(expected)
+    if not all(is_finite(part) for part in given):
+        raise ValueError(f"{name} is not finite")
     return jax.tree.unflatten(
         jax.tree.structure(expected),
         [jnp.asarray(exactly(g, e.shape, np.dtype(e.dtype), name)) for g, e in zip(given, parts, strict=True)],
