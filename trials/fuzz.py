@@ -5,7 +5,8 @@ It needs atheris, which is no dependency of rejeu's (Linux and macOS)::
     pip install atheris
     python trials/fuzz.py --seconds 300 --target all
 
-Each target runs in a process of its own, seeded with the recorded files of ``tests/golden``. Inputs are mutated as bytes,
+Each target runs in a process of its own, seeded with the recorded files of ``tests/golden``, or with checkpoints of runs that
+it makes first (``run`` and ``rows``; see ``fuzz_runs.py``, which says what is asked of them). Inputs are mutated as bytes,
 as JSON, as arrays and as tables; most of the time checksums and lengths are put right afterwards, so that what lies behind
 them is reached. A finding is any exception but ``CheckpointError``, any input that takes too long, and any
 file that is read and then cannot be used. Findings are saved in ``trials/results/findings``, and counts in
@@ -33,7 +34,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 RESULTS = ROOT / "trials" / "results"
-SECONDS = {"agent": 20.0}
+SECONDS = {"agent": 20.0, "run": 20.0, "rows": 20.0}
 """Longest that any input may take on a processor, two seconds where not said; building networks includes compiling them."""
 SEEDS = {
     "table": ("sac", "td3", "dqn", "ppo", "replay", "vec_normalize"),
@@ -41,8 +42,10 @@ SEEDS = {
     "agent": ("sac", "td3", "dqn", "ppo"),
     "replay": ("replay",),
     "vec_normalize": ("vec_normalize",),
+    "run": (),
+    "rows": (),
 }
-"""The targets, and the files of ``tests/golden`` that each begins with."""
+"""The targets, and the files of ``tests/golden`` that each begins with; ``fuzz_runs.py`` makes those of the last two."""
 VALUES = (
     None,
     True,
@@ -79,6 +82,13 @@ VALUES += (
     "simba",
     "gru",
     "os.system",
+    "envpool",
+    "CartPole-v1",
+    "rejeu/Ball-v0",
+    {"float": "nan"},
+    {"float": "inf"},
+    {"tuple": []},
+    {"dict": {}},
     "float64",
     "HerReplayBuffer",
 )
@@ -143,9 +153,13 @@ def fuzz(target: str, seconds: int) -> None:
     for path in files:
         seeds.append(path.read_bytes())
         (corpus / f"{path.parent.name}-{path.stem}").write_bytes(seeds[-1])
-    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size))  # which is another function once it fuzzes
     watched = Watched(target, folder)
+    for i, content in enumerate(watched.seeds):
+        seeds.append(content)
+        (corpus / f"{target}-{i}").write_bytes(content)
+    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size))  # which is another function once it fuzzes
     flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=60", "-len_control=0"]
+    flags.append(f"-artifact_prefix={folder}{os.sep}")
     atheris.Setup([sys.argv[0], str(corpus), *flags], watched, custom_mutator=mutate)
     atheris.Fuzz()
 
@@ -156,10 +170,19 @@ class Watched:
     def __init__(self, target: str, folder: Path) -> None:
         self.target, self.folder = target, folder
         self.path = folder / "input.safetensors"
-        self.read = READERS[target](self.path)
+        self.seeds: list[bytes] = []
+        """What the target begins with beside recorded files."""
+        self.read = READERS[target](self.path) if target in READERS else self.whole_runs()
         self.counts = {"executions": 0, "refused": 0, "read": 0, "findings": 0}
         self.seen: set[str] = set()
         self.written = 0.0
+
+    def whole_runs(self) -> Callable[[], None]:
+        """Makes runs, and returns what resumes one of which a file was replaced by the input."""
+        import fuzz_runs
+
+        self.seeds, read = fuzz_runs.reader(self.target, self.folder)
+        return lambda: read(self.path)
 
     def __call__(self, data: bytes) -> None:
         """Reads one input."""
@@ -321,28 +344,11 @@ def header_reader(path: Path) -> Callable[[], None]:
 
 def agent_reader(path: Path) -> Callable[[], None]:
     """Returns what loads models; those of one configuration share what is compiled, which takes most of the time."""
-    import jax
+    import fuzz_runs
 
     import rejeu
-    from rejeu import config as configs, spaces
-    from rejeu.agents.base import Agent
 
-    build, kept = Agent._build, {}
-
-    def build_once(self: Agent, observation_space: Any, action_space: Any, n_envs: int) -> None:
-        described = [spaces.describe(observation_space), spaces.describe(action_space)]
-        key = json.dumps([self.name, configs.to_json(self.config), described])
-        if key in kept:
-            self.observation_space, self.action_space = observation_space, action_space
-            self._obs_leaves, self._compiled = spaces.leaves(observation_space), kept[key]
-            return
-        if len(kept) > 200:
-            kept.clear()
-            jax.clear_caches()
-        build(self, observation_space, action_space, n_envs)
-        kept[key] = self._compiled
-
-    Agent._build = build_once  # type: ignore[method-assign]
+    fuzz_runs.share_compiled()
 
     def read() -> None:
         rejeu.load(path)

@@ -15,6 +15,8 @@ COMMANDS = """python trials/kill.py --kills 200 --sb3-python PATH
 python trials/resume.py --sb3-python PATH
 python trials/hostile.py --sb3-python PATH
 python trials/fuzz.py --seconds 300
+python trials/fuzz.py --seconds 600 --target run
+python trials/fuzz.py --seconds 600 --target rows
 python trials/soak.py --minutes 60
 python trials/report.py"""
 
@@ -152,7 +154,8 @@ def fuzzed() -> str:
 
 The loaders under a coverage-guided fuzzer (atheris) whose mutations keep lengths and checksums right part of the time:
 {executions:,} executions in {hours:.1f} hours. A finding is anything but our own error, a load of more than a bounded time, or
-one that changes what it should not.
+one that changes what it should not. `run` and `rows` are the two kinds of file that a checkpoint of a whole run has: what is
+resumed from them must learn on and save checkpoints, and these must be read again, or that is a finding as well.
 
 {table(("loader", "executions", "minutes", "branches reached", "findings"), rows)}
 """
