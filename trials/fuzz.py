@@ -46,6 +46,9 @@ SEEDS = {
     "rows": (),
 }
 """The targets, and the files of ``tests/golden`` that each begins with; ``fuzz_runs.py`` makes those of the last two."""
+AFRESH = {"run": 0.7, "rows": 0.7}
+"""How often a whole file is changed in place of an input that reached something new. Most of those are refused, and stay so;
+of these targets what comes after reading is as much."""
 VALUES = (
     None,
     True,
@@ -157,7 +160,8 @@ def fuzz(target: str, seconds: int) -> None:
     for i, content in enumerate(watched.seeds):
         seeds.append(content)
         (corpus / f"{target}-{i}").write_bytes(content)
-    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size))  # which is another function once it fuzzes
+    afresh = AFRESH.get(target, 0.0)
+    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size), afresh)  # Mutate is another once it fuzzes
     flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=60", "-len_control=0"]
     flags.append(f"-artifact_prefix={folder}{os.sep}")
     atheris.Setup([sys.argv[0], str(corpus), *flags], watched, custom_mutator=mutate)
@@ -204,7 +208,9 @@ class Watched:
         self.counts["executions"] += 1
         if time.monotonic() - self.written > 2.0:
             self.written = time.monotonic()
-            (self.folder / "counts.json").write_text(json.dumps(self.counts), encoding="utf-8")
+            new = self.folder / "counts.new"
+            new.write_text(json.dumps(self.counts), encoding="utf-8")
+            new.replace(self.folder / "counts.json")  # whole, whenever the process ends
 
     def note(self, data: bytes, what: str) -> None:
         """Saves an input, once for each place where it went wrong."""
@@ -220,12 +226,16 @@ class Watched:
         (target / f"{name}.txt").write_text(what, encoding="utf-8", errors="replace")
 
 
-def mutator(seeds: list[bytes], mutate: Callable[[bytes, int], bytes]) -> Callable[[bytes, int, int], bytes]:
-    """Returns what makes a new input of an old one."""
+def mutator(
+    seeds: list[bytes], mutate: Callable[[bytes, int], bytes], afresh: float = 0.0
+) -> Callable[[bytes, int, int], bytes]:
+    """Returns what makes a new input of an old one, or with the probability ``afresh`` of one of the seeds."""
     from tests import hostile_files
 
     def mutated(data: bytes, max_size: int, seed: int) -> bytes:
         draw = random.Random(seed)
+        if draw.random() < afresh:
+            data = draw.choice(seeds)
         try:
             parts = hostile_files.take_apart(data)
         except Exception:

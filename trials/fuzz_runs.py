@@ -80,7 +80,8 @@ def bits() -> Any:
 
         def set_state(self, state: dict[str, Any]) -> None:
             for key in ("state", "goal"):
-                if state[key].shape != (self.n_bits,) or not {*state[key].tolist()} <= {0, 1}:
+                is_int = state[key].dtype == "int8"
+                if not is_int or state[key].shape != (self.n_bits,) or not {*state[key].tolist()} <= {0, 1}:
                     raise ValueError(f"{key} is no {self.n_bits} bits")
             self.state, self.goal, self.time = state["state"], state["goal"], int(state["time"])
             self.np_random.bit_generator.state = state["rng"]
