@@ -213,6 +213,8 @@ def bad_arrays(content: bytes) -> Iterator[Variant]:
                     "not finite", f"{name} {value}", put_together(parts._replace(arrays=parts.arrays | {name: spoilt}))
                 )
             break
+    long = {"many\nlines " * 200: np.zeros(1, np.float32)}
+    yield Variant("names", "of many lines", put_together(parts._replace(arrays=parts.arrays | long)))
     name, array = max(parts.arrays.items(), key=lambda item: item[1].nbytes)
     others = {
         "gone": None,

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rejeu import checkpoint, spaces
+from rejeu.agents import loading
 from rejeu.agents.base import Agent
 from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
@@ -62,7 +63,7 @@ class OffPolicyAgent(Agent):
                 spaces.check_actions(self.action_space, action, "the replay file")
             self._run.replay.restore(arrays)
         except ValueError as error:
-            raise CheckpointError(f"{path}: {error}") from None
+            raise CheckpointError(f"{path}: {loading.brief(error)}") from None
         self._run.learn_from = self.config.learning_starts
         self._run.obs = self._run.action = None
 
