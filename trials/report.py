@@ -163,13 +163,13 @@ resumed from them must learn on and save checkpoints, and these must be read aga
 
 def soaked() -> str:
     found = read("soak")
+    minutes = found["minutes_suspended"]
+    suspended = f", {minutes:.0f} of which the process was suspended for other work on the machine" if minutes else ""
     return f"""## An hour with everything on
 
-{found["minutes"]:.0f} minutes, {
-        found["minutes_suspended"]:.0f} of which the process was suspended for other work on the
-machine: {found["steps"]:,} steps of SAC with hindsight on parking-v0, {found["evaluations"]} evaluations, {
-        found["films"]
-    } films,
+{found["minutes"]:.0f} minutes{suspended}: {found["steps"]:,} steps of SAC with hindsight on parking-v0, {
+        found["evaluations"]
+    } evaluations, {found["films"]} films,
 checkpoints every minute, {
         found["episodes"]:,} episodes. Between the first tenth after the warm-up (a quarter of the time) and the
 last tenth:
