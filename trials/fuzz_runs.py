@@ -4,7 +4,8 @@ An input of the target ``run`` is the file of a run, whose rows are whole; one o
 whole. Both are read by ``Agent.resume(folder)``. ``CheckpointError`` alone may come of it: the file is always there, so there
 is no reason for ``FileNotFoundError``. What was resumed must learn on for some steps with checkpoints in the same folder, and
 what those hold must be read again as it is. While it learns, ``NonFiniteError`` and ``BadEnvironmentError`` are answers too:
-weights and states of environments may be any finite numbers, and what follows from them may be too large.
+weights and states of environments may be any finite numbers, and what follows from them may be too large. So is what the
+ball says of actions that are no numbers, which such weights lead to.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from typing import Any
 N_STEPS = 8
 """Environment steps that a resumed run must be able to go on for."""
 BALL, BITS, CART_POLE = "rejeu/Ball-v0", "fuzz/Bits-v0", "rejeu/CartPoleNoVelocity-v0"
+DIVERGED = "is not a number; the policy has diverged"
+"""What the ball says where the policy's action is none."""
 COSTLY = {"batch_size": 64, "n_steps": 64, "gradient_steps": 16, "n_epochs": 8, "n_episodes": 8, "n_quantiles": 64}
 """Hyper-parameters that ask for more work the larger they are, and up to where the work is done here."""
 MOST_EXTRA_STEPS = 100
@@ -176,6 +179,10 @@ class Runs:
                     raise
                 raise AssertionError(f"it was resumed, but: {error}") from error
             except (NonFiniteError, BadEnvironmentError):
+                return
+            except ValueError as error:
+                if DIVERGED not in str(error):
+                    raise
                 return
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
