@@ -162,7 +162,7 @@ def fuzz(target: str, seconds: int) -> None:
         (corpus / f"{target}-{i}").write_bytes(content)
     afresh = AFRESH.get(target, 0.0)
     mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size), afresh)  # Mutate is another once it fuzzes
-    flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=300", "-len_control=0"]
+    flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=3600", "-len_control=0"]
     flags.append(f"-artifact_prefix={folder}{os.sep}")
     atheris.Setup([sys.argv[0], str(corpus), *flags], watched, custom_mutator=mutate)
     atheris.Fuzz()
