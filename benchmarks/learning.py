@@ -48,6 +48,15 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     else:
         agent.learn(arguments.steps or preset.total_steps, callback=callback)
     seconds = time.perf_counter() - began
+    done = (
+        seconds / (60 * arguments.minutes)
+        if arguments.minutes
+        else agent.num_timesteps / (arguments.steps or preset.total_steps)
+    )
+    if done < 0.99:
+        raise SystemExit(
+            f"seed {seed} was cut short after {seconds:.0f} s and {agent.num_timesteps:,} steps; nothing is recorded"
+        )
     if arguments.best:
         agent.restore_best()
     evaluation_env = make_vector(preset.env_id, 10, backend, seed + 1_000_000, **arguments.env)
