@@ -436,7 +436,17 @@ def bad_statistics(content: bytes) -> Iterator[Variant]:
         return Variant("statistics", name, changed(content, change))
 
     for key in ("clip_obs", "clip_reward", "gamma", "epsilon"):
-        for value in (math.nan, math.inf, -1.0, "1", None, [], True, 10**30 if key == "gamma" else "x"):
+        may_be_none = key.startswith("clip")  # nothing is clipped then
+        for value in (
+            math.nan,
+            math.inf,
+            -1.0,
+            "1",
+            {} if may_be_none else None,
+            [],
+            True,
+            10**30 if key == "gamma" else "x",
+        ):
             yield of(f"{key} {value}", lambda h, a, k=key, v=value: h["settings"].update({k: v}))
     for key in ("training", "norm_obs", "norm_reward"):
         for value in (1, "true", None, []):
