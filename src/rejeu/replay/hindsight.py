@@ -27,7 +27,7 @@ import numpy as np
 from rejeu.core import Transition
 from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import TERMINATED, Ring, Rows
-from rejeu.replay.uniform import batch, begin, bootstrap_discount, discounted_sum, draw, look_ahead
+from rejeu.replay.uniform import batch, begin, bootstrap_discount, discounted_sum, discounts_by_kind, draw, look_ahead
 
 
 class GoalSelectionStrategy(str, Enum):
@@ -112,6 +112,7 @@ class HerReplayBuffer:
         self.goals = goals
         self.n_steps = n_steps
         self.priorities = priorities
+        self._discounts = discounts_by_kind(gamma)
         paths = [leaf.path for leaf in ring.obs_leaves]
         self.achieved = paths.index("achieved_goal")
         self.desired = paths.index("desired_goal")
@@ -147,22 +148,22 @@ class HerReplayBuffer:
         step, obs = ring.read(rows.position)
         relabelled = relabelled_positions(shape, k)
 
-        goal_index = self._goal_index(rng, Rows(*(column[relabelled] for column in rows)), step[relabelled])
-        goal = ring.read(goal_index)[1][self.achieved]
+        goal_index = self._goal_index(rng, rows.env[relabelled], rows.time[relabelled], step[relabelled])
+        goal = ring.read_leaf(self.achieved, goal_index)
         steps: int | np.ndarray = 1
         if self.n_steps > 1:
             reward, steps, terminated = self._n_step(rows, relabelled, goal)
+            discount = bootstrap_discount(self.gamma, steps, terminated)
         _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
-            reward, terminated = step["reward"], rows.kind == TERMINATED
-            reached = next_obs[self.achieved][relabelled]
+            reward, discount = step["reward"], self._discounts.take(rows.kind)
             if len(goal):
+                reached = next_obs[self.achieved][relabelled]
                 reward[relabelled] = self.goals.reward(reached, goal)
                 if self.goals.terminated is not None:
-                    terminated[relabelled] = self.goals.terminated(reached, goal)
+                    discount[relabelled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
         obs[self.desired][relabelled] = goal
         next_obs[self.desired][relabelled] = goal
-        discount = bootstrap_discount(self.gamma, steps, terminated)
         return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight)
 
     def reprioritise(self, td_errors: list[Any]) -> None:
@@ -170,24 +171,24 @@ class HerReplayBuffer:
         if self.priorities is not None:
             self.priorities.update(td_errors)
 
-    def _goal_index(self, rng: np.random.Generator, rows: Rows, step: np.ndarray) -> np.ndarray:
-        """Returns where in the ring the new goals of ``rows`` stand: observations after a step, by the strategy.
+    def _goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Returns where in the ring new goals for rows stand: observations after a step, by the strategy.
 
-        ``step`` is what the ring holds of them, records ``(n,)``.
+        The rows are given by environment and time, ``(n,)``; ``step`` is what the ring holds of them, records ``(n,)``.
         """
         ring, strategy = self.ring, self.config.goal_selection_strategy
         if strategy == "random":
             other = ring.draw(rng, len(step))
             return ring.index(other.env, other.time + 1)
         until_end = step["until_end"]
-        end = np.where(until_end > 0, rows.time + until_end, ring.head[rows.env])
+        head = ring.head[env] if ring.n_envs > 1 else ring.head[0]
+        ahead = np.where(until_end, until_end, head - time)
         if strategy == "final":
-            return ring.index(rows.env, end)
-        if strategy == "future":
-            first = rows.time + 1
-        else:
-            first = np.maximum(rows.time - step["since_start"], ring.oldest()[rows.env]) + 1
-        return ring.index(rows.env, first + (rng.random(len(end)) * (end + 1 - first)).astype(np.int64))
+            return ring.index(env, time + ahead)
+        if strategy == "episode":
+            behind = np.minimum(step["since_start"], time - ring.oldest()[env])
+            time, ahead = time - behind, ahead + behind
+        return ring.index(env, time + 1 + (rng.random(len(time)) * ahead).astype(np.int64))
 
     def _n_step(
         self, rows: Rows, relabelled: slice | np.ndarray, goal: np.ndarray

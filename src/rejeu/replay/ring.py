@@ -221,6 +221,10 @@ class Ring:
         kinds = zip(self.obs, self.stacked, self._names, strict=True)
         return records, [leaf.take(frames, axis=0) if stacked else records[name] for leaf, stacked, name in kinds]
 
+    def read_leaf(self, leaf: int, index: np.ndarray) -> np.ndarray:
+        """Returns one observation leaf, which is no stack, of the rows at positions ``index``; see :meth:`read`."""
+        return self.records.take(index)[self._names[leaf]]
+
     def _frames(self, index: np.ndarray, since_start: np.ndarray) -> np.ndarray:
         """Returns where the frames of the stacks at ``index`` are, oldest first, ``(*index.shape, frame_stack)``."""
         assert self.frame_stack is not None

@@ -21,8 +21,7 @@ class ReplayBuffer:
         self.gamma = gamma
         self.n_steps = n_steps
         self.priorities = priorities
-        self._discounts = bootstrap_discount(gamma, 1, np.arange(3) == TERMINATED)
-        """Of single steps, by the kind of their row."""
+        self._discounts = discounts_by_kind(gamma)
 
     def size(self) -> int:
         """Returns the number of transitions kept."""
@@ -154,3 +153,8 @@ def discounted_sum(rewards: np.ndarray, valid: np.ndarray, gamma: float) -> np.n
 def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
     """Returns ``gamma^steps``, and 0 where the MDP terminated, ``float32``."""
     return np.where(terminated, np.float32(0.0), np.asarray(gamma**steps, np.float32))
+
+
+def discounts_by_kind(gamma: float) -> np.ndarray:
+    """Returns :func:`bootstrap_discount` of single steps, by the kind of their row, ``float32 (3,)``."""
+    return bootstrap_discount(gamma, 1, np.arange(3) == TERMINATED)
