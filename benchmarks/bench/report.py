@@ -30,6 +30,9 @@ HELPED = (
     "**Donating the packed state** saves a copy of it.",
     "**One vector for all that the host sends**, and fewer NumPy calls in storing and drawing (numbers in place of arrays of "
     "one element, kinds of rows read once), save 15 us of a step of SAC while caches are warm, and a sixth in the loop.",
+    "**Rows of the replay buffer sent whole**: a batch's columns are fields of the records that were drawn, and copying the "
+    "records is several times faster than picking each column out of them; a batch of 256 with hindsight is packed in half "
+    "the time, and drawn in five sixths of it with fewer NumPy calls.",
 )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Hashable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,49 +113,140 @@ class Readings(Mapping[str, Array]):
         return cls(names, *children)
 
 
+class Part(NamedTuple):
+    """What a message sends in one piece: a leaf, or the whole of an array of records of which leaves are fields."""
+
+    leaves: tuple[int, ...]
+    """Positions of the leaves that are in it."""
+    offsets: tuple[int, ...] | None
+    """The words before each of them in a record; None for a leaf that is sent by itself."""
+    dtype: Any
+    """Of its words; None if it is not made of words."""
+    shape: tuple[int, ...]
+    """Its words; of records ``(rows, words of one)``."""
+
+
 class Message:
     """How the leaves of one kind of tree of NumPy arrays travel into compiled code: side by side in one vector of words.
 
     A word is four bytes, of a float or of anything else: the vector is called ``float32``, and what is not is taken for what
-    it is again inside, bit for bit. Dtypes are JAX's (64 bits become 32); narrower ones are widened on the way. Leaves of
-    more than ``LARGE`` elements, and of dtypes of another width, travel by themselves. Immutable, and equal only to itself,
-    so that a compiled function may take it as a static argument.
+    it is again inside, bit for bit. Dtypes are JAX's (64 bits become 32); narrower ones are widened on the way. Leaves that
+    are fields of one array of records are sent as those records, whole: copying one block is several times faster than
+    picking fields out of it. What has more than ``LARGE`` words, or dtypes of another width, travels by itself. Immutable,
+    and equal only to itself, so that a compiled function may take it as a static argument.
     """
 
-    def __init__(self, tree: PyTree) -> None:
-        """Plans for trees of the structure, shapes and dtypes of ``tree``, whose leaves have ``shape`` and ``dtype``."""
+    def __init__(self, tree: PyTree, by_records: bool = True) -> None:
+        """Plans for trees of the structure, shapes and dtypes of ``tree``, whose leaves have ``shape`` and ``dtype``.
+
+        With ``by_records=False`` every leaf is sent by itself, whether or not it is a field of records.
+        """
         leaves, self.structure = jax.tree.flatten(tree)
         self.shapes: list[tuple[int, ...]] = [tuple(leaf.shape) for leaf in leaves]
         self.dtypes: list[Any] = [jax.dtypes.canonicalize_dtype(leaf.dtype) for leaf in leaves]
-        sizes = [math.prod(shape) for shape in self.shapes]
-        words = [WORDS.get(dtype.kind) if dtype.itemsize <= 4 else None for dtype in self.dtypes]
-        self.small = [i for i, size in enumerate(sizes) if size <= LARGE and words[i] is not None]
-        self.large = [i for i in range(len(leaves)) if i not in self.small]
-        self.ends = np.cumsum([sizes[i] for i in self.small]).tolist()
-        self.record = np.dtype([(str(i), words[i], self.shapes[i]) for i in self.small])
-        """The vector as NumPy fills it: every leaf a field."""
+        self.together = parts_of_records(leaves) if by_records else []
+        in_records = {i for part in self.together for i in part.leaves}
+        parts = self.together + [self._alone(i) for i in range(len(leaves)) if i not in in_records]
+        self.small = [part for part in parts if part.dtype is not None and math.prod(part.shape) <= LARGE]
+        self.large = [part for part in parts if part not in self.small]
+        self.ends = np.cumsum([math.prod(part.shape) for part in self.small]).tolist()
+        self.record = np.dtype([(str(k), part.dtype, part.shape) for k, part in enumerate(self.small)])
+        """The vector as NumPy fills it: every part a field."""
         self.fields = list(zip(self.record.names or (), self.small, strict=True))
 
-    def pack(self, tree: PyTree) -> list[np.ndarray]:
-        """Returns the vector of ``tree``, which is a copy, and then the leaves that travel by themselves."""
-        leaves = jax.tree.leaves(tree)
+    def _alone(self, i: int) -> Part:
+        dtype = self.dtypes[i]
+        return Part((i,), None, WORDS.get(dtype.kind) if dtype.itemsize <= 4 else None, self.shapes[i])
+
+    def fits(self, leaves: list[Any]) -> bool:
+        """Returns whether leaves that were fields of records as the plan was made still are fields of the same ones."""
+        for part in self.together:
+            first, *others = part.leaves
+            records = getattr(leaves[first], "base", None)
+            if records is None or records.nbytes != 4 * math.prod(part.shape):
+                return False
+            for i in others:
+                if getattr(leaves[i], "base", None) is not records:
+                    return False
+        return True
+
+    def pack(self, leaves: list[Any]) -> list[np.ndarray]:
+        """Returns the vector of the leaves of a tree, which is a copy, and then what travels by itself."""
         record = np.empty(1, self.record)
-        for name, i in self.fields:
-            record[name] = leaves[i]
+        for name, part in self.fields:
+            record[name] = sent(part, leaves)
         vector = record.view(np.float32) if self.record.itemsize else np.zeros(0, np.float32)
-        return [vector, *[leaves[i] for i in self.large]]
+        return [vector, *[sent(part, leaves) for part in self.large]]
 
     def unpack(self, arrays: list[Any]) -> PyTree:
         """Returns the tree again, inside compiled code."""
         leaves: list[Any] = [None] * len(self.shapes)
-        for i, begin, end in zip(self.small, [0, *self.ends], self.ends, strict=False):
-            words, dtype = arrays[0][begin:end].reshape(self.shapes[i]), self.dtypes[i]
-            if dtype.kind != "f":
-                words = jax.lax.bitcast_convert_type(words, WORDS[dtype.kind])
-            leaves[i] = words.astype(dtype)
-        for i, array in zip(self.large, arrays[1:], strict=True):
-            leaves[i] = array
+        for part, begin, end in zip(self.small, [0, *self.ends], self.ends, strict=False):
+            words = arrays[0][begin:end].reshape(part.shape)
+            if part.offsets is None:
+                leaves[part.leaves[0]] = as_dtype(words, self.dtypes[part.leaves[0]])
+            else:
+                self._take_apart(part, words, leaves)
+        for part, array in zip(self.large, arrays[1:], strict=True):
+            if part.offsets is None:
+                leaves[part.leaves[0]] = array
+            else:
+                self._take_apart(part, array, leaves)
         return jax.tree.unflatten(self.structure, leaves)
+
+    def _take_apart(self, part: Part, records: Array, leaves: list[Any]) -> None:
+        """Puts the fields of records, which have arrived as their words, where they belong among the leaves."""
+        assert part.offsets is not None
+        for i, offset in zip(part.leaves, part.offsets, strict=True):
+            width = math.prod(self.shapes[i]) // part.shape[0]
+            leaves[i] = as_dtype(records[:, offset : offset + width].reshape(self.shapes[i]), self.dtypes[i])
+
+
+def sent(part: Part, leaves: list[Any]) -> Any:
+    """Returns what stands for a part among the leaves of a tree: the leaf, or the words of its records."""
+    leaf = leaves[part.leaves[0]]
+    return leaf if part.offsets is None else leaf.base.view(np.float32).reshape(part.shape)
+
+
+def as_dtype(words: Array, dtype: Any) -> Array:
+    """Returns words, called ``float32``, as what they are, inside compiled code."""
+    if dtype.kind != "f":
+        words = jax.lax.bitcast_convert_type(words, WORDS[dtype.kind])
+    return words.astype(dtype)
+
+
+def parts_of_records(leaves: list[Any]) -> list[Part]:
+    """Returns the arrays of records that are better sent whole: those of whose words the leaves are half or more."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for i, leaf in enumerate(leaves):
+        offset = offset_in_records(leaf)
+        if offset is not None:
+            found.setdefault(id(leaf.base), []).append((i, offset))
+    parts = []
+    for members in found.values():
+        positions, offsets = zip(*members, strict=True)
+        records = leaves[positions[0]].base
+        if 2 * sum(leaves[i].nbytes for i in positions) >= records.nbytes:
+            parts.append(Part(positions, offsets, np.float32, (records.size, records.itemsize // 4)))
+    return parts
+
+
+def offset_in_records(leaf: Any) -> int | None:
+    """Returns how many words precede a leaf in each record, if it is a field, all rows in order, of records of words.
+
+    Rows may have been given a shape of several axes since. None for any other array.
+    """
+    records = getattr(leaf, "base", None)
+    if not isinstance(records, np.ndarray) or records.dtype.names is None or records.ndim != 1 or not leaf.size:
+        return None
+    words = leaf.dtype.itemsize == 4 and records.itemsize % 4 == 0 and records.flags.c_contiguous
+    if not words or leaf.size % records.size:
+        return None
+    rows = leaf.reshape(records.size, -1)
+    if rows.base is not records or rows.strides[0] != records.itemsize or (rows.shape[1] > 1 and rows.strides[1] != 4):
+        return None
+    before = rows.__array_interface__["data"][0] - records.__array_interface__["data"][0]
+    return None if before % 4 else before // 4
 
 
 class HostPacker:
@@ -169,7 +260,12 @@ class HostPacker:
 
         Trees of one ``size`` must have the same structure, shapes and dtypes: comparing them takes longer than packing.
         """
+        leaves = jax.tree.leaves(tree)
         plan = self._plans.get(size)
         if plan is None:
             plan = self._plans[size] = Message(tree)
-        return plan.pack(tree), plan
+        if not plan.fits(leaves):
+            plan = self._plans.get((HostPacker, size))
+            if plan is None:
+                plan = self._plans[HostPacker, size] = Message(tree, by_records=False)
+        return plan.pack(leaves), plan
