@@ -169,6 +169,14 @@ def test_later_rounds_measure_the_variant_that_was_the_fastest_in_the_first(resu
     assert [s["variant"] for s in summary.best(results["samples"], "steps", "TD3", "sb3")] == [plan.ONE] * 3
 
 
+def test_no_library_compiles_its_sources_anew_in_each_process(monkeypatch, tmp_path):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    for measurement in plan.everything():
+        environment = runner.child_environment(measurement, measurement.variants[0], tmp_path)
+        assert "PYTHONDONTWRITEBYTECODE" not in environment
+        assert environment["JAX_PLATFORMS"] == "cpu"
+
+
 def test_every_measurement_has_a_name_of_its_own():
     keys = [measurement.key for measurement in plan.everything()]
     assert len(keys) == len(set(keys))

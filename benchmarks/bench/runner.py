@@ -135,6 +135,7 @@ def measure(measurement: Measurement, turn: int, python: str, variant: str, cach
 def child_environment(measurement: Measurement, variant: str, cache: Path) -> dict[str, str]:
     """Returns the environment variables of a measurement's process."""
     environment = {**os.environ, **VARIANTS[variant], "PYTHONWARNINGS": "ignore", "JAX_PLATFORMS": "cpu"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is compiled, a checkout at its first import
     if measurement.library == "rejeu":
         source = str(ROOT / "src")
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH", ""))))
