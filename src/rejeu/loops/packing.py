@@ -258,7 +258,8 @@ class HostPacker:
     def __call__(self, tree: PyTree, size: Hashable) -> tuple[list[np.ndarray], Message]:
         """Returns the arrays that hold ``tree`` and the plan to unpack them by.
 
-        Trees of one ``size`` must have the same structure, shapes and dtypes: comparing them takes longer than packing.
+        Trees of one ``size`` must have the same structure, shapes and dtypes, and leaves that are fields of records must be
+        the same fields, unless they are copies: comparing all that takes longer than packing.
         """
         leaves = jax.tree.leaves(tree)
         plan = self._plans.get(size)
