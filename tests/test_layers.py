@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ from scipy import special
 
 from rejeu import spaces
 from rejeu.core import ensemble
-from rejeu.networks import ACTIVATIONS, MLP, Actor, LayerNorm, Linear, PolicyConfig
+from rejeu.networks import ACTIVATIONS, MLP, Actor, LayerNorm, Linear, PolicyConfig, product
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 KEY = jax.random.PRNGKey(0)
@@ -36,6 +38,45 @@ def test_layer_norm_comes_between_the_linear_map_and_the_nonlinearity():
 def test_an_mlp_without_layers_hands_its_input_on():
     x = jnp.array([[1.0, 2.0]])
     np.testing.assert_array_equal(MLP(KEY, 2, [], "relu", layer_norm=False)(x), x)
+
+
+@pytest.mark.parametrize("n_outputs", [1, 5])
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+@pytest.mark.parametrize("shape", [(6, 4), (3, 6, 4)], ids=["batch", "steps-of-batches"])
+def test_the_gradients_of_a_product_equal_numpys(shape, backend, n_outputs, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    draw = lambda i, *s: np.asarray(jax.random.normal(jax.random.PRNGKey(i), s))  # noqa: E731
+    x, weight, gradient = draw(0, *shape), draw(1, 4, n_outputs), draw(2, *shape[:-1], n_outputs)
+    out, pull_back = jax.vjp(product, x, weight)
+    for_x, for_weight = pull_back(gradient)
+    np.testing.assert_allclose(out, x @ weight, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(for_x, gradient @ weight.T, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(for_weight, np.tensordot(x, gradient, (range(x.ndim - 1),) * 2), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA on CPUs")
+def test_no_gradient_multiplies_by_a_transposed_left_side():
+    """Which XLA's library of matrix products does not take; a change of XLA's that undid our own would be seen here."""
+    transposed = re.compile(r" dot\(.*lhs_contracting_dims=\{0\}")
+
+    def compiled(multiply):
+        loss = lambda weight, x: jnp.sum(jnp.square(jax.nn.relu(multiply(x, weight))))  # noqa: E731
+        return jax.jit(jax.grad(loss)).lower(jnp.ones((128, 128)), jnp.ones((128, 128))).compile().as_text()
+
+    assert transposed.search(compiled(jnp.matmul))
+    assert not transposed.search(compiled(product))
+
+
+def test_an_ensemble_takes_the_gradient_of_each_member():
+    stack = ensemble(lambda key: Linear(key, 4, 3), KEY, 2)
+    x, target = jax.random.normal(KEY, (5, 4)), jnp.ones((5, 3))
+    loss = lambda layer: jnp.sum(jnp.square(layer(x) - target))  # noqa: E731
+    together = jax.vmap(jax.grad(loss))(stack)
+    for i in range(2):
+        member = jax.tree.map(lambda leaf, i=i: leaf[i], stack)
+        residual = 2 * (np.asarray(x) @ np.asarray(member.weight) + np.asarray(member.bias) - 1)
+        np.testing.assert_allclose(together.weight[i], np.asarray(x).T @ residual, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(together.bias[i], residual.sum(axis=0), rtol=1e-4, atol=1e-5)
 
 
 FORMULAS = {

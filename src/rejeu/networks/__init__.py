@@ -19,7 +19,7 @@ from rejeu.networks.encoder import (
     image_shape,
     n_features,
 )
-from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear
+from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
 from rejeu.networks.shape import BRANCHES, PolicyConfig
 from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_torso, own_torso
 
@@ -51,4 +51,5 @@ __all__ = [
     "make_torso",
     "n_features",
     "own_torso",
+    "product",
 ]
