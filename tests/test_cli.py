@@ -201,7 +201,7 @@ def test_list_shows_algorithms_and_presets(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
     assert re.search(r"SAC +Soft actor-critic", text)
-    assert re.search(r"parking-v0 +SAC +80,000 steps", text)
+    assert re.search(r"parking-v0 +SAC +56,000 steps", text)
 
 
 def test_version_is_printed(capsys):
