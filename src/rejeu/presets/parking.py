@@ -15,7 +15,7 @@ PRESETS = (
             "batch_size": 128,
             "learning_rate": "lin_1e-3",
             "gamma": 0.95,
-            "learning_starts": 1_000,
+            "learning_starts": 1_024,
             "buffer_size": 100_000,
         },
         n_envs=16,
