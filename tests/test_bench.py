@@ -110,14 +110,14 @@ def test_the_page_has_medians_spreads_ratios_of_rounds_and_limits(results, tmp_p
     # rejeu 0.10, 0.20, 0.15 ms; sb3 3, 2, 3 ms: its ratios are 30, 10, 20, not 3 / 0.15; sbx 0.3, 1.0, 0.6 ms.
     # The limit is 10 us and 4 MFLOP at 100 GFLOP/s, 40 us: of 100, 200 and 150 us that is 50, 25 and 33 %.
     assert row_of(text, "SAC") == [
-        "SAC", "0.15 (0.1 to 0.2)", "3 (2 to 3), 1 thread", "20.0", "0.6 (0.3 to 1), 1 thread", "4.00",
+        "SAC", "0.15 (0.1 to 0.2)", "3 (2 to 3), 1 thread", "20.0 of 60.0", "0.6 (0.3 to 1), 1 thread", "4.00 of 12.0",
         "0.05", "0.01", "0.04", "33 %",
     ]  # fmt: skip
     assert row_of(text, "QRDQN")[4:6] == ["", ""]  # SBX has none
     # Of 150 us 20 % are the environment's, 20 us beyond the bare 10; 60 % the update's, 50 beyond the arithmetic's 40.
     assert row_of(text, "SAC", "20 %") == ["SAC", "20 %", "10 %", "60 %", "10 %", "20", "15", "50", "15"]
     on_pool = row_of(text, "16", "EnvPool")
-    assert on_pool[2:5] == ["6,667 (5,000 to 10,000)", "333 (333 to 500), 1 thread", "20.0"]
+    assert on_pool[2:5] == ["6,667 (5,000 to 10,000)", "333 (333 to 500), 1 thread", "20.0 of 60.0"]
     assert on_pool[-4:] == ["50", "10", "40", "33 %"]
     assert row_of(text, "1,000,000") == [
         "1,000,000", "150 (100 to 200)", "3,000 (2,000 to 3,000)", "20.0", "150 (100 to 200)",

@@ -33,6 +33,12 @@ HELPED = (
     "**Rows of the replay buffer sent whole**: a batch's columns are fields of the records that were drawn, and copying the "
     "records is several times faster than picking each column out of them; a batch of 256 with hindsight is packed in half "
     "the time, and drawn in five sixths of it with fewer NumPy calls.",
+    "**Gradients of weights without a transposed left side**: XLA's fast products take none, so the transposition is done "
+    "apart; at 128 by 128 such a product took 52 to 61 us where it had taken 78, and a whole update of SAC, DDPG, TD3, DQN, "
+    "TQC or CrossQ 0.5 to 15 % less. Patches of images gain nothing by it, and are left as they were.",
+    "**Random bits hashed once**: XLA repeats what is elementwise in every kernel that reads it, so the hash behind SAC's "
+    "noise stood nine times in its update. As a reduction it is computed once: the main job's update compiles in 10.5 s of "
+    "processor time instead of 23.",
 )
 
 
@@ -106,6 +112,7 @@ def how_to_read(results: Mapping[str, Any]) -> str:
   this machine computes with as many threads as rejeu uses. No program that does the two one after the other can be faster.
   rejeu's off-policy loop does them at the same time, where there is a core to spare; and no real update is one large
   product. "Of the limit" is the limit divided by the measured time: 100 % would be a loop and an update without any loss.
+  Behind a ratio, after "of", stands the ratio that a program at the limit would have, on the same environments.
 - Operations are counted by XLA (`cost_analysis` of the compiled update). XLA counts the body of a loop once and of a
   conditional the costlier branch, so the count adds XLA's count of each body for its further runs, and takes of a
   conditional its share: a delayed actor counts as often as it is updated.

@@ -21,7 +21,7 @@ from benchmarks.bench.summary import (
     spread,
     step_seconds,
 )
-from benchmarks.bench.text import percent, table, times, variant_of, with_spread
+from benchmarks.bench.text import percent, table, times, times_of_most, variant_of, with_spread
 
 PICTURES = {"steps": "speed-steps.png", "rollouts": "speed-rollouts.png", "replay": "speed-replay.png"}
 
@@ -112,7 +112,7 @@ def per_step(samples: Sequence[Sample], page: Path) -> str:
         by = {library: step_seconds(samples, "steps", name, library) for library in plan.LIBRARIES}
         limits[name] = limit(samples, "steps", name, env_of(name))
         drawn[name] = {library: spread(numbers) for library, numbers in by.items() if numbers}
-        rows.append((name, *compared(samples, "steps", name, by, 1e3), *limit_cells(limits[name], 1e3)))
+        rows.append((name, *compared(samples, name, by, limits[name]), *limit_cells(limits[name], 1e3)))
     picture = page.parent / "images" / PICTURES["steps"]
     one = {name: by for name, by in drawn.items() if name != plan.POOL} or drawn
     pictures.draw_steps(one, limits, picture, "A step with one update, one environment")
@@ -140,15 +140,13 @@ EnvPool and eight updates a turn, which is again one a step. {settings}.
 LIMIT_HEADER = ("limit", "of it environment", "of it arithmetic", "of the limit")
 
 
-def compared(
-    samples: Sequence[Sample], case: str, name: str, by: Mapping[str, ByRound], scale: float
-) -> tuple[str, ...]:
-    """Returns the cells of a row: rejeu's time, then each peer's with its setting and the ratio."""
-    cells = [with_spread(by["rejeu"], scale)]
+def compared(samples: Sequence[Sample], name: str, by: Mapping[str, ByRound], found: Limit | None) -> tuple[str, ...]:
+    """Returns the cells of a row of :func:`per_step`: rejeu's time, then each peer's with its setting and the ratio."""
+    cells = [with_spread(by["rejeu"], 1e3)]
     for library in ("sb3", "sbx"):
-        setting = variant_of(best(samples, case, name, library))
-        cells.append(with_spread(by[library], scale) + (f", {setting}" if setting else ""))
-        cells.append(times(ratio(by[library], by["rejeu"])))
+        setting = variant_of(best(samples, "steps", name, library))
+        cells.append(with_spread(by[library], 1e3) + (f", {setting}" if setting else ""))
+        cells.append(times_of_most(by[library], by["rejeu"], found))
     return tuple(cells)
 
 
@@ -201,7 +199,8 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
                     if library == "sbx" and algorithm == "A2C":
                         continue
                     setting = variant_of(best(samples, "rollouts", home, library))
-                    cells += [rate_text(numbers) + (f", {setting}" if setting else ""), times(ratio(numbers, own))]
+                    cells += [rate_text(numbers) + (f", {setting}" if setting else "")]
+                    cells.append(times_of_most(numbers, own, found))
                 rows.append((*cells, *limit_cells(found, 1e6)))
         if rows:
             header = ["environments", "rejeu's on", "rejeu", "Stable-Baselines3", "ratio"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from benchmarks.bench.pictures import number
-from benchmarks.bench.summary import ByRound, Sample, Spread, spread
+from benchmarks.bench.summary import ByRound, Limit, Sample, Spread, ratio, spread
 
 Row = Sequence[str]
 
@@ -41,6 +41,18 @@ def with_spread(numbers: ByRound, scale: float = 1.0) -> str:
 def times(found: Spread | None) -> str:
     """Returns how many times faster, empty where that is not known."""
     return "" if found is None else f"{found.median:.2f}" if found.median < 10 else f"{found.median:.1f}"
+
+
+def times_of_most(peer: ByRound, own: ByRound, limit: Limit | None) -> str:
+    """Returns how many times faster than a peer, of how many times a program at the limit would be.
+
+    >>> times_of_most({0: 8.0, 1: 12.0}, {0: 2.0, 1: 3.0}, Limit(env=0.5, arithmetic=0.5, flops=1.0, share_reached=0.4))
+    '4.00 of 10.0'
+    """
+    reached = ratio(peer, own)
+    if reached is None or limit is None:
+        return times(reached)
+    return f"{times(reached)} of {times(spread({turn: value / limit.seconds for turn, value in peer.items()}))}"
 
 
 def percent(share: float) -> str:
