@@ -59,7 +59,7 @@ def _random_bits(key: Array, bit_width: int, shape: tuple[int, ...]) -> Array:
     if bit_width == 64:
         raise NotImplementedError("64-bit random numbers are not drawn with rejeu's keys; use jax.random.key")
     high, low = _hashes(key, shape)
-    # XLA would repeat a plain ``high ^ low``, and the hash with it, in every kernel that reads the bits: ten times in an
+    # XLA would repeat a plain ``high ^ low``, and the hash with it, in every kernel that reads the bits: nine times in an
     # update of SAC, which then took twice as long to compile. A reduction it computes once.
     words = jnp.where(jnp.arange(2) == 0, high[..., None], low[..., None])
     return jax.lax.reduce_xor(words, axes=(len(shape),)).astype(f"uint{bit_width}")
