@@ -1,5 +1,8 @@
 """What holds in every test: JAX refuses to broadcast ranks silently, and compiled functions are kept between runs.
 
+Programs are compiled with little optimisation, which takes half as long and is most of what tests do; ``XLA_FLAGS= pytest``
+compiles them as users do.
+
 Mixed dtypes are refused as well, but only around our own functions (``strict_dtypes``): Adam's bias correction in optax
 raises a Python float to an int32 power, which JAX's strict mode forbids.
 """
@@ -28,6 +31,15 @@ hypothesis.settings.load_profile("rejeu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell; those whom tests start inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Sets XLA's options before its first use; learning runs of minutes, marked slow, run longer than they compile."""
+    if config.option.markexpr == "not slow":
+        os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 
 
 @pytest.fixture
