@@ -119,6 +119,13 @@ def test_the_gradient_of_the_quantile_huber_loss_equals_finite_differences_and_t
     np.testing.assert_array_equal(by_targets, 0.0)
 
 
+def test_the_table_of_all_pairs_is_never_in_memory():
+    loss = lambda q, t: jnp.sum(quantile_huber_loss(q, t))  # noqa: E731
+    compiled = jax.jit(jax.value_and_grad(loss)).lower(jnp.zeros((8, 30)), jnp.zeros((8, 40))).compile()
+    needed = compiled.memory_analysis().temp_size_in_bytes
+    assert needed < 8 * 30 * 40 * 4, needed
+
+
 def test_the_quantile_huber_loss_is_least_at_the_quantiles_of_the_samples():
     """Two quantiles, at 1/4 and 3/4, of the numbers 0 to 100, with a kappa too small to matter: 25 and 75."""
     samples = jnp.arange(101.0)[None]
