@@ -109,7 +109,7 @@ def draw_rollouts(
             axes.set_xlabel("environments")
             axes.set_title(algorithm, loc="left")
         panels[0][0].set_ylabel("environment steps a second (log), more is better")
-        panels[0][0].legend(fontsize=8)
+        panels[0][0].legend(fontsize=8, frameon=True, framealpha=0.9, edgecolor="none")
         figure.suptitle(title, x=0.01, ha="left")
         save(figure, path)
 
