@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu import finite
+from rejeu import compilation, finite
 from rejeu.checkpoint import names
 from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Rollout, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
@@ -24,8 +24,6 @@ from rejeu.randomness import nth
 
 PackedState = list[Array]
 """The state of an algorithm as the vectors of its :class:`Packing`."""
-RUN_ONCE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""For what runs once only: it takes a quarter of the time to compile."""
 
 
 class Compiled:
@@ -45,7 +43,7 @@ class Compiled:
         self._recall_packer, self._observe_packer = HostPacker(), HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
 
-        @partial(jax.jit, compiler_options=RUN_ONCE)
+        @compilation.run_once
         def init(key: Array) -> PackedState:
             return packing.pack(algorithm.init(key))
 
