@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from rejeu.compilation import one_kernel, outlined
+
 PyTree = Any
 Metrics = dict[str, Array]
 """Named scalars of one update, still on the device."""
@@ -134,6 +136,11 @@ TD_ERROR = "td_error"
 """Name among the metrics of an update for the absolute TD error of each transition, ``(batch,)``."""
 
 
+def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[..., Any]:
+    """Returns ``jax.value_and_grad(loss, has_aux=has_aux)``, kept as a function of its own in a compiled update."""
+    return outlined(jax.value_and_grad(loss, has_aux=has_aux))
+
+
 def descend(
     params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: optax.GradientTransformation, rate: Any
 ) -> tuple[PyTree, PyTree]:
@@ -142,9 +149,13 @@ def descend(
     ``optimizer`` is a transformation without a learning rate (``optax.scale_by_adam()``); the rate is multiplied here,
     so that it may be a traced value of a schedule.
     """
-    direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
-    params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
-    return params, optimizer_state
+
+    @one_kernel
+    def step(params: PyTree, gradients: PyTree, optimizer_state: PyTree, rate: Any) -> tuple[PyTree, PyTree]:
+        direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
+        return jax.tree.map(lambda p, d: p - rate * d, params, direction), optimizer_state
+
+    return step(params, gradients, optimizer_state, rate)
 
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
@@ -152,6 +163,7 @@ def weighted_mean(values: Array, weight: Array | None) -> Array:
     return jnp.mean(values if weight is None else values * jnp.broadcast_to(weight, values.shape), axis=-1)
 
 
+@one_kernel
 def polyak(target: PyTree, online: PyTree, tau: Any) -> PyTree:
     """Returns ``(1 - tau) * target + tau * online``, leaf by leaf."""
     return jax.tree.map(lambda t, o: t + tau * (o - t), target, online)

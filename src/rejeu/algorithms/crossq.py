@@ -42,6 +42,7 @@ from rejeu.core import (
     Transition,
     descend,
     ensemble,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.distributions import TanhNormal
@@ -160,14 +161,14 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         next_action, next_log_prob = distribution(state.actor(batch.next_obs)).sample_and_log_prob(target_key)
-        (critic_loss, (values, target, trained)), gradients = jax.value_and_grad(critics_loss, has_aux=True)(
+        (critic_loss, (values, target, trained)), gradients = value_and_grad(critics_loss, has_aux=True)(
             state.critics, batch, next_action, alpha * next_log_prob
         )
         critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
         critics, n_updates = with_statistics(critics, trained), state.n_updates + 1
 
         def delayed(state: State) -> State:
-            (policy_loss, (log_prob, trained)), gradients = jax.value_and_grad(actor_loss, has_aux=True)(
+            (policy_loss, (log_prob, trained)), gradients = value_and_grad(actor_loss, has_aux=True)(
                 state.actor, critics, alpha, batch.obs, actor_key
             )
             actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)

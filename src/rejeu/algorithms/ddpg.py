@@ -25,6 +25,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.compilation import outlined
 from rejeu.config import OffPolicyConfig
 from rejeu.core import (
     TD_ERROR,
@@ -36,6 +37,7 @@ from rejeu.core import (
     copy,
     descend,
     polyak,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.networks import Actor, Critic
@@ -105,9 +107,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate = at(config.learning_rate, clock.progress)
         target = td_target(state.target_actor, state.target_critic, batch)
-        (loss, values), gradients = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, batch, target)
+        (loss, values), gradients = value_and_grad(critic_loss, has_aux=True)(state.critic, batch, target)
         critic, critic_optimizer = descend(state.critic, gradients, state.critic_optimizer, optimizer, rate)
-        policy_loss, gradients = jax.value_and_grad(actor_loss)(state.actor, critic, batch.obs)
+        policy_loss, gradients = value_and_grad(actor_loss)(state.actor, critic, batch.obs)
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
         state = State(
             actor=actor,
@@ -139,6 +141,7 @@ def action_value(critic: Critic, obs: PyTree, action: Array) -> Array:
     return critic(obs, action)[:, 0]
 
 
+@outlined
 def td_target(target_actor: Actor, target_critic: Critic, batch: Transition) -> Array:
     """Returns what the critic should say of the batch, ``(batch,)``."""
     next_value = action_value(target_critic, batch.next_obs, policy(target_actor, batch.next_obs))

@@ -22,6 +22,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, Config
+from rejeu.compilation import outlined
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -32,6 +33,7 @@ from rejeu.core import (
     copy,
     descend,
     polyak,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.networks import Actor
@@ -84,9 +86,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate = at(config.learning_rate, clock.progress)
         target = td_target(state.target_actor, state.target_critic, batch)
-        (loss, values), gradients = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, batch, target)
+        (loss, values), gradients = value_and_grad(critic_loss, has_aux=True)(state.critic, batch, target)
         critic, critic_optimizer = descend(state.critic, gradients, state.critic_optimizer, optimizer, rate)
-        (policy_loss, entropy), gradients = jax.value_and_grad(actor_loss, has_aux=True)(
+        (policy_loss, entropy), gradients = value_and_grad(actor_loss, has_aux=True)(
             state.actor, critic(batch.obs), batch.obs
         )
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
@@ -111,6 +113,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     return Algorithm(init, lambda state: state.actor, explore, exploit, update)
 
 
+@outlined
 def td_target(target_actor: Actor, target_critic: Actor, batch: Transition) -> Array:
     """Returns what the critic should say of the batch, ``(batch,)``."""
     probabilities = jax.nn.softmax(target_actor(batch.next_obs))

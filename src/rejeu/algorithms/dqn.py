@@ -30,8 +30,21 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.compilation import outlined
 from rejeu.config import OffPolicyConfig, number, whole
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, polyak, weighted_mean
+from rejeu.core import (
+    TD_ERROR,
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    copy,
+    descend,
+    polyak,
+    value_and_grad,
+    weighted_mean,
+)
 from rejeu.exploration.noise import ActionNoise
 from rejeu.networks import MLP, Actor, Encoder, Linear, PolicyConfig, Torso, make_torso
 from rejeu.schedules import Exponential, Linear as LinearSchedule, Schedule, at
@@ -138,7 +151,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         moves = moves_due(state.step, clock.step, config.target_update_interval)
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
         target = td_target(state.network, target_network, batch, config.double_q)
-        (loss, td_error), gradients = jax.value_and_grad(td_loss, has_aux=True)(
+        (loss, td_error), gradients = value_and_grad(td_loss, has_aux=True)(
             state.network, batch, target, LOSSES[config.loss]
         )
         gradients = clipped(gradients, config.clip_grad_value, config.max_grad_norm)
@@ -209,6 +222,7 @@ def joined(value: Array, advantage: Array) -> Array:
     return value + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
 
 
+@outlined
 def td_target(network: Actor | Dueling, target_network: Actor | Dueling, batch: Transition, double_q: bool) -> Array:
     """Returns what the network should say of the batch, ``(batch,)``."""
     next_values = target_network(batch.next_obs)

@@ -28,6 +28,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.compilation import outlined
 from rejeu.config import OffPolicyConfig, number, whole
 from rejeu.core import (
     TD_ERROR,
@@ -40,6 +41,7 @@ from rejeu.core import (
     descend,
     ensemble,
     polyak,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.distributions import TanhNormal
@@ -146,9 +148,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch, target_key)
-        (critic_loss, values), gradients = jax.value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
+        (critic_loss, values), gradients = value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
         critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
-        (policy_loss, log_prob), gradients = jax.value_and_grad(actor_loss, has_aux=True)(
+        (policy_loss, log_prob), gradients = value_and_grad(actor_loss, has_aux=True)(
             state.actor, critics, alpha, batch.obs, actor_key
         )
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
@@ -211,6 +213,7 @@ def policy(actor: Actor, obs: PyTree) -> TanhNormal:
     return TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
 
 
+@outlined
 def td_target(actor: Actor, target_critics: Critic, alpha: Array, batch: Transition, key: Array) -> Array:
     """Returns what the critics should say of the batch, ``(batch,)`` (arXiv 1812.05905, equations 2 and 5)."""
     next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)

@@ -23,6 +23,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.sac import HIDDEN_LAYERS, Config, State, initial_temperature
+from rejeu.compilation import outlined
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -34,6 +35,7 @@ from rejeu.core import (
     descend,
     ensemble,
     polyak,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.networks import Actor
@@ -82,10 +84,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch)
-        (critic_loss, values), gradients = jax.value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
+        (critic_loss, values), gradients = value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
         critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
         least_values = jnp.min(all_values(critics, batch.obs), axis=0)
-        (policy_loss, entropy), gradients = jax.value_and_grad(actor_loss, has_aux=True)(
+        (policy_loss, entropy), gradients = value_and_grad(actor_loss, has_aux=True)(
             state.actor, least_values, alpha, batch.obs
         )
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
@@ -124,6 +126,7 @@ def all_values(critics: PyTree, obs: PyTree) -> Array:
     return jax.vmap(lambda critic: critic(obs))(critics)
 
 
+@outlined
 def td_target(actor: Actor, target_critics: PyTree, alpha: Array, batch: Transition) -> Array:
     """Returns what the critics should say of the batch, ``(batch,)``."""
     log_probabilities = jax.nn.log_softmax(actor(batch.next_obs))

@@ -25,6 +25,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, actor_loss, policy
+from rejeu.compilation import outlined
 from rejeu.config import OffPolicyConfig, number, whole
 from rejeu.core import (
     TD_ERROR,
@@ -37,6 +38,7 @@ from rejeu.core import (
     descend,
     ensemble,
     polyak,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.networks import Actor, Critic, action_values
@@ -133,13 +135,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             config.target_noise_clip,
         )
         target = td_target(state.target_critics, batch, next_action)
-        (loss, values), gradients = jax.value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
+        (loss, values), gradients = value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
         critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
         n_updates = state.n_updates + 1
 
         def delayed(state: State) -> State:
             first_critic = jax.tree.map(lambda leaf: leaf[0], critics)
-            policy_loss, gradients = jax.value_and_grad(actor_loss)(state.actor, first_critic, batch.obs)
+            policy_loss, gradients = value_and_grad(actor_loss)(state.actor, first_critic, batch.obs)
             actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
             return eqx.tree_at(
                 lambda s: (s.actor, s.actor_optimizer, s.actor_loss, s.target_actor, s.target_critics),
@@ -168,6 +170,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return Algorithm(init, lambda state: state.actor, explore, policy, update)
 
 
+@outlined
 def smoothed_action(target_actor: Actor, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:
     """Returns the target actor's actions with clipped noise, in [-1, 1], ``(batch, action_dim)``."""
     action = policy(target_actor, next_obs)
@@ -175,6 +178,7 @@ def smoothed_action(target_actor: Actor, next_obs: PyTree, key: Array, sigma: fl
     return jnp.clip(action + noise, -1.0, 1.0)
 
 
+@outlined
 def td_target(target_critics: Critic, batch: Transition, next_action: Array) -> Array:
     """Returns what the critics should say of the batch, ``(batch,)``."""
     next_value = jnp.min(action_values(target_critics, batch.next_obs, next_action), axis=0)

@@ -25,6 +25,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.sac import HIDDEN_LAYERS, State, initial_temperature, policy, temperature_loss
+from rejeu.compilation import outlined
 from rejeu.config import OffPolicyConfig, number, whole
 from rejeu.core import (
     TD_ERROR,
@@ -37,6 +38,7 @@ from rejeu.core import (
     descend,
     ensemble,
     polyak,
+    value_and_grad,
     weighted_mean,
 )
 from rejeu.networks import Actor, Critic
@@ -128,11 +130,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         rate = at(config.learning_rate, clock.progress)
         alpha = jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch, target_key, n_kept)
-        (critic_loss, quantiles), gradients = jax.value_and_grad(critics_loss, has_aux=True)(
-            state.critics, batch, target
-        )
+        (critic_loss, quantiles), gradients = value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
         critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
-        (policy_loss, log_prob), gradients = jax.value_and_grad(actor_loss, has_aux=True)(
+        (policy_loss, log_prob), gradients = value_and_grad(actor_loss, has_aux=True)(
             state.actor, critics, alpha, batch.obs, actor_key
         )
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
@@ -184,6 +184,7 @@ def truncate(quantiles: Array, n_kept: int) -> Array:
     return -jax.lax.top_k(-pooled, n_kept)[0]
 
 
+@outlined
 def td_target(actor: Actor, target_critics: Critic, alpha: Array, batch: Transition, key: Array, n_kept: int) -> Array:
     """Returns samples of the return that the critics should predict, ``(batch, n_kept)``."""
     next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)

@@ -42,6 +42,7 @@ class Compiled:
         self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
         self._recall_packer, self._observe_packer = HostPacker(), HostPacker()
         self._explorer = explorer = exploration.make(algorithm, noise)
+        pack, unpack = compilation.one_kernel(packing.pack), compilation.one_kernel(packing.unpack)
 
         @compilation.run_once
         def init(key: Array) -> PackedState:
@@ -74,9 +75,9 @@ class Compiled:
             return finite.all_finite(packing.without(after, passed_over), metrics)
 
         def learnt(state: PackedState, batch: Transition | Rollout, clock: Clock) -> tuple[PackedState, Metrics, Array]:
-            after, metrics = algorithm.update(packing.unpack(state), batch, clock)
+            after, metrics = algorithm.update(unpack(state), batch, clock)
             # Without the barrier XLA would compute the whole step of the optimizer once more for the check.
-            packed = jax.lax.optimization_barrier(packing.pack(after))
+            packed = jax.lax.optimization_barrier(pack(after))
             sound = is_sound(packed, metrics)
             return packed, metrics, sound
 
@@ -90,7 +91,7 @@ class Compiled:
         def update(
             state: PackedState, vectors: list[Array], plan: Message
         ) -> tuple[PackedState, Readings, Array | None]:
-            batches, clock = plan.unpack(vectors)
+            batches, clock = compilation.one_kernel(plan.unpack)(vectors)
             is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
             if skips and is_one:
                 packed, (metrics, sound) = learnt_or_skipped(state, batches, clock)
