@@ -40,14 +40,14 @@ def test_other_errors_of_the_device_are_not_hidden():
 
 @pytest.mark.parametrize("wrapped", [compilation.outlined, compilation.one_kernel])
 def test_a_function_apart_computes_the_same_and_takes_any_tree_and_setting(wrapped):
-    def function(tree, factor, activation, nothing):
+    def function(tree, factor, activation, *, nothing):
         assert nothing is None
         return {"sum": tree["a"] + factor * tree["b"], "activated": activation(tree["a"]), "a": tree["a"]}
 
     tree = {"a": jnp.linspace(-1.0, 1.0, 7), "b": np.arange(7, dtype=np.float32)}
-    expected = function(tree, 0.5, jnp.tanh, None)
-    inside = jax.jit(lambda tree: wrapped(function)(tree, 0.5, jnp.tanh, None))
-    for found in (wrapped(function)(tree, 0.5, jnp.tanh, None), inside(tree)):
+    expected = function(tree, 0.5, jnp.tanh, nothing=None)
+    inside = jax.jit(lambda tree: wrapped(function)(tree, 0.5, jnp.tanh, nothing=None))
+    for found in (wrapped(function)(tree, 0.5, jnp.tanh, nothing=None), inside(tree)):
         jax.tree.map(lambda e, f: np.testing.assert_allclose(f, e, rtol=1e-6), expected, found)
 
 

@@ -105,18 +105,19 @@ def _marked(function: F, marks: dict[str, str], most: float) -> F:
     """Returns ``function`` as one that compiled programs call, marked so, if at most so many numbers go into it."""
 
     @functools.wraps(function)
-    def call(*arguments: Any) -> Any:
-        leaves, structure = jax.tree.flatten(arguments)
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        leaves, structure = jax.tree.flatten((arguments, keywords))
         where = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray)]
         if jax.default_backend() != "cpu" or sum(leaves[i].size for i in where) > most:
-            return function(*arguments)
+            return function(*arguments, **keywords)
 
         def of_arrays(*arrays: Array) -> Any:
             complete = list(leaves)
             for i, array in zip(where, arrays, strict=True):
                 complete[i] = array
             with set_xla_metadata(**dict.fromkeys(marks)):  # it is the call that is marked, not what is done there
-                return function(*jax.tree.unflatten(structure, complete))
+                arguments, keywords = jax.tree.unflatten(structure, complete)
+                return function(*arguments, **keywords)
 
         of_arrays.__name__ = getattr(function, "__name__", of_arrays.__name__)  # a profile shows it
         with set_xla_metadata(**marks):
