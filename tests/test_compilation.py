@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from rejeu import compilation
-from rejeu.algorithms import ddpg, dqn, qrdqn, sac, sac_discrete, td3, tqc
+from rejeu.algorithms import ddpg, dqn, sac, sac_discrete, td3, tqc
 from rejeu.core import Clock, Transition, descend, polyak
 from rejeu.loops.compiled import Compiled
 
@@ -83,7 +83,7 @@ def test_other_processors_are_told_nothing(monkeypatch):
 
 
 @ON_CPU
-@pytest.mark.parametrize("module", [ddpg, td3, sac, tqc, dqn, qrdqn, sac_discrete])
+@pytest.mark.parametrize("module", [ddpg, td3, sac, tqc, dqn, sac_discrete])
 def test_an_update_never_has_so_many_kernels_waiting_that_xla_shares_them_among_threads(module):
     text = compiled_update(module)
     most = {name: most_waiting(text, name) for name in computations_run(text)}
@@ -99,7 +99,7 @@ def test_kernels_that_wait_are_counted():
 
 def compiled_update(module) -> str:
     """Returns the compiled program of an update of batches of 32 with 32-32, as XLA writes it."""
-    discrete = module in (dqn, qrdqn, sac_discrete)
+    discrete = module in (dqn, sac_discrete)
     action_space = spaces.Discrete(3) if discrete else spaces.Box(-1, 1, (2,), np.float32)
     config = module.Config(policy_kwargs={"net_arch": [32, 32]}, batch_size=32)
     compiled = Compiled(module.make(config, spaces.Box(-np.inf, np.inf, (5,), np.float32), action_space), None)

@@ -29,7 +29,7 @@ OUTLINED = {"inlineable": "false"}
 """What tells XLA to leave a function that a program calls a function."""
 ONE_KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 """What tells it to make one kernel of the function."""
-SMALL = 2**18
+SMALL = 2**19
 """Numbers that go into a function up to which it is made one kernel, which is the work of one thread."""
 
 _seconds = 0.0

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optax
 from gymnasium import spaces
@@ -38,20 +39,8 @@ from rejeu.algorithms.dqn import (
     moves_due,
     taken,
 )
-from rejeu.compilation import outlined
 from rejeu.config import OffPolicyConfig, whole
-from rejeu.core import (
-    TD_ERROR,
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    copy,
-    descend,
-    value_and_grad,
-    weighted_mean,
-)
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, weighted_mean
 from rejeu.networks import Actor
 from rejeu.quantiles import quantile_huber_loss
 from rejeu.schedules import Schedule, at
@@ -144,7 +133,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         moves = moves_due(state.step, clock.step, config.target_update_interval)
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
         target = td_target(target_network, batch)
-        (loss, current), gradients = value_and_grad(quantile_loss, has_aux=True)(state.network, batch, target)
+        (loss, current), gradients = jax.value_and_grad(quantile_loss, has_aux=True)(state.network, batch, target)
         gradients = clipped(gradients, None, config.max_grad_norm)
         rate = at(config.learning_rate, clock.progress)
         network, optimizer_state = descend(state.network, gradients, state.optimizer, optimizer, rate)
@@ -182,7 +171,6 @@ class QuantileNetwork(eqx.Module):
         return jnp.mean(self.quantiles(obs), axis=-1)
 
 
-@outlined
 def td_target(target_network: QuantileNetwork, batch: Transition) -> Array:
     """Returns a sample of what the return may be, under the action of highest mean: ``(batch, n_quantiles)``."""
     following = target_network.quantiles(batch.next_obs)
