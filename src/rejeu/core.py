@@ -141,6 +141,7 @@ def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[
     return outlined(jax.value_and_grad(loss, has_aux=has_aux))
 
 
+@one_kernel
 def descend(
     params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: optax.GradientTransformation, rate: Any
 ) -> tuple[PyTree, PyTree]:
@@ -149,13 +150,9 @@ def descend(
     ``optimizer`` is a transformation without a learning rate (``optax.scale_by_adam()``); the rate is multiplied here,
     so that it may be a traced value of a schedule.
     """
-
-    @one_kernel
-    def step(params: PyTree, gradients: PyTree, optimizer_state: PyTree, rate: Any) -> tuple[PyTree, PyTree]:
-        direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
-        return jax.tree.map(lambda p, d: p - rate * d, params, direction), optimizer_state
-
-    return step(params, gradients, optimizer_state, rate)
+    direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
+    params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
+    return params, optimizer_state
 
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
