@@ -174,6 +174,18 @@ def test_targets_move_by_tau_towards_the_new_networks(learner):
         assert_equal_layers(layers(getattr(after, f"target_{name}")), target, name, atol=1e-6)
 
 
+def test_both_targets_move_by_tau_at_every_target_update_interval_th_update_and_only_then():
+    algorithm = make(target_update_interval=3)
+    update, state = jax.jit(algorithm.update), jax.jit(algorithm.init)(jax.random.PRNGKey(1))
+    for k in range(1, 7):
+        before, (state, _) = state, update(state, random_batch(k), CLOCK)
+        for target, online in (("target_actor", "actor"), ("target_critic", "critic")):
+            expected = layers(getattr(before, target))
+            if k % 3 == 0:
+                follow(expected, layers(getattr(state, online)), TAU)
+            assert_equal_layers(layers(getattr(state, target)), expected, f"{target} after {k}", atol=1e-7)
+
+
 def test_the_metrics_are_of_the_networks_before_the_update(learner):
     update, state = learner
     batch = random_batch()
@@ -259,6 +271,7 @@ def test_the_defaults_are_those_of_stable_baselines3():
         ({"tau": 0.0}, "tau=0.0 must be a finite number, above 0 and at most 1"),
         ({"gamma": 1.01}, "gamma=1.01 must be a finite number, at least 0"),
         ({"learning_rate": -1e-3}, "learning_rate=-0.001"),
+        ({"target_update_interval": 0}, "target_update_interval=0 must be a whole number of at least 1"),
         ({"batch_size": 0}, "batch_size=0 must be a whole number of at least 1"),
     ],
 )

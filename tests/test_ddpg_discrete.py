@@ -28,8 +28,8 @@ td_target, critic_loss, actor_loss = map(
 )
 
 
-def make():
-    config = ddpg.Config(policy_kwargs={"net_arch": [5, 4]}, learning_rate=RATE, tau=TAU)
+def make(**settings):
+    config = ddpg.Config(policy_kwargs={"net_arch": [5, 4]}, learning_rate=RATE, tau=TAU, **settings)
     return ddpg.make(config, OBS_SPACE, ACTION_SPACE)
 
 
@@ -145,6 +145,18 @@ def test_three_updates_equal_numpy(learner):
             moments, adam = getattr(state, f"{name}_optimizer"), getattr(by_hand, f"{name}_adam")
             assert_equal_layers(layers(moments.mu), adam.first, f"first moment of {name}", atol=1e-6, rtol=1e-4)
     assert int(state.n_updates) == 3
+
+
+def test_both_targets_move_by_tau_at_every_target_update_interval_th_update_and_only_then():
+    algorithm = make(target_update_interval=3)
+    update, state = jax.jit(algorithm.update), jax.jit(algorithm.init)(jax.random.PRNGKey(1))
+    for k in range(1, 7):
+        before, (state, _) = state, update(state, random_batch(k), CLOCK)
+        for target, online in (("target_actor", "actor"), ("target_critic", "critic")):
+            expected = layers(getattr(before, target))
+            if k % 3 == 0:
+                follow(expected, layers(getattr(state, online)), TAU)
+            assert_equal_layers(layers(getattr(state, target)), expected, f"{target} after {k}", atol=1e-7)
 
 
 def test_the_metrics_name_losses_values_entropy_and_errors(learner):

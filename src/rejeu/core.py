@@ -166,6 +166,15 @@ def polyak(target: PyTree, online: PyTree, tau: Any) -> PyTree:
     return jax.tree.map(lambda t, o: t + tau * (o - t), target, online)
 
 
+def tau_at(n_updates: Array, tau: float, interval: int) -> Any:
+    """Returns ``tau`` at every ``interval``-th update and 0 at the others, so that :func:`polyak` leaves targets alone.
+
+    >>> [float(tau_at(jnp.int32(n), 0.5, 3)) for n in (1, 2, 3, 4)]
+    [0.0, 0.0, 0.5, 0.0]
+    """
+    return tau if interval == 1 else jnp.where(n_updates % interval == 0, tau, 0.0)
+
+
 def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:
     """Returns ``size`` independent initialisations stacked along a leading axis."""
     return jax.vmap(init)(jax.random.split(key, size))

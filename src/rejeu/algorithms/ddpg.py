@@ -6,7 +6,7 @@ critic ``Q``, their slowly moving targets ``mu'`` and ``Q'``, and discount ``d``
     y      = r + d Q'(s', mu'(s'))
     J_Q    = mean (Q(s, a) - y)^2
     J_mu   = -mean Q(s, mu(s))
-    Q'    <- Q' + tau (Q - Q'),    mu' <- mu' + tau (mu - mu')
+    Q'    <- Q' + tau (Q - Q'),    mu' <- mu' + tau (mu - mu')     every target_update_interval-th update
 
 Exploration is noise on actions or on parameters (``action_noise``). The actor ends in a tanh, which the loop scales to the
 environment's bounds. As in Stable-Baselines3 the critic takes its step before the actor, and there is no weight decay.
@@ -26,7 +26,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig
+from rejeu.config import OffPolicyConfig, whole
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -37,6 +37,7 @@ from rejeu.core import (
     copy,
     descend,
     polyak,
+    tau_at,
     value_and_grad,
     weighted_mean,
 )
@@ -55,8 +56,15 @@ class Config(OffPolicyConfig):
     learning_rate: float | Schedule = 1e-3
     """Step size of Adam for both networks; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
     ``"lin_1e-3"``."""
+    target_update_interval: int = 1
+    """Gradient steps between two moves of both targets. Raising it is steadier and slower."""
 
     name: ClassVar[str] = "DDPG"
+
+    def __post_init__(self) -> None:
+        OffPolicyConfig.__post_init__(self)
+        interval = whole("target_update_interval", self.target_update_interval, least=1)
+        object.__setattr__(self, "target_update_interval", interval)
 
 
 class State(eqx.Module):
@@ -111,14 +119,16 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         critic, critic_optimizer = descend(state.critic, gradients, state.critic_optimizer, optimizer, rate)
         policy_loss, gradients = value_and_grad(actor_loss)(state.actor, critic, batch.obs)
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
+        n_updates = state.n_updates + 1
+        tau = tau_at(n_updates, config.tau, config.target_update_interval)
         state = State(
             actor=actor,
             critic=critic,
-            target_actor=polyak(state.target_actor, actor, config.tau),
-            target_critic=polyak(state.target_critic, critic, config.tau),
+            target_actor=polyak(state.target_actor, actor, tau),
+            target_critic=polyak(state.target_critic, critic, tau),
             actor_optimizer=actor_optimizer,
             critic_optimizer=critic_optimizer,
-            n_updates=state.n_updates + 1,
+            n_updates=n_updates,
         )
         metrics = {
             "critic_loss": loss,

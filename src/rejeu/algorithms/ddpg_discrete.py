@@ -33,6 +33,7 @@ from rejeu.core import (
     copy,
     descend,
     polyak,
+    tau_at,
     value_and_grad,
     weighted_mean,
 )
@@ -92,14 +93,16 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
             state.actor, critic(batch.obs), batch.obs
         )
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
+        n_updates = state.n_updates + 1
+        tau = tau_at(n_updates, config.tau, config.target_update_interval)
         state = State(
             actor=actor,
             critic=critic,
-            target_actor=polyak(state.target_actor, actor, config.tau),
-            target_critic=polyak(state.target_critic, critic, config.tau),
+            target_actor=polyak(state.target_actor, actor, tau),
+            target_critic=polyak(state.target_critic, critic, tau),
             actor_optimizer=actor_optimizer,
             critic_optimizer=critic_optimizer,
-            n_updates=state.n_updates + 1,
+            n_updates=n_updates,
         )
         metrics = {
             "critic_loss": loss,

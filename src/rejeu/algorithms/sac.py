@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -41,6 +41,7 @@ from rejeu.core import (
     descend,
     ensemble,
     polyak,
+    tau_at,
     value_and_grad,
     weighted_mean,
 )
@@ -161,9 +162,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             log_alpha, alpha_optimizer = descend(log_alpha, gradient, alpha_optimizer, optimizer, rate)
 
         n_updates = state.n_updates + 1
-        tau: Any = config.tau
-        if config.target_update_interval > 1:
-            tau = jnp.where(n_updates % config.target_update_interval == 0, tau, 0.0)
+        tau = tau_at(n_updates, config.tau, config.target_update_interval)
         state = State(
             actor=actor,
             critics=critics,

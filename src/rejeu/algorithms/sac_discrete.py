@@ -35,6 +35,7 @@ from rejeu.core import (
     descend,
     ensemble,
     polyak,
+    tau_at,
     value_and_grad,
     weighted_mean,
 )
@@ -96,7 +97,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
             gradient = jnp.mean(entropy) - target_entropy
             log_alpha, alpha_optimizer = descend(log_alpha, gradient, alpha_optimizer, optimizer, rate)
         n_updates = state.n_updates + 1
-        tau = jnp.where(n_updates % config.target_update_interval == 0, config.tau, 0.0)
+        tau = tau_at(n_updates, config.tau, config.target_update_interval)
         state = State(
             actor=actor,
             critics=critics,
