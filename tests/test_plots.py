@@ -42,6 +42,39 @@ def test_the_line_is_the_moving_average():
     np.testing.assert_allclose(line.get_ydata(), expected)
 
 
+@pytest.mark.parametrize(("n_episodes", "window"), [(30, 6), (250, 50), (2_000, 50), (4, 3)])
+def test_the_line_averages_a_fifth_of_a_short_run(n_episodes, window):
+    labels = learning_curve(history(n_episodes)).axes[0].get_legend_handles_labels()[1]
+    assert f"mean of {window} episodes" in labels
+
+
+def test_a_window_below_one_is_an_error():
+    with pytest.raises(ValueError, match="window=0 must be a whole number of at least 1"):
+        learning_curve(history(), window=0)
+
+
+@pytest.mark.parametrize("success", [float("nan"), 1.0])
+def test_a_long_title_and_the_legend_keep_apart_and_inside_the_picture(success):
+    title = "gymnasium_robotics/AdroitHandRelocateSparse-v1 of some_package.some_module, RecurrentPPO"
+    figure = learning_curve(history(success=success), evaluations=[evaluated(100_000, success)], title=title)
+    figure.draw_without_rendering()
+    title_box, legend_box = (
+        artist.get_window_extent() for artist in (figure.axes[0]._left_title, figure.axes[0].get_legend())
+    )
+    assert title_box.y0 > legend_box.y1
+    assert title_box.x1 < figure.bbox.x1
+    assert title_box.y1 <= figure.bbox.y1
+    assert legend_box.x1 < figure.bbox.x1
+
+
+def test_points_at_the_right_edge_are_drawn_whole():
+    figure = learning_curve(history(), evaluations=[evaluated(200_000)])
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    marker = 5 / 2 * figure.dpi / 72  # half of the largest dot, in pixels
+    assert axes.transData.transform((200_000, -800))[0] + marker < axes.get_window_extent().x1
+
+
 def test_evaluations_are_drawn_at_their_steps():
     figure = learning_curve(history(), evaluations=[evaluated(50_000), evaluated(100_000)])
     points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))

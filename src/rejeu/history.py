@@ -92,8 +92,13 @@ class History:
             writer.writerow(COLUMNS)
             writer.writerows(self.episodes)
 
-    def plot(self, path: str | Path | None = None, against: str = "step", window: int = 50) -> Figure:
-        """Draws returns and, where known, success against ``"step"`` or ``"seconds"``; writes a PNG if ``path``.
+    def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Figure:
+        """Returns a matplotlib figure of returns and, where known, success.
+
+        Args:
+            path: of a file to write, whose suffix says the format; None for none.
+            against: ``"step"`` or ``"seconds"``.
+            window: episodes in the moving average; None: a fifth of the run, at least 3 and at most 50.
 
         Raises:
             MissingExtra: if matplotlib is not installed.

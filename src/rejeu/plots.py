@@ -1,14 +1,16 @@
-"""Pictures of training runs. Drawn without a display and without matplotlib's global state."""
+"""Figures of training runs. Drawn without a display and without matplotlib's global state."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rejeu.config import whole
 from rejeu.errors import MissingExtra
 from rejeu.evaluation import Evaluation
 
@@ -19,15 +21,22 @@ if TYPE_CHECKING:
     from rejeu.history import History
 
 INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
+EPISODES = "episodes"
 DOT_COLOUR, LINE_COLOUR, EVALUATION_COLOUR = "#63a4e0", "#1d4f91", "#dd6b20"
 AXIS_LABELS = {"step": "environment steps", "seconds": "seconds of training"}
+MOST_WINDOW = 50
+"""Most episodes in the moving average that is drawn by default."""
+TITLE_WIDTH = 72
+"""Characters of a title's line: what fits the width of the picture in the title's font."""
+ROOM_AT_THE_RIGHT = 0.02
+"""Of the horizontal axis, beyond the last episode, so that its dot is drawn whole."""
 
 
 def learning_curve(
     history: History,
     path: str | Path | None = None,
     against: str = "step",
-    window: int = 50,
+    window: int | None = None,
     evaluations: Iterable[tuple[int, Evaluation]] = (),
     title: str = "",
 ) -> Figure:
@@ -37,9 +46,9 @@ def learning_curve(
         history: the episodes; may be empty.
         path: of a file to write, whose suffix says the format (``.png``, ``.svg``, ``.pdf``); None for none.
         against: ``"step"`` or ``"seconds"``.
-        window: episodes in the moving average.
+        window: episodes in the moving average; None: a fifth of the run, at least 3 and at most 50. The legend says it.
         evaluations: ``(step, Evaluation)`` pairs, such as ``Evaluate.results``, drawn as points with 95 % intervals.
-        title: over the picture; empty for none.
+        title: over the picture; long ones are wrapped. Empty for none.
 
     Raises:
         MissingExtra: if matplotlib is not installed.
@@ -52,8 +61,7 @@ def learning_curve(
         raise MissingExtra("drawing a learning curve", "matplotlib", "plot") from None
     if against not in AXIS_LABELS:
         raise ValueError(f"against={against!r} must be one of {', '.join(AXIS_LABELS)}")
-    if window < 1:
-        raise ValueError(f"window={window} must be at least 1 episode")
+    window = default_window(len(history)) if window is None else whole("window", window, least=1)
     evaluations = list(evaluations)
     x, returns, successes = history[against], history["return"], history["success"]
     steps = np.array([step for step, _ in evaluations], np.float64)
@@ -80,18 +88,35 @@ def learning_curve(
         _dress(panel)
     panels[-1].set_xlabel(AXIS_LABELS[against])
     panels[-1].xaxis.set_major_formatter(FuncFormatter(_thousands))
-    panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]))
-    if title:
-        panels[0].set_title(title, loc="left", color=INK, fontsize=12, fontweight="bold", pad=9)
-    if panels[0].get_legend_handles_labels()[0]:
-        style = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2, "columnspacing": 1.4}
-        legend = panels[0].legend(loc="lower right", bbox_to_anchor=(1.01, 1.0), ncols=3, borderaxespad=0.2, **style)
-        if len(x):
-            legend.legend_handles[0].set(markersize=5, alpha=0.8)
+    panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]) * (1 + ROOM_AT_THE_RIGHT))
+    _head(panels[0], title)
     if path is not None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)
     return figure
+
+
+def default_window(n_episodes: int) -> int:
+    """Returns the episodes in the moving average of a run: few in a short one, whose line would lag behind otherwise.
+
+    >>> [default_window(n) for n in (4, 30, 100, 1000)]
+    [3, 6, 20, 50]
+    """
+    return min(max(n_episodes // 5, 3), MOST_WINDOW)
+
+
+def _head(panel: Axes, title: str) -> None:
+    """Writes the legend above a panel and the title above the legend, so that neither limits the other's length."""
+    has_legend = bool(panel.get_legend_handles_labels()[0])
+    if title:
+        text = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
+        panel.set_title(text, loc="left", color=INK, fontsize=12, fontweight="bold", pad=25 if has_legend else 9)
+    if has_legend:
+        style = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2, "columnspacing": 1.4}
+        legend = panel.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=3, borderaxespad=0.2, **style)
+        for line in legend.get_lines():
+            if line.get_label() == EPISODES:
+                line.set(markersize=5, alpha=0.8)
 
 
 def _thousands(value: float, _: int | None = None) -> str:
@@ -104,7 +129,7 @@ def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
         return
     size = float(np.clip(60 / math.sqrt(len(x)), 2.4, 5.0))
     opacity = float(np.clip(600 / len(x), 0.3, 0.6))
-    panel.plot(x, y, "o", markersize=size, color=DOT_COLOUR, alpha=opacity, markeredgewidth=0, label="episodes")
+    panel.plot(x, y, "o", markersize=size, color=DOT_COLOUR, alpha=opacity, markeredgewidth=0, label=EPISODES)
 
 
 def _line(panel: Axes, x: np.ndarray, y: np.ndarray, window: int) -> None:
