@@ -75,6 +75,13 @@ def test_points_at_the_right_edge_are_drawn_whole():
     assert axes.transData.transform((200_000, -800))[0] + marker < axes.get_window_extent().x1
 
 
+def test_a_notebook_shows_the_curve_without_matplotlibs_magic():
+    from IPython.core.interactiveshell import InteractiveShell
+
+    formatted, _ = InteractiveShell().display_formatter.format(history().plot())
+    assert formatted["image/png"].startswith(b"\x89PNG")
+
+
 def test_evaluations_are_drawn_at_their_steps():
     figure = learning_curve(history(), evaluations=[evaluated(50_000), evaluated(100_000)])
     points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))
@@ -111,5 +118,6 @@ def test_an_unknown_axis_is_an_error():
 
 def test_without_matplotlib_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.delitem(sys.modules, "rejeu.figures", raising=False)
     with pytest.raises(MissingExtra, match=r"rejeu\[plot\]"):
         learning_curve(history())

@@ -13,7 +13,7 @@ import numpy as np
 from rejeu.loops.host import Episode
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from rejeu.figures import Picture
 
 COLUMNS = ("step", "env", "return", "length", "success", "seconds")
 
@@ -92,8 +92,8 @@ class History:
             writer.writerow(COLUMNS)
             writer.writerows(self.episodes)
 
-    def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Figure:
-        """Returns a matplotlib figure of returns and, where known, success.
+    def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
+        """Returns a matplotlib figure of returns and, where known, success; a notebook shows it by itself.
 
         Args:
             path: of a file to write, whose suffix says the format; None for none.

@@ -1,4 +1,4 @@
-"""Figures of training runs. Drawn without a display and without matplotlib's global state."""
+"""Pictures of training runs. Drawn without a display and without matplotlib's global state."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from rejeu.evaluation import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
+    from rejeu.figures import Picture
     from rejeu.history import History
 
 INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
@@ -39,7 +39,7 @@ def learning_curve(
     window: int | None = None,
     evaluations: Iterable[tuple[int, Evaluation]] = (),
     title: str = "",
-) -> Figure:
+) -> Picture:
     """Draws the return of every episode, its moving average and, where known, the success rate below.
 
     Args:
@@ -55,8 +55,9 @@ def learning_curve(
         ValueError: for another ``against`` or a ``window`` below 1.
     """
     try:
-        from matplotlib.figure import Figure
         from matplotlib.ticker import FuncFormatter, PercentFormatter
+
+        from rejeu.figures import Picture
     except ImportError:
         raise MissingExtra("drawing a learning curve", "matplotlib", "plot") from None
     if against not in AXIS_LABELS:
@@ -68,7 +69,7 @@ def learning_curve(
     at = steps if against == "step" or not len(x) else np.interp(steps, history["step"], x)
     has_success = bool(np.isfinite(successes).any())
 
-    figure = Figure(figsize=(8.0, 6.4 if has_success else 4.2), dpi=150, layout="constrained", facecolor="white")
+    figure = Picture(figsize=(8.0, 6.4 if has_success else 4.2), dpi=150, layout="constrained", facecolor="white")
     panels = figure.subplots(1 + has_success, sharex=True, squeeze=False, height_ratios=[3, 2][: 1 + has_success])[:, 0]
     means = [evaluation.mean_return for _, evaluation in evaluations]
     _episodes(panels[0], x, returns)
