@@ -14,6 +14,7 @@ from rejeu.exploration.noise import (
     NormalActionNoise,
     OrnsteinUhlenbeckActionNoise,
     ParameterNoise,
+    barrier,
     barrier_slope,
     check_fits,
     parse,
@@ -88,7 +89,7 @@ def test_drift_moves_the_resting_point_by_drift_over_theta():
 
 def test_barrier_slope_is_the_derivative_of_the_barrier():
     u = np.linspace(-1.5, 1.5, 13)
-    barrier = lambda v: (np.pi * v / 2) ** 6  # noqa: E731
+    np.testing.assert_allclose(barrier(u), (np.pi * u / 2) ** 6, rtol=1e-12)
     expected = (barrier(u + 1e-5) - barrier(u - 1e-5)) / 2e-5
     np.testing.assert_allclose(barrier_slope(jnp.asarray(u, jnp.float32)), expected, rtol=1e-4, atol=1e-6)
 
@@ -235,3 +236,52 @@ def test_action_noise_is_refused_where_it_does_not_fit_the_actions():
         check_fits(NormalActionNoise([0], 0.1), box)
     with pytest.raises(ValueError, match=r"use action_noise=ParameterNoise\(\)"):
         check_fits(NormalActionNoise([0], 0.1), spaces.Discrete(4))
+
+
+# By hand.
+
+
+def test_noise_called_by_hand_runs_the_process_of_one_environment():
+    noise = OrnsteinUhlenbeckActionNoise([0.3], [0.0], theta=1.0, dt=0.5, initial_noise=[0.7])
+    found = [float(noise()[0]) for _ in range(3)]
+    np.testing.assert_allclose(found, [0.5, 0.4, 0.35], rtol=1e-6)  # half way to the mean in each step
+    noise.reset()
+    assert noise().tolist() == pytest.approx([0.5], rel=1e-6)
+
+
+def test_noise_called_by_hand_has_the_deviation_of_its_settings():
+    noise = NormalActionNoise([0.5, 0.0], [0.1, 0.3])
+    noise.reset(seed=0)
+    drawn = np.stack([noise() for _ in range(4_000)])
+    assert drawn.dtype == np.float32
+    np.testing.assert_allclose(drawn.mean(0), [0.5, 0.0], atol=4 * 0.3 / np.sqrt(4_000))
+    np.testing.assert_allclose(drawn.std(0), [0.1, 0.3], rtol=4 / np.sqrt(2 * 4_000))
+
+
+def test_a_seed_repeats_what_is_drawn_by_hand_and_reset_alone_lets_the_random_numbers_continue():
+    noise = NormalActionNoise([0.0], 1.0)
+    noise.reset(seed=3)
+    first = [noise().item(), noise().item()]
+    noise.reset()
+    assert noise().item() not in first
+    noise.reset(seed=3)
+    assert [noise().item(), noise().item()] == first
+
+
+def test_the_repulsive_boundary_answers_the_action_that_is_given_by_hand():
+    """At u = 1 the slope is 3 pi (pi / 2)^5 = 90.13; no kicks, so that the push is all there is."""
+    noise = OrnsteinUhlenbeckActionNoise([0.0], 0.0, theta=0.0, repulsive=1e-3)
+    assert noise(1.0).item() == pytest.approx(-1e-3 * 3 * np.pi * (np.pi / 2) ** 5, rel=1e-5)
+    noise.reset()
+    assert noise().item() == 0.0
+
+
+def test_what_was_done_by_hand_is_no_part_of_the_settings():
+    noise = OrnsteinUhlenbeckActionNoise([0.0], 0.2)
+    fresh = OrnsteinUhlenbeckActionNoise([0.0], 0.2)
+    noise()
+    assert noise == fresh
+    assert hash(noise) == hash(fresh)
+    assert repr(noise) == repr(fresh)
+    assert to_json(noise) == to_json(fresh)
+    np.testing.assert_array_equal(noise.init(2), fresh.init(2))

@@ -48,7 +48,7 @@ def with_action_noise(algorithm: Algorithm, noise: ActionNoise) -> Explorer:
         carry, action = noise.perturb(carry, algorithm.explore(actor, obs, action_key, clock), noise_key)
         return jnp.clip(action, -1.0, 1.0), carry
 
-    return Explorer(lambda actor, n_envs: noise.init(n_envs), act)
+    return Explorer(lambda actor, n_envs: jnp.asarray(noise.init(n_envs)), act)
 
 
 def with_parameter_noise(algorithm: Algorithm, noise: ParameterNoise) -> Explorer:

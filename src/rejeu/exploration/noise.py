@@ -9,21 +9,92 @@ stay.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, InitVar, asdict, dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from jax import Array
+from numpy.typing import ArrayLike
 
 from rejeu.exploration.parameter_space import ParameterNoise
 
 
+class ActionNoise(ABC):
+    """Noise on actions in [-1, 1]. Abstract.
+
+    The object holds settings only: agents keep the processes of their environments themselves. Called by hand it runs one
+    process of its own, as Stable-Baselines3's noise does, which is no part of its settings: equality, files and agents
+    know nothing of it.
+
+    >>> noise = NormalActionNoise(mean=[0.0, 0.0], sigma=0.2)
+    >>> noise.reset(seed=0)
+    >>> noise().shape
+    (2,)
+    """
+
+    _by_hand: _ByHand | None = None
+
+    @abstractmethod
+    def init(self, n_envs: int) -> Any:
+        """Returns the state of ``n_envs`` processes at the start of an episode, ``float32 (n_envs, ...)``."""
+
+    @abstractmethod
+    def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
+        """Returns the state after one step, and ``action`` ``(n_envs, action_dim)`` with noise, not yet clipped.
+
+        ``normal`` has standard normal numbers, one for each action dimension. NumPy or JAX arrays.
+        """
+
+    def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
+        """Returns what :meth:`advance` does, with random numbers drawn from ``key``."""
+        return self.advance(state, action, jax.random.normal(key, action.shape))
+
+    def __call__(self, action: ArrayLike = 0.0) -> np.ndarray:
+        """Returns the noise of the next step, ``float32 (action_dim,)``: what is to be added to ``action``.
+
+        Args:
+            action: the policy's action in [-1, 1], a number or ``(action_dim,)``. The noise depends on it only with a
+                repulsive boundary.
+
+        What is returned is not clipped: take ``np.clip(action + noise(action), -1, 1)``, scaled to the environment's range.
+        """
+        if self._by_hand is None:
+            self.reset()
+        assert self._by_hand is not None
+        return self._by_hand(self, action)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Puts the process that :meth:`__call__` runs to the start of an episode.
+
+        Args:
+            seed: also restarts its random numbers; None lets them continue.
+        """
+        if self._by_hand is None or seed is not None:
+            object.__setattr__(self, "_by_hand", _ByHand(np.random.default_rng(seed)))
+        assert self._by_hand is not None
+        self._by_hand.state = None
+
+
+class _ByHand:
+    """One process that is stepped by hand, in NumPy, so that looking at noise does not start JAX's device."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.state: Any = None
+
+    def __call__(self, noise: Any, action: ArrayLike) -> np.ndarray:
+        state = noise.init(1) if self.state is None else self.state
+        before = np.broadcast_to(np.asarray(action, np.float32), (1, len(noise.mean)))
+        self.state, after = noise.advance(state, before, self.rng.standard_normal(before.shape, np.float32))
+        return (after - before)[0]
+
+
 @dataclass(frozen=True)
-class NormalActionNoise:
+class NormalActionNoise(ActionNoise):
     """Independent Gaussian noise, the same at every step (Stable-Baselines3's class of that name).
 
     >>> NormalActionNoise(mean=[0.0, 0.0], sigma=[0.2, 0.2])
@@ -41,18 +112,16 @@ class NormalActionNoise:
         _check_dtype(self, dtype)
         _as_tuples(self, "mean", "sigma")
 
-    def init(self, n_envs: int) -> Array:
+    def init(self, n_envs: int) -> Any:
         """Returns the state of the noise of ``n_envs`` environments: nothing."""
-        return jnp.zeros((n_envs, 0), jnp.float32)
+        return np.zeros((n_envs, 0), np.float32)
 
-    def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
-        """Returns the state and ``action`` with noise, ``(n_envs, action_dim)``, not yet clipped to [-1, 1]."""
-        noise = _row(self.mean) + _row(self.sigma) * jax.random.normal(key, action.shape)
-        return state, action + noise
+    def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
+        return state, action + (_row(self.mean) + _row(self.sigma) * normal)
 
 
 @dataclass(frozen=True)
-class OrnsteinUhlenbeckActionNoise:
+class OrnsteinUhlenbeckActionNoise(ActionNoise):
     """Noise that drifts back to its mean: an Ornstein-Uhlenbeck process, one per environment.
 
     From ``initial_noise`` at the start of every episode, each step takes (Uhlenbeck and Ornstein 1930; for DDPG,
@@ -105,29 +174,36 @@ class OrnsteinUhlenbeckActionNoise:
         if min(self.repulsive) < 0:
             raise ValueError(f"{type(self).__name__}: repulsive={self.repulsive} must not be negative")
 
-    def init(self, n_envs: int) -> Array:
+    def init(self, n_envs: int) -> Any:
         """Returns the processes of ``n_envs`` environments at the start of an episode, ``(n_envs, action_dim)``."""
-        return jnp.tile(_row(self.initial_noise), (n_envs, 1))
+        return np.tile(_row(self.initial_noise), (n_envs, 1))
 
-    def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
-        """Returns the processes after one step, and ``action`` plus their values, not yet clipped to [-1, 1]."""
-        kick = _row(self.sigma) * math.sqrt(self.dt) * jax.random.normal(key, state.shape)
+    def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
+        kick = _row(self.sigma) * math.sqrt(self.dt) * normal
         state = state + self.theta * (_row(self.mean) - state) * self.dt + kick
         action = action + state
         state = state + _row(self.drift) * self.dt
         if max(self.repulsive) > 0:
-            push = jnp.clip(_row(self.repulsive) * barrier_slope(action), -jnp.abs(action), jnp.abs(action))
+            push = (_row(self.repulsive) * barrier_slope(action)).clip(-abs(action), abs(action))
             state, action = state - push, action - push
         return state, action
 
 
-def barrier_slope(action: Array) -> Array:
-    """Returns the derivative of the barrier ``(pi u / 2)^6``, which is flat within [-1, 1] and steep beyond."""
+def barrier(action: Any) -> Any:
+    """Returns the repulsive barrier ``B(u) = (pi u / 2)^6``, which is flat within [-1, 1] and steep beyond.
+
+    >>> float(barrier(2 / math.pi))
+    1.0
+    """
+    return (0.5 * math.pi * action) ** 6
+
+
+def barrier_slope(action: Any) -> Any:
+    """Returns the barrier's derivative ``B'(u) = 3 pi (pi u / 2)^5``: the push for a ``repulsive`` of 1."""
     return 3.0 * math.pi * (0.5 * math.pi * action) ** 5
 
 
-ActionNoise = NormalActionNoise | OrnsteinUhlenbeckActionNoise
-Noise = ActionNoise | ParameterNoise
+Noise = NormalActionNoise | OrnsteinUhlenbeckActionNoise | ParameterNoise
 NOISES: dict[str, type[NormalActionNoise] | type[OrnsteinUhlenbeckActionNoise] | type[ParameterNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -177,8 +253,8 @@ def check_fits(noise: Noise | None, action_space: spaces.Space) -> None:
         )
 
 
-def _row(values: tuple[float, ...]) -> Array:
-    return jnp.array([values], jnp.float32)
+def _row(values: tuple[float, ...]) -> np.ndarray:
+    return np.array([values], np.float32)
 
 
 def _check_dtype(noise: Any, dtype: Any) -> None:

@@ -1,5 +1,5 @@
 """Noise on actions."""
 
-from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from rejeu.exploration.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
-__all__ = ["NormalActionNoise", "OrnsteinUhlenbeckActionNoise"]
+__all__ = ["ActionNoise", "NormalActionNoise", "OrnsteinUhlenbeckActionNoise"]
