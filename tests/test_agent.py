@@ -235,6 +235,16 @@ def test_the_window_of_statistics_keeps_the_last_episodes():
     assert agent.statistics()["rollout/ep_len_mean"] == 2.0
 
 
+@pytest.mark.parametrize("window", [1, 200])
+def test_best_weights_are_kept_from_the_20th_episode_on_whatever_the_window_of_statistics(window):
+    """Returns grow with the episode, so the last 20 are always the best so far: at the 25th, those of episodes 5 to 24."""
+    agent = small_sac(counters(1, (2,)), learning_starts=NEVER, stats_window_size=window).learn(2 * 19)
+    assert agent.best is None
+    agent.learn(2 * 6)
+    assert agent.best.score == pytest.approx(np.mean([2 * 100 * k + 1 for k in range(5, 25)]))
+    assert (agent.best.by, agent.best.step) == ("training", 50)
+
+
 def test_success_is_counted_where_the_environment_tells():
     agent = small_sac(Reach(), learning_starts=NEVER).learn(40)
     assert len(agent.ep_success_buffer) == 4

@@ -261,6 +261,13 @@ def test_envpool_knows_its_time_limit():
     vector.close()
 
 
+def test_envpool_environments_without_a_time_limit_have_none():
+    """EnvPool says 2,147,483,647 of them."""
+    vector = EnvPool("CliffWalking-v0", 1, seed=0)
+    assert vector.max_episode_steps is None
+    vector.close()
+
+
 # Success.
 
 

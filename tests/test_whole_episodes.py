@@ -192,6 +192,12 @@ def test_a_time_limit_sets_how_long_a_rollout_may_be():
     assert agent.n_updates == 1
 
 
+def test_without_a_time_limit_n_steps_says_how_long_a_rollout_may_be():
+    """EnvPool's CliffWalking-v0 has none; 8 GiB were once reserved for it."""
+    agent = small(make_vector("CliffWalking-v0", 1, "envpool", seed=0), n_episodes=2, n_steps=8).learn(40)
+    assert agent._run.replay.n_steps == 2 * 8
+
+
 @pytest.mark.parametrize("value", [0, -1, 1.5, True])
 def test_a_bad_number_of_episodes_is_refused(value):
     with pytest.raises((TypeError, ValueError), match="n_episodes"):

@@ -31,9 +31,9 @@ class Best(NamedTuple):
 
 def note_training_return(agent: Agent) -> None:
     """Keeps the present weights if the mean of the last episodes' returns is the best so far."""
-    returns = [e["r"] for e in agent.ep_info_buffer]
-    if len(returns) >= BEST_WINDOW and (agent.best is None or agent.best.by == "training"):
-        agent.remember_best(float(np.mean(returns[-BEST_WINDOW:])), "training")
+    returns = [episode.episode_return for episode in agent.history.last(BEST_WINDOW)]
+    if len(returns) == BEST_WINDOW and (agent.best is None or agent.best.by == "training"):
+        agent.remember_best(float(np.mean(returns)), "training")
 
 
 def remember(agent: Agent, score: float | tuple[float, ...], by: str) -> bool:

@@ -14,6 +14,9 @@ from rejeu.envs.registry import make_env, provider, register, unknown_environmen
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, leaves
 
+NO_LIMIT = 2**31 - 1
+"""What EnvPool says of the length of episodes that have no time limit."""
+
 
 class EnvPool(VectorEnv):
     """Environments of the EnvPool package, stepped by C++ threads."""
@@ -26,7 +29,8 @@ class EnvPool(VectorEnv):
         self._pool = self._make(seed)
         self.observation_space = _bounded_rightly(self._pool.observation_space)
         self.action_space = self._pool.action_space
-        self.max_episode_steps = int(self._pool.spec.config.max_episode_steps)
+        limit = int(self._pool.spec.config.max_episode_steps)
+        self.max_episode_steps = None if limit >= NO_LIMIT else limit
         self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
         self._leaves = leaves(self.observation_space)
 
