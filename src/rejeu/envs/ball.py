@@ -50,7 +50,8 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
     Args:
         dimension: of the box.
         sigma: standard deviation of the random push in each dimension and step.
-        render_mode: ``"rgb_array"`` or ``"human"``; one dimension is drawn as position against time, two as a plane.
+        render_mode: ``"rgb_array"`` or ``"human"``; one dimension is drawn as position against time, two as a plane,
+            more as the plane of the first two beside every coordinate against time (the first ten).
 
     Raises:
         ValueError: for a dimension below 1, a negative sigma or an unknown render mode.
@@ -164,13 +165,11 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         """Returns the picture, ``uint8 (height, width, 3)``, or None where it is shown on the screen.
 
         Raises:
-            ValueError: if it was made without a render mode, or has more than two dimensions.
+            ValueError: if it was made without a render mode.
             MissingExtra: if pygame is not installed.
         """
         if self.render_mode is None:
             raise ValueError("nothing is drawn without a render mode: gymnasium.make(..., render_mode='rgb_array')")
-        if self.dimension > 2:
-            raise ValueError(f"a ball in {self.dimension} dimensions cannot be drawn; dimension=1 and 2 can")
         if self._drawing is None:
             self._drawing = BallDrawing(self.dimension, self.render_mode, self.metadata["render_fps"], WALL, N_STEPS)
         return self._drawing.draw(self._trail, self._push, self.n_steps, self.over)

@@ -1,9 +1,12 @@
-"""How the ball is drawn: position against time in one dimension, the plane in two."""
+"""How the ball is drawn: position against time in one dimension, the plane in two.
+
+In more, the plane of the first two coordinates with every coordinate against time beside it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +25,24 @@ FADING = 80
 """Steps over which the trail fades."""
 MARGIN = 2.2
 """What is seen beyond the walls, in units of position."""
-SIZES = {1: (900, 460), 2: (620, 666)}
-"""Width and height of the picture in pixels, by dimension; even, as videos want them."""
+LINE_SIZE, PLANE_SIZE, STRIPS_WIDTH = (900, 460), (620, 666), 320
+"""Width and height in pixels of the picture in one dimension and of the plane; even, as videos want them."""
+MOST_STRIPS = 10
+"""Most coordinates that are drawn against time beside the plane."""
+
+
+class Strip(NamedTuple):
+    """Where one coordinate is drawn against time, in pixels."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def place(self, share: float, height: float) -> Point:
+        """Returns the pixel at a share of the time in [0, 1] and a height from -1 (bottom) to 1 (top)."""
+        y = 0.5 * (self.top + self.bottom) - 0.5 * height * (self.bottom - self.top)
+        return self.left + share * (self.right - self.left), y
 
 
 class BallDrawing:
@@ -44,9 +63,10 @@ class BallDrawing:
         self.fps = fps
         self.wall = wall
         self.n_steps = n_steps
-        self.size = width, height = SIZES[dimension]
+        width, height = LINE_SIZE if dimension == 1 else PLANE_SIZE
+        self.size = (width + STRIPS_WIDTH if dimension > 2 else width, height)
         pygame.font.init()
-        self.canvas = pygame.Surface((width * FINE, height * FINE))
+        self.canvas = pygame.Surface((self.size[0] * FINE, height * FINE))
         self.font = pygame.font.Font(None, 22 * FINE)
         self.large_font = pygame.font.Font(None, 30 * FINE)
         self.window: Any = None
@@ -58,6 +78,12 @@ class BallDrawing:
         self.left, self.top = (64, 72) if dimension == 1 else (46, 76)
         self.right, self.bottom = width - 26, height - (48 if dimension == 1 else 42)
         self._draw_field()
+        self.strips = self._strips() if dimension > 2 else []
+        if self.strips:
+            self._text("x1", (self.right - 4, self.bottom + 15), FAINT, "right")
+            self._text("x2", (self.left - 9, self.top + 8), FAINT, "right")
+        for i, strip in enumerate(self.strips):
+            self._draw_strip(i, strip)
         self.field = self.canvas.copy()
 
     def draw(self, trail: Sequence[Sequence[float]], push: Sequence[float], step: int, over: bool) -> np.ndarray | None:
@@ -74,7 +100,9 @@ class BallDrawing:
             if len(push) and len(points) > 1:
                 self._draw_push(points[-2], push)
             self._draw_ball(points[-1], colour)
-        self._draw_caption(step, colour, over, lost)
+        for i, strip in enumerate(self.strips):
+            self._draw_course(strip, [position[i] for position in trail], step, colour)
+        self._draw_caption(self._caption(trail, step, over, lost), step, colour if over else INK, colour)
         picture = self.pygame.transform.smoothscale(self.canvas, self.size)
         if self.window is None:
             return np.ascontiguousarray(self.pygame.surfarray.array3d(picture).swapaxes(0, 1))
@@ -119,7 +147,7 @@ class BallDrawing:
             self._line((self._x(west), self._y(tick)), (self._x(east), self._y(tick)), GRID, 1.2)
             self._text(_number(tick), (self.left - 9, self._y(tick)), FAINT, "right")
         for tick in range(0, self.n_steps + 1, self.n_steps // 5) if self.dimension == 1 else ticks:
-            if self.dimension == 2 or tick > 0:
+            if self.dimension > 1 or tick > 0:
                 self._line((self._x(tick), self._y(-wall)), (self._x(tick), self._y(wall)), GRID, 1.2)
             self._text(_number(tick), (self._x(tick), self.bottom + 15), FAINT, "centre")
         corners = [(self._x(x), self._y(y)) for x, y in ((west, wall), (east, wall), (east, -wall), (west, -wall))]
@@ -164,9 +192,49 @@ class BallDrawing:
             shift, tint = 0.33 * radius * share, 0.75 * share**2
             self._disc((centre[0] - shift, centre[1] - shift), radius * (1 - 0.85 * share), _mix(colour, INSIDE, tint))
 
-    def _draw_caption(self, step: int, colour: Colour, over: bool, lost: bool) -> None:
-        said = f"lost in step {step}" if lost else f"held for {step} steps" if over and step else f"step {step}"
-        self._text(said, (self.left, 30), colour if over else INK, "left", self.large_font)
+    def _strips(self) -> list[Strip]:
+        """Returns the places of the coordinates against time, in the height of the plane."""
+        n = min(self.dimension, MOST_STRIPS)
+        left, right, gap = self.right + 74.0, self.size[0] - 26.0, 12.0
+        height = (self.bottom - self.top - gap * (n - 1)) / n
+        tops = [self.top + i * (height + gap) for i in range(n)]
+        return [Strip(left, top, right, top + height) for top in tops]
+
+    def _draw_strip(self, coordinate: int, strip: Strip) -> None:
+        """Draws what stays as it is of one coordinate against time: the box, its walls, and which coordinate it is."""
+        wall = self.wall / (self.wall + MARGIN)
+        self._rectangle((strip.left, strip.top), (strip.right, strip.bottom), OUTSIDE)
+        self._rectangle(strip.place(0, wall), strip.place(1, -wall), INSIDE)
+        self._line(strip.place(0, 0), strip.place(1, 0), GRID, 1.2)
+        for height in (-wall, wall):
+            self._line(strip.place(0, height), strip.place(1, height), INK, 1.6)
+        self._text(f"x{coordinate + 1}", (strip.left - 9, strip.place(0, 0)[1]), FAINT, "right")
+        if coordinate == len(self.strips) - 1:
+            for share in (0.0, 0.5, 1.0):
+                place = strip.place(share, 0)[0], self.bottom + 15
+                self._text(_number(share * self.n_steps), place, FAINT, "centre")
+        if coordinate == 0 and self.dimension > len(self.strips):
+            self._text(f"{len(self.strips)} of {self.dimension} coordinates", (strip.right, 30), FAINT, "right")
+
+    def _draw_course(self, strip: Strip, values: Sequence[float], step: int, colour: Colour) -> None:
+        """Draws one coordinate's values up to ``step``."""
+        reach, first = self.wall + MARGIN, step - len(values) + 1
+        heights = [min(max(value / reach, -1.0), 1.0) for value in values]
+        points = [strip.place((first + i) / self.n_steps, height) for i, height in enumerate(heights)]
+        if len(points) > 1:
+            self.pygame.draw.lines(self.canvas, NEW_TRAIL, False, [(x * FINE, y * FINE) for x, y in points], FINE)
+        if points:
+            self._disc(points[-1], 4.0, colour)
+
+    def _caption(self, trail: Sequence[Sequence[float]], step: int, over: bool, lost: bool) -> str:
+        """Returns what is written above the plane; in more dimensions than it shows, where the ball left."""
+        if not lost:
+            return f"held for {step} steps" if over and step else f"step {step}"
+        left = [f"x{i + 1}" for i, x in enumerate(trail[-1]) if abs(x) > self.wall]
+        return f"lost in step {step}" + (f" by {', '.join(left)}" if self.dimension > 2 else "")
+
+    def _draw_caption(self, said: str, step: int, ink: Colour, colour: Colour) -> None:
+        self._text(said, (self.left, 30), ink, "left", self.large_font)
         self._text(f"of {self.n_steps}", (self.right, 30), FAINT, "right")
         self._rectangle((self.left, 50), (self.right, 55), GRID)
         filled = self.left + (self.right - self.left) * min(step / self.n_steps, 1.0)
