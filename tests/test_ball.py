@@ -216,7 +216,7 @@ def test_in_three_dimensions_the_third_coordinate_is_drawn_where_it_is():
     middle, low = (ball.render().astype(int) for ball in balls)
     assert middle.shape[0] % 2 == middle.shape[1] % 2 == 0  # for videos
     drawing = balls[0]._drawing
-    plane, (first, second, third) = round(drawing.right), drawing.strips
+    plane, (_, second, third) = round(drawing.right), drawing.strips
     assert (middle[:, :plane] == low[:, :plane]).all()
     assert (middle[: int(second.bottom)] == low[: int(second.bottom)]).all()
     for frame, height in ((middle, 0.0), (low, -5.0 / 12.2)):  # the strip shows 2.2 beyond the walls at 10
