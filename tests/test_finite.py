@@ -93,20 +93,22 @@ def replace_update(agent, which, instead):
 def poison(agent, which, value):
     """Puts ``value`` into a reward of the ``which``-th sample or rollout, so that what is saved is what was learnt from."""
     buffer, calls = agent._run.replay, []
-    name = "rollout" if isinstance(buffer, RolloutBuffer) else "sample"
+    name = "rollout" if isinstance(buffer, RolloutBuffer) else "draw"
     method = getattr(buffer, name)
 
     def poisoned(*arguments):
-        data = method(*arguments)
+        answer = method(*arguments)
+        data, *drawn = answer if name == "draw" else (answer,)
         calls.append(data)
         if len(calls) != which + 1:
-            return data
+            return answer
         rewards = np.array(data.reward)
         if rewards.ndim == 1:
             rewards[0] = value
         else:
             rewards[1, 0] = value  # of a scan its second batch, of a rollout its second step
-        return data._replace(reward=rewards)
+        data = data._replace(reward=rewards)
+        return (data, *drawn) if drawn else data
 
     setattr(buffer, name, poisoned)
 
@@ -417,8 +419,9 @@ def test_updates_that_are_all_skipped_are_an_error_in_the_end(tmp_path):
     agent.report_folder = tmp_path
     agent.learn(20)
     agent._run.replay.ring.records["reward"][:] = np.nan
-    sample = agent._run.replay.sample
-    agent._run.replay.sample = lambda *a: (lambda b: b._replace(reward=b.reward * np.float32(np.nan)))(sample(*a))
+    draw = agent._run.replay.draw
+    spoiled = lambda batch, drawn: (batch._replace(reward=batch.reward * np.float32(np.nan)), drawn)  # noqa: E731
+    agent._run.replay.draw = lambda *a: spoiled(*draw(*a))
     with pytest.raises(NonFiniteError, match=r"^100 updates in a row were skipped, .* the batch held reward") as caught:
         agent.learn(200)
     assert caught.value.batch.exists()
@@ -556,9 +559,9 @@ def test_td_errors_that_are_not_finite_leave_priorities_as_they_are(bad):
     ring.begin(np.zeros((1, 1), np.float32))
     for _ in range(4):
         priorities.add(*ring.add(np.zeros((1, 1)), np.zeros(1), np.zeros(1, bool), np.zeros((1, 1), np.float32)))
-    rows, _ = priorities.draw(np.random.default_rng(0), 4, 0.0)
+    rows, _, drawn = priorities.draw(np.random.default_rng(0), 4, 0.0)
     before = priorities.tree[rows.position].copy()
-    priorities.update([np.array([2.0, bad, 0.5, bad], np.float32)])
+    priorities.update([(drawn, np.array([2.0, bad, 0.5, bad], np.float32))])
     after = priorities.tree[rows.position]
     np.testing.assert_allclose(after, [2.001, before[1], 0.501, before[3]])
     assert priorities.largest == pytest.approx(2.001)

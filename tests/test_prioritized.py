@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import timeit
 
 import jax
@@ -11,12 +12,18 @@ from gymnasium import spaces
 from hypothesis import given, settings, strategies as st
 from scipy.stats import chisquare
 
+import rejeu
+from rejeu import checkpoint
+from rejeu.callbacks import Checkpoint
+from rejeu.envs.vector import InProcess
+from rejeu.errors import NonFiniteError
 from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer, HindsightConfig
 from rejeu.replay.prioritized import Priorities, PriorityConfig, SumTree
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
 from rejeu.schedules import Linear
 from rejeu.spaces import leaves, structure
+from tests.environments import Sampled
 
 NUMBER = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 GOALS = spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), NUMBER))
@@ -78,9 +85,9 @@ def hindsight(capacity: int, n_envs: int = 1, n_steps: int = 1, k: int = 0, **co
 
 
 def draw_all(buffer, rng, n: int = 512) -> np.ndarray:
-    """Returns the observations of a draw of ``n``, and answers its TD errors so that none are outstanding."""
-    batch = buffer.sample(rng, (n,))
-    buffer.reprioritise([np.ones(n)])
+    """Returns the observations of a draw of ``n``, and gives it TD errors of 1."""
+    batch, drawn = buffer.draw(rng, (n,))
+    buffer.reprioritise([(drawn, np.ones(n))])
     return jax.tree.leaves(batch.obs)[0][:, 0]
 
 
@@ -136,17 +143,15 @@ def give_td_errors(buffer, by_time: np.ndarray) -> None:
     rng = np.random.default_rng(1)
     unseen = set(range(len(by_time)))
     while unseen:
-        batch = buffer.sample(rng, (256,))
+        batch, drawn = buffer.draw(rng, (256,))
         times = jax.tree.leaves(batch.obs)[0][:, 0].astype(int)
-        buffer.reprioritise([by_time[times]])
+        buffer.reprioritise([(drawn, by_time[times])])
         unseen -= set(times.tolist())
 
 
 def draw_once(buffer, rng) -> np.ndarray:
     """Returns one step drawn; batches of one are independent, larger ones are stratified."""
-    batch = buffer.sample(rng, (1,))
-    buffer.priorities._drawn.pop()
-    return batch.obs[:, 0]
+    return buffer.sample(rng, (1,)).obs[:, 0]
 
 
 def test_every_equal_part_of_the_priorities_gives_one_step_of_a_batch():
@@ -181,11 +186,11 @@ def test_new_steps_get_the_largest_priority_so_far():
     story = Story(buffer)
     story.step()
     assert buffer.priorities.tree[0] == 1.0
-    buffer.sample(np.random.default_rng(0), (1,))
-    buffer.reprioritise([np.array([7.0])])
+    _, drawn = buffer.draw(np.random.default_rng(0), (1,))
+    buffer.reprioritise([(drawn, np.array([7.0]))])
     story.step()
-    buffer.sample(np.random.default_rng(0), (2,))
-    buffer.reprioritise([np.array([0.5, 0.5])])
+    _, drawn = buffer.draw(np.random.default_rng(0), (2,))
+    buffer.reprioritise([(drawn, np.array([0.5, 0.5]))])
     story.step()
     np.testing.assert_allclose(buffer.priorities.tree[np.arange(4)], [0.5 + 1e-6, 0.5 + 1e-6, 7 + 1e-6, 0])
 
@@ -195,11 +200,11 @@ def test_td_errors_of_steps_overwritten_meanwhile_are_passed_over():
     story = Story(buffer)
     for _ in range(3):
         story.step()
-    buffer.sample(np.random.default_rng(0), (3,))
+    _, drawn = buffer.draw(np.random.default_rng(0), (3,))
     story.step()
     story.step()
     before = buffer.priorities.tree[np.arange(4)].copy()
-    buffer.reprioritise([np.array([9.0, 9.0, 9.0])])
+    buffer.reprioritise([(drawn, np.array([9.0, 9.0, 9.0]))])
     kept = 2  # of the times 0, 1, 2 only 2 is left, in row 2
     expected = before.copy()
     expected[kept] = 9 + 1e-6
@@ -229,8 +234,8 @@ def test_exactly_the_steps_that_are_kept_can_be_drawn(rows, n_envs, course, kind
         story.step({env for env in ended if env < n_envs}, terminated)
         if learns and buffer.size():
             n = 16
-            buffer.sample(rng, (n,))
-            buffer.reprioritise([rng.random(n)])
+            _, drawn = buffer.draw(rng, (n,))
+            buffer.reprioritise([(drawn, rng.random(n))])
         can_be_drawn = np.flatnonzero(buffer.priorities.tree[np.arange(buffer.ring.rows * n_envs)] > 0)
         drawn = {float(buffer.ring.obs[0][i, 0]) for i in can_be_drawn}
         assert drawn == story.kept()
@@ -303,7 +308,20 @@ def test_relabelled_transitions_carry_high_and_low_priorities_alike():
     assert late[2000:].mean() == pytest.approx(0.9, abs=0.03)
 
 
-def test_a_restored_buffer_can_draw_all_its_steps_and_forgets_outstanding_draws():
+def test_td_errors_belong_to_their_draw_in_whatever_order_they_come():
+    buffer = uniform(64, alpha=1.0)
+    story = Story(buffer)
+    for _ in range(6):
+        story.step()
+    rng = np.random.default_rng(0)
+    draws = [buffer.draw(rng, (6,)) for _ in range(4)]  # equal priorities: each draw has every step once
+    for batch, drawn in (draws[2], draws[0]):  # the others are never answered
+        buffer.reprioritise([(drawn, batch.obs[:, 0] + 1.0)])
+        np.testing.assert_allclose(buffer.priorities.tree[np.arange(6)], np.arange(6) + 1.0, rtol=1e-5)
+        buffer.reprioritise([(drawn, np.ones(6))])
+
+
+def test_a_restored_buffer_can_draw_all_its_steps_and_ignores_td_errors_of_earlier_draws():
     buffer, other = uniform(16, 2), uniform(16, 2)
     story, stale = Story(buffer), Story(other)
     for t in range(15):
@@ -311,13 +329,13 @@ def test_a_restored_buffer_can_draw_all_its_steps_and_forgets_outstanding_draws(
     for _ in range(3):
         stale.step()
     rng = np.random.default_rng(0)
-    other.sample(rng, (4,))
+    _, stale_draw = other.draw(rng, (4,))
     other.restore(buffer.arrays())
-    first = other.sample(rng, (512,))
+    first, drawn = other.draw(rng, (512,))
     assert set(first.obs[:, 0].tolist()) == story.kept()
-    other.reprioritise([np.full(4, 100.0)])  # answers the draw from what is gone
+    other.reprioritise([(stale_draw, np.full(4, 100.0))])
     assert other.priorities.tree.total == pytest.approx(other.size())
-    other.reprioritise([np.full(512, 3.0)])
+    other.reprioritise([(drawn, np.full(512, 3.0))])
     assert other.priorities.tree.total == pytest.approx(other.size() * (3 + 1e-6) ** 0.6)
 
 
@@ -343,3 +361,103 @@ def test_drawing_and_setting_take_time_in_the_logarithm_of_the_size():
 def test_settings_out_of_range_are_refused_by_name(setting, message):
     with pytest.raises(ValueError, match=message):
         PriorityConfig(**setting)
+
+
+def small_dqn(**settings) -> rejeu.DQN:
+    """A DQN whose updates report as TD error of each step the first number of its observation, drawn from [0, 1)."""
+    env = InProcess([Sampled(spaces.Box(0.0, 1.0, (3,)), spaces.Discrete(3))], seed=0)
+    settings = {"train_freq": 1, "gradient_steps": 1, **settings, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
+    agent = rejeu.DQN("MlpPolicy", env, learning_starts=8, batch_size=4, buffer_size=300, priorities={}, **settings)
+    update = agent._compiled.update
+    agent._compiled.update = lambda state, batch, clock: (*update(state, batch, clock)[:2], batch.obs[..., 0])
+    return agent
+
+
+def fail_once(agent: rejeu.DQN, which: int, instead) -> None:
+    """Lets the ``which``-th draw from now on, counted from 0, be ``instead(batch, drawn)``."""
+    draw, numbers = agent.replay_buffer.draw, itertools.count()
+
+    def drawing(*arguments):
+        answer = draw(*arguments)
+        return instead(*answer) if next(numbers) == which else answer
+
+    agent.replay_buffer.draw = drawing
+
+
+def not_a_number(batch, drawn):
+    return batch._replace(reward=batch.reward * np.float32(np.nan)), drawn
+
+
+def compute_reward_fails(batch, drawn):
+    raise RuntimeError("compute_reward")
+
+
+def assert_priorities_are_of_their_steps(agent: rejeu.DQN, least: int) -> None:
+    """Fails unless all steps have the priority of their own TD error or, being new, the largest, which is 1."""
+    ring, tree = agent.replay_buffer.ring, agent.replay_buffer.priorities.tree
+    index = np.flatnonzero(tree[np.arange(ring.rows)] > 0)
+    own = (ring.obs[0][index, 0].astype(np.float64) + 1e-6) ** 0.6
+    known = tree[index] != 1.0
+    np.testing.assert_allclose(tree[index][known], own[known], rtol=1e-6)
+    assert known.sum() >= least
+
+
+def assert_resumes(agent: rejeu.DQN, folder) -> None:
+    """Fails unless a checkpoint of the run, taken now, can be resumed with everything that is outstanding."""
+    assert agent._run.td_errors
+    Checkpoint(folder).save(agent)
+    env = InProcess([Sampled(spaces.Box(0.0, 1.0, (3,)), spaces.Discrete(3))], seed=0)
+    with pytest.warns(UserWarning, match="at the start of new episodes"):
+        again = rejeu.DQN.resume(folder, env)
+    for (draw, td_error), (other, same) in zip(agent._run.td_errors, again._run.td_errors, strict=True):
+        np.testing.assert_array_equal(draw.position, other.position)
+        np.testing.assert_array_equal(draw.time, other.time)
+        np.testing.assert_array_equal(td_error, same)
+
+
+def test_after_an_update_that_was_not_finite_td_errors_still_belong_to_their_steps(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent = small_dqn()
+    fail_once(agent, 10, not_a_number)
+    with pytest.raises(NonFiniteError):
+        agent.learn(60)
+    agent.learn(60)
+    assert_priorities_are_of_their_steps(agent, least=20)
+    assert_resumes(agent, tmp_path / "run")
+
+
+def test_after_a_draw_that_raised_td_errors_still_belong_to_their_steps(tmp_path):
+    agent = small_dqn(train_freq=(1, "episode"), gradient_steps=-1)
+    fail_once(agent, 8, compute_reward_fails)  # the fourth of the five of a turn
+    with pytest.raises(RuntimeError, match="compute_reward"):
+        agent.learn(60)
+    agent.learn(60)
+    assert_priorities_are_of_their_steps(agent, least=20)
+    assert_resumes(agent, tmp_path / "run")
+
+
+def test_a_loaded_replay_buffer_forgets_the_td_errors_of_the_one_before(tmp_path):
+    agent = small_dqn().learn(60)
+    agent.save_replay_buffer(tmp_path / "replay")
+    agent.load_replay_buffer(tmp_path / "replay")
+    Checkpoint(tmp_path / "run").save(agent)
+    with pytest.warns(UserWarning, match="none was under way"):
+        assert rejeu.DQN.resume(tmp_path / "run", agent.env)._run.td_errors == []
+    agent.learn(60)
+    assert_priorities_are_of_their_steps(agent, least=20)
+
+
+def test_checkpoints_in_which_draws_have_lost_their_td_errors_are_read(tmp_path):
+    """Older versions wrote such after an error: the draws ahead of the others had no TD errors any more."""
+    agent = small_dqn().learn(40)
+    path = Checkpoint(tmp_path).save(agent)
+    (draw, td_error), steps = agent._run.td_errors[0], np.arange(4)
+    header, arrays = checkpoint.read(path, "run")
+    drawn = header["run"]["dict"]["buffer"]["dict"]["priorities"]["dict"]["drawn"]
+    drawn.insert(0, [{"array": "lost"}, {"array": "lost"}])
+    kept = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
+    checkpoint.write(path, "run", {**arrays, "lost": steps}, kept)
+    with pytest.warns(UserWarning, match="at the start of new episodes"):
+        ((same, error),) = rejeu.DQN.resume(tmp_path, agent.env)._run.td_errors
+    np.testing.assert_array_equal(same.position, draw.position)
+    np.testing.assert_array_equal(error, td_error)

@@ -37,8 +37,9 @@ def rejeu_sampler(what: str, size: int) -> Any:
 
     def draw_and_update() -> None:
         nonlocal turn
-        replay.sample(rng, (BATCH,), 0.5)
-        replay.reprioritise([td_errors[turn % len(td_errors)]])
+        _, drawn = replay.draw(rng, (BATCH,), 0.5)
+        assert drawn is not None
+        replay.reprioritise([(drawn, td_errors[turn % len(td_errors)])])
         turn += 1
 
     return draw_and_update

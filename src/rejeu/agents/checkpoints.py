@@ -282,7 +282,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "reason": "" if run.seed is not None and run.obs is None else reason,
         "metrics": None if run.metrics is None else {key: np.asarray(value) for key, value in run.metrics.items()},
         "n_skipped": run.watch.n_skipped,
-        "td_errors": leaves(run.td_errors),
+        "td_errors": leaves([td_error for _, td_error in run.td_errors]),
         "seconds": {key: float(value) for key, value in run.seconds.items()},
         "buffer": buffer_content(run),
         "history": agent.history.table(),
@@ -309,7 +309,10 @@ def buffer_content(run: Run) -> dict[str, Any]:
     buffer = run.replay
     if isinstance(buffer, RolloutBuffer):
         return {"rollout": buffer.arrays(), "started": buffer.started, "carry": leaves(buffer.carry)}
-    priorities = None if buffer.priorities is None else buffer.priorities.state()
+    priorities = None
+    if buffer.priorities is not None:
+        drawn = [[draw.position, draw.time] for draw, _ in run.td_errors]
+        priorities = {**buffer.priorities.state(), "drawn": drawn}
     return {"heads": buffer.ring.head, "priorities": priorities}
 
 

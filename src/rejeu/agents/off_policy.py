@@ -66,6 +66,7 @@ class OffPolicyAgent(Agent):
             raise CheckpointError(f"{path}: {loading.brief(error)}") from None
         self._run.learn_from = self.config.learning_starts
         self._run.obs = self._run.action = None
+        self._run.td_errors = []  # of steps that are gone
 
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return make_vector(env, n_envs, backend, seed)

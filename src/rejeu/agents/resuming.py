@@ -12,6 +12,7 @@ import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from rejeu import checkpoint, plain, spaces
 from rejeu.agents import files, loading
@@ -24,6 +25,7 @@ from rejeu.envs.vector import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.loops.host import Run, is_finite
 from rejeu.loops.packing import Readings
+from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.rollout import RolloutBuffer
 
 if TYPE_CHECKING:
@@ -184,13 +186,15 @@ def restore(
         metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved["metrics"].items()}
         run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
     run.watch.n_skipped = whole("n_skipped", saved["n_skipped"], least=0)
-    run.td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved["td_errors"]]
+    td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved["td_errors"]]
     run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
     for key in PER_ENV:
         setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
     for part in rows:
         spaces.check_actions(agent.action_space, part["action"], "a file of rows")
     restore_buffer(run, saved["buffer"], rows, compiled.initial_carry(n_envs), begun=saved["envs"] is not None)
+    if saved["buffer"].get("priorities") is not None:
+        run.td_errors = with_draws(run.replay.priorities, saved["buffer"]["priorities"]["drawn"], td_errors)
     if isinstance(run.replay, RolloutBuffer):
         spaces.check_actions(agent.action_space, saved["buffer"]["rollout"]["action"], "the rollout")
     if saved["envs"] is not None:
@@ -275,8 +279,24 @@ def restore_buffer(
         raise ValueError("rows of the replay buffer are missing")
     if buffer.priorities is not None:
         buffer.priorities.restore(saved["priorities"])
-        if [error.size for error in run.td_errors] != [len(index) for index, _ in saved["priorities"]["drawn"]]:
-            raise ValueError("the TD errors under way are not those of the steps that were drawn")
+
+
+def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Array]) -> list[tuple[Draw, Array]]:
+    """Returns TD errors beside the draws that they belong to.
+
+    Older versions could save more draws than TD errors, or draws of no steps, after an error or after
+    ``load_replay_buffer``: the first draws have then lost their TD errors, and draws of no steps their meaning.
+
+    Raises:
+        ValueError: if they do not belong together, or are of another replay buffer.
+    """
+    draws = [priorities.draw_of(index, time) for index, time in drawn]
+    if len(draws) < len(td_errors):
+        raise ValueError("the TD errors under way are not those of the steps that were drawn")
+    pairs = list(zip(draws[len(draws) - len(td_errors) :], td_errors, strict=True))
+    if any(len(draw.position) not in (0, td_error.size) for draw, td_error in pairs):
+        raise ValueError("the TD errors under way are not those of the steps that were drawn")
+    return [(draw, td_error) for draw, td_error in pairs if len(draw.position)]
 
 
 def text(value: Any) -> str:

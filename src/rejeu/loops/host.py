@@ -20,6 +20,7 @@ from rejeu.envs.vector import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError, NonFiniteError
 from rejeu.loops.compiled import Compiled, PackedState
 from rejeu.loops.watch import Watch
+from rejeu.replay.prioritized import Draw
 from rejeu.spaces import leaves
 
 VDOT_SIZE = 2**13
@@ -106,8 +107,9 @@ class Run:
     running_return: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     """The discounted sum of each running episode's rewards, ``sum_k gamma^k r_{t-k}``, for scaling rewards."""
     metrics: Mapping[str, Array] | None = None
-    td_errors: list[Array] = field(default_factory=list)
-    """Of the newest updates, on their way to the priorities of the replay buffer, which get them one turn later."""
+    td_errors: list[tuple[Draw, Array]] = field(default_factory=list)
+    """Of the newest updates, each beside the draw that it learned from; they set the priorities of the replay buffer one
+    turn later."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*PARTS, "total"), 0.0))
     """Wall time by what it went into; ``update`` is the time that the loop waited for the device."""
     watch: Watch = field(default_factory=Watch)

@@ -102,15 +102,15 @@ def off_policy(
             chosen = choose_or_draw(run, compiled, config, clock)
         t5 = time.perf_counter()
         shapes = [(config.batch_size,) if size == 1 else (size, config.batch_size) for size in sizes]
-        samples = [run.replay.sample(run.rng, shape, done) for shape in shapes]
+        samples = [run.replay.draw(run.rng, shape, done) for shape in shapes]
         t6 = time.perf_counter()
         run.replay.reprioritise(run.td_errors)
         run.td_errors = []
         n_before = len(run.watch)
-        for batch in samples:
+        for batch, drawn in samples:
             td_error = run.watch.update(run, compiled, batch, clock)
             if td_error is not None:
-                run.td_errors.append(td_error)
+                run.td_errors.append((drawn, td_error))
         run.n_updates += n_updates
         if not config.overlap:
             chosen = choose_or_draw(run, compiled, config, clock)

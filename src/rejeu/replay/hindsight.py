@@ -16,7 +16,7 @@ kept as it was elsewhere: a crash remains a crash.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.core import Transition
-from rejeu.replay.prioritized import Priorities
+from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.ring import TERMINATED, Ring, Rows
 from rejeu.replay.uniform import batch, begin, bootstrap_discount, discounted_sum, discounts_by_kind, draw, look_ahead
 
@@ -143,8 +143,14 @@ class HerReplayBuffer:
 
         Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances, ``progress`` anneals the weights.
         """
+        return self.draw(rng, shape, progress)[0]
+
+    def draw(
+        self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
+    ) -> tuple[Transition, Draw | None]:
+        """Returns what :meth:`sample` does and, with priorities, what :meth:`reprioritise` takes; None without."""
         ring, k = self.ring, self.config.n_sampled_goal
-        rows, weight = draw(ring, self.priorities, rng, math.prod(shape), progress)
+        rows, weight, drawn = draw(ring, self.priorities, rng, math.prod(shape), progress)
         step, obs = ring.read(rows.position)
         relabelled = relabelled_positions(shape, k)
 
@@ -164,10 +170,10 @@ class HerReplayBuffer:
                     discount[relabelled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
         obs[self.desired][relabelled] = goal
         next_obs[self.desired][relabelled] = goal
-        return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight)
+        return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight), drawn
 
-    def reprioritise(self, td_errors: list[Any]) -> None:
-        """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
+    def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+        """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
         if self.priorities is not None:
             self.priorities.update(td_errors)
 

@@ -8,10 +8,9 @@ the largest priority so far.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +36,17 @@ class PriorityConfig:
             raise ValueError(f"alpha={self.alpha!r} must be from 0 to 1")
         if not self.epsilon > 0:
             raise ValueError(f"epsilon={self.epsilon!r} must be positive")
+
+
+class Draw(NamedTuple):
+    """Which steps a batch was made of: what their TD errors are given back with."""
+
+    position: np.ndarray
+    """Their positions in the ring, ``int64 (n,)``."""
+    time: np.ndarray
+    """Their absolute times, ``int64 (n,)``, which tell whether they have been overwritten since."""
+    version: int
+    """:attr:`Ring.version` when they were drawn; in a ring that was restored since, other steps are there."""
 
 
 class SumTree:
@@ -95,16 +105,16 @@ class Priorities:
         self.tree = SumTree(ring.rows * ring.n_envs)
         self.largest = 1.0
         """The largest priority so far, which new steps get."""
-        self._drawn: deque[tuple[np.ndarray, np.ndarray]] = deque()
-        """Positions and times of the steps whose TD errors are still to come, one entry a draw."""
 
     def add(self, index: np.ndarray, following: np.ndarray) -> None:
         """Notes new steps at ``index``, and that the rows ``following`` are heads, which cannot be drawn."""
         self.tree.set(following, 0.0)
         self.tree.set(index, self.largest)
 
-    def draw(self, rng: np.random.Generator, n: int, progress: float) -> tuple[Rows, np.ndarray]:
+    def draw(self, rng: np.random.Generator, n: int, progress: float) -> tuple[Rows, np.ndarray, Draw]:
         """Returns ``n`` steps, one from each of ``n`` equal parts of the total priority, and weights ``float32 (n,)``.
+
+        Nothing is remembered of it: the third value is what :meth:`update` takes beside the TD errors of these steps.
 
         Raises:
             ValueError: if there is none.
@@ -119,17 +129,17 @@ class Priorities:
         time = head - (head - index % ring.rows) % ring.rows
         probability = tree[index] / tree.total
         weight = (len(ring) * probability) ** -float(schedules.at(self.config.beta, progress))
-        self._drawn.append((index, time))
-        return Rows(env, time, index, ring.kind.take(index)), weight.astype(np.float32)
+        rows = Rows(env, time, index, ring.kind.take(index))
+        return rows, weight.astype(np.float32), Draw(index, time, ring.version)
 
-    def update(self, td_errors: Iterable[np.ndarray]) -> None:
-        """Takes the absolute TD errors of the oldest draws; of steps overwritten since then they are passed over.
+    def update(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+        """Sets the priorities of drawn steps by their absolute TD errors, ``(n,)`` in any shape of that size.
 
-        So are those that are not finite: such a step keeps the priority that it has. One NaN would make all sums NaN.
+        TD errors of steps that were overwritten since are ignored. So are those that are not finite: such a step keeps
+        the priority that it has, because one NaN would make all sums NaN.
         """
-        for td_error in td_errors:
-            index, time = self._drawn.popleft()
-            if not len(index):  # drawn from what the ring held before it was restored
+        for (index, time, version), td_error in td_errors:
+            if version != self.ring.version:
                 continue
             priority = (np.asarray(td_error, np.float64).ravel() + self.config.epsilon) ** self.config.alpha
             head = self.ring.head[index // self.ring.rows]
@@ -142,8 +152,7 @@ class Priorities:
     def state(self) -> dict[str, Any]:
         """Returns everything, for :meth:`restore`."""
         n = self.ring.rows * self.ring.n_envs
-        drawn = [list(draw) for draw in self._drawn]
-        return {"values": self.tree[np.arange(n)], "largest": self.largest, "drawn": drawn}
+        return {"values": self.tree[np.arange(n)], "largest": self.largest}
 
     def restore(self, state: Mapping[str, Any] | None = None) -> None:
         """Puts back what :meth:`state` returned, or gives every step of the ring the largest priority.
@@ -152,15 +161,9 @@ class Priorities:
             KeyError, ValueError: if the state is damaged, or of another ring.
         """
         if state is not None:
-            values, drawn = state["values"], [(index, time) for index, time in state["drawn"]]
+            values = state["values"]
             steps = self._step_positions()
-            within = all(
-                i.dtype == t.dtype == np.int64
-                and i.shape == t.shape == (len(i),)
-                and ((i >= 0) & (i < len(values))).all()
-                for i, t in drawn
-            )
-            if values.shape != (self.ring.rows * self.ring.n_envs,) or values.dtype != np.float64 or not within:
+            if values.shape != (self.ring.rows * self.ring.n_envs,) or values.dtype != np.float64:
                 raise ValueError("the priorities are of another replay buffer")
             largest = float(state["largest"])
             most = float(np.finfo(np.float64).max) / self.tree.n_leaves  # so that their sum is finite
@@ -170,14 +173,22 @@ class Priorities:
                 raise ValueError("the priorities do not belong to the steps of this replay buffer")
             self.tree.fill(values)
             self.largest = largest
-            self._drawn = deque(drawn)
             return
-        nowhere = np.zeros(0, np.int64)
-        self._drawn = deque((nowhere, nowhere) for _ in self._drawn)
         self.tree = SumTree(self.ring.rows * self.ring.n_envs)
         steps = self._step_positions()
         if len(steps):
             self.tree.set(steps, self.largest)
+
+    def draw_of(self, index: np.ndarray, time: np.ndarray) -> Draw:
+        """Returns a draw from this ring as it is now, from the positions and times of a file.
+
+        Raises:
+            ValueError: if they are no positions in this ring.
+        """
+        good = index.dtype == time.dtype == np.int64 and index.shape == time.shape == (index.size,)
+        if not good or not ((index >= 0) & (index < self.ring.rows * self.ring.n_envs)).all():
+            raise ValueError("the priorities are of another replay buffer")
+        return Draw(index, time, self.ring.version)
 
     def _step_positions(self) -> np.ndarray:
         """Returns the positions of the ring that hold steps, environment after environment."""

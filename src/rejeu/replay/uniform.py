@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rejeu.core import Transition
-from rejeu.replay.prioritized import Priorities
+from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.ring import LAST, TERMINATED, Ring, Rows
 
 
@@ -46,7 +46,13 @@ class ReplayBuffer:
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
         """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances, ``progress`` anneals the weights."""
-        rows, weight = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
+        return self.draw(rng, shape, progress)[0]
+
+    def draw(
+        self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
+    ) -> tuple[Transition, Draw | None]:
+        """Returns what :meth:`sample` does and, with priorities, what :meth:`reprioritise` takes; None without."""
+        rows, weight, drawn = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
         step, obs = self.ring.read(rows.position)
         steps: int | np.ndarray = 1
         if self.n_steps == 1:
@@ -56,10 +62,10 @@ class ReplayBuffer:
             reward = discounted_sum(self.ring.reward[window.position], window.valid, self.gamma)
             steps, discount = window.steps, bootstrap_discount(self.gamma, window.steps, window.terminated)
         _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
-        return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight)
+        return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight), drawn
 
-    def reprioritise(self, td_errors: list[Any]) -> None:
-        """Takes the absolute TD errors of the oldest samples, one array a sample; without priorities there are none."""
+    def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+        """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
         if self.priorities is not None:
             self.priorities.update(td_errors)
 
@@ -84,9 +90,9 @@ def begin(ring: Ring, priorities: Priorities | None, obs: Any, envs: np.ndarray 
 
 def draw(
     ring: Ring, priorities: Priorities | None, rng: np.random.Generator, n: int, progress: float
-) -> tuple[Rows, np.ndarray | None]:
-    """Returns ``n`` steps, and their importance weights where there are priorities."""
-    return (ring.draw(rng, n), None) if priorities is None else priorities.draw(rng, n, progress)
+) -> tuple[Rows, np.ndarray | None, Draw | None]:
+    """Returns ``n`` steps, and where there are priorities their importance weights and what gives TD errors back."""
+    return (ring.draw(rng, n), None, None) if priorities is None else priorities.draw(rng, n, progress)
 
 
 def batch(
