@@ -6,6 +6,7 @@
 100
 """
 
+from rejeu import plots
 from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
 from rejeu.envs.checker import check_env
 from rejeu.envs.monitor import Monitor
@@ -52,6 +53,7 @@ __all__ = [
     "evaluate_policy",
     "load",
     "make_vector",
+    "plots",
     "record_video",
     "show_videos",
 ]

@@ -1,9 +1,8 @@
-"""Pictures of training runs. Drawn without a display and without matplotlib's global state."""
+"""The learning curve: returns and successes of a run against steps or seconds."""
 
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rejeu.config import whole
-from rejeu.errors import MissingExtra
 from rejeu.evaluation import Evaluation
+from rejeu.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,14 +19,10 @@ if TYPE_CHECKING:
     from rejeu.figures import Picture
     from rejeu.history import History
 
-INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
 EPISODES = "episodes"
-DOT_COLOUR, LINE_COLOUR, EVALUATION_COLOUR = "#63a4e0", "#1d4f91", "#dd6b20"
 AXIS_LABELS = {"step": "environment steps", "seconds": "seconds of training"}
 MOST_WINDOW = 50
 """Most episodes in the moving average that is drawn by default."""
-TITLE_WIDTH = 72
-"""Characters of a title's line: what fits the width of the picture in the title's font."""
 ROOM_AT_THE_RIGHT = 0.02
 """Of the horizontal axis, beyond the last episode, so that its dot is drawn whole."""
 
@@ -54,12 +49,6 @@ def learning_curve(
         MissingExtra: if matplotlib is not installed.
         ValueError: for another ``against`` or a ``window`` below 1.
     """
-    try:
-        from matplotlib.ticker import FuncFormatter, PercentFormatter
-
-        from rejeu.figures import Picture
-    except ImportError:
-        raise MissingExtra("drawing a learning curve", "matplotlib", "plot") from None
     if against not in AXIS_LABELS:
         raise ValueError(f"against={against!r} must be one of {', '.join(AXIS_LABELS)}")
     window = default_window(len(history)) if window is None else whole("window", window, least=1)
@@ -69,7 +58,7 @@ def learning_curve(
     at = steps if against == "step" or not len(x) else np.interp(steps, history["step"], x)
     has_success = bool(np.isfinite(successes).any())
 
-    figure = Picture(figsize=(8.0, 6.4 if has_success else 4.2), dpi=150, layout="constrained", facecolor="white")
+    figure = style.blank("drawing a learning curve", height=6.4 if has_success else 4.2)
     panels = figure.subplots(1 + has_success, sharex=True, squeeze=False, height_ratios=[3, 2][: 1 + has_success])[:, 0]
     means = [evaluation.mean_return for _, evaluation in evaluations]
     _episodes(panels[0], x, returns)
@@ -77,24 +66,22 @@ def learning_curve(
     _points(panels[0], at, means, [evaluation.return_interval for _, evaluation in evaluations])
     _fit(panels[0], returns, means)
     panels[0].set_ylabel("return")
-    panels[0].yaxis.set_major_formatter(FuncFormatter(_thousands))
+    panels[0].yaxis.set_major_formatter(style.thousands)
     if has_success:
         rates = [evaluation.success_rate for _, evaluation in evaluations]
         _line(panels[1], x, history.moving_average("success", window), window)
         _points(panels[1], at, rates, [evaluation.success_interval for _, evaluation in evaluations])
         panels[1].set_ylim(-0.03, 1.03)
         panels[1].set_ylabel("success rate")
-        panels[1].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        panels[1].yaxis.set_major_formatter(lambda share, _: f"{share:.0%}")
     for panel in panels:
-        _dress(panel)
+        style.dress(panel)
     panels[-1].set_xlabel(AXIS_LABELS[against])
-    panels[-1].xaxis.set_major_formatter(FuncFormatter(_thousands))
+    panels[-1].xaxis.set_major_formatter(style.thousands)
     panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]) * (1 + ROOM_AT_THE_RIGHT))
-    _head(panels[0], title)
-    if path is not None:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
-    return figure
+    style.head(panels[0], title)
+    _enlarge_dots(panels[0])
+    return style.write(figure, path)
 
 
 def default_window(n_episodes: int) -> int:
@@ -106,22 +93,12 @@ def default_window(n_episodes: int) -> int:
     return min(max(n_episodes // 5, 3), MOST_WINDOW)
 
 
-def _head(panel: Axes, title: str) -> None:
-    """Writes the legend above a panel and the title above the legend, so that neither limits the other's length."""
-    has_legend = bool(panel.get_legend_handles_labels()[0])
-    if title:
-        text = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
-        panel.set_title(text, loc="left", color=INK, fontsize=12, fontweight="bold", pad=25 if has_legend else 9)
-    if has_legend:
-        style = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2, "columnspacing": 1.4}
-        legend = panel.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=3, borderaxespad=0.2, **style)
-        for line in legend.get_lines():
-            if line.get_label() == EPISODES:
-                line.set(markersize=5, alpha=0.8)
-
-
-def _thousands(value: float, _: int | None = None) -> str:
-    return f"{value:,.10g}".replace("-", "\N{MINUS SIGN}")
+def _enlarge_dots(panel: Axes) -> None:
+    """Draws the dot of the legend in one size, whatever that of the episodes is."""
+    legend = panel.get_legend()
+    for line in legend.get_lines() if legend is not None else ():
+        if line.get_label() == EPISODES:
+            line.set(markersize=5, alpha=0.8)
 
 
 def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
@@ -130,13 +107,12 @@ def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
         return
     size = float(np.clip(60 / math.sqrt(len(x)), 2.4, 5.0))
     opacity = float(np.clip(600 / len(x), 0.3, 0.6))
-    panel.plot(x, y, "o", markersize=size, color=DOT_COLOUR, alpha=opacity, markeredgewidth=0, label=EPISODES)
+    panel.plot(x, y, "o", markersize=size, color=style.DOT_COLOR, alpha=opacity, markeredgewidth=0, label=EPISODES)
 
 
 def _line(panel: Axes, x: np.ndarray, y: np.ndarray, window: int) -> None:
     if len(x):
-        style: dict[str, Any] = {"solid_capstyle": "round", "solid_joinstyle": "round"}
-        panel.plot(x, y, color=LINE_COLOUR, linewidth=1.8, label=f"mean of {window} episodes", **style)
+        panel.plot(x, y, label=f"mean of {window} episodes", **style.LINE)
 
 
 def _points(panel: Axes, x: np.ndarray, y: list[float], intervals: list[tuple[float, float]]) -> None:
@@ -145,14 +121,14 @@ def _points(panel: Axes, x: np.ndarray, y: list[float], intervals: list[tuple[fl
         return
     low, high = np.array(intervals).T
     reach = np.nan_to_num(np.stack([np.array(y) - low, high - np.array(y)]).clip(0))
-    panel.errorbar(x, y, reach, fmt="none", ecolor=EVALUATION_COLOUR, elinewidth=1.2, alpha=0.6, zorder=3)
-    style: dict[str, Any] = {
-        "color": EVALUATION_COLOUR,
+    panel.errorbar(x, y, reach, fmt="none", ecolor=style.ACCENT_COLOR, elinewidth=1.2, alpha=0.6, zorder=3)
+    form: dict[str, Any] = {
+        "color": style.ACCENT_COLOR,
         "markeredgecolor": "white",
         "markeredgewidth": 0.8,
         "zorder": 4,
     }
-    panel.plot(x, y, "o", markersize=5, label="evaluation, 95 % interval", clip_on=False, **style)
+    panel.plot(x, y, "o", markersize=5, label="evaluation, 95 % interval", clip_on=False, **form)
 
 
 def _fit(panel: Axes, returns: np.ndarray, evaluated: list[float]) -> None:
@@ -162,13 +138,3 @@ def _fit(panel: Axes, returns: np.ndarray, evaluated: list[float]) -> None:
     if len(shown):
         margin = 0.05 * (np.ptp(shown) or 1.0)
         panel.set_ylim(shown.min() - margin, shown.max() + margin)
-
-
-def _dress(panel: Axes) -> None:
-    panel.grid(color=GRID, linewidth=0.8)
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right", "left"]].set_visible(False)
-    panel.spines["bottom"].set_color(MUTED)
-    panel.tick_params(colors=MUTED, labelcolor=INK, labelsize=9, length=0, pad=6)
-    panel.xaxis.label.set(color=INK, fontsize=10)
-    panel.yaxis.label.set(color=INK, fontsize=10)
