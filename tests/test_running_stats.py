@@ -540,3 +540,18 @@ def test_hindsight_relabels_raw_goals(reaching):
     goals = reaching.state.statistics.obs
     assert len(goals) == 2
     assert float(goals[0].n_seen) == 2 * float(goals[1].n_seen) == 2 * 1600
+
+
+def test_statistics_are_taken_of_copies_that_the_next_step_cannot_overwrite():
+    """The device reads a large array when it gets to it, in warm-up after the environments have stepped again."""
+    env = InProcess([Counter() for _ in range(2)], seed=0)
+    agent = rejeu.SAC("MlpPolicy", env, normalize=True, **{**OFF, "learning_starts": 20})
+    observe, shared = agent._compiled.observe, []
+
+    def observing(state, obs, returns):
+        shared.append(np.shares_memory(obs, env._obs))
+        return observe(state, obs, returns)
+
+    agent._compiled.observe = observing
+    agent.learn(40)
+    assert shared == [False] * 20

@@ -100,13 +100,17 @@ class Watch:
         return td_error
 
     def observe(self, run: Run, compiled: Compiled) -> None:
-        """Lets the state take in the present observations, if it has a use for them."""
+        """Lets the state take in the present observations, if it has a use for them.
+
+        They are copied: the device may read a large array after the environments have written the next step to it.
+        """
         if compiled.observe is None:
             return
         is_known = run.state is self._newest
-        run.state = compiled.observe(run.state, run.obs, run.running_return)
+        seen = (jax.tree.map(np.copy, run.obs), run.running_return)
+        run.state = compiled.observe(run.state, *seen)
         if is_known and self._stretch is not None:
-            self._stretch.done.append((compiled.observe, (jax.tree.map(np.copy, run.obs), run.running_return)))
+            self._stretch.done.append((compiled.observe, seen))
             self._newest = run.state
 
     def _on(self, run: Run, compiled: Compiled, batches: Transition | Rollout) -> Stretch:
