@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import warnings
+from contextlib import closing
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 import rejeu
 from rejeu import plain
-from rejeu.envs.state import carried, put_back, restore, state_of
+from rejeu.envs.state import restore, state_of
 from rejeu.envs.vector import make_vector
 
 CARRIED = [
@@ -137,14 +138,6 @@ def test_an_heir_of_a_known_environment_is_not_taken_for_it():
     assert state_of(env) is None
 
 
-def test_envpool_cannot_be_carried():
-    vector = make_vector("CartPole-v1", 2, "envpool", seed=0)
-    vector.reset()
-    assert carried(vector) is None
-    with pytest.raises(ValueError, match="do not fit 2 environments of the envpool backend"):
-        put_back(vector, [[], []], np.zeros((2, 4), np.float32))
-
-
 def test_the_state_of_another_environment_is_refused():
     pendulum, cart = gym.make("Pendulum-v1"), gym.make("CartPole-v1")
     pendulum.reset(seed=0)
@@ -166,19 +159,42 @@ def test_the_state_taken_out_does_not_move_with_the_environment():
     np.testing.assert_equal(after, before)
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_vectors_are_carried_whole(n_envs):
+@pytest.mark.parametrize(
+    ("backend", "n_envs"), [("gymnasium", 1), ("gymnasium", 3), ("gymnasium-async", 2), ("envpool", 3)]
+)
+def test_a_vector_continues_from_its_snapshot(backend, n_envs):
     def make():
-        return make_vector("CartPole-v1", n_envs, "gymnasium", seed=2)
+        return make_vector("CartPole-v1", n_envs, backend, seed=2)
 
-    one, two = make(), make()
-    obs = one.reset()
-    for _ in range(5):
-        obs = one.step(np.ones(n_envs, int)).obs
-    put_back(two, carried(one), obs)
+    with closing(make()) as one, closing(make()) as two:
+        obs = one.reset()
+        for _ in range(5):
+            obs = one.step(np.ones(n_envs, int)).obs
+        saved = plain.decode(plain.encode(one.snapshot(), arrays := {}, "envs"), arrays)
+        assert two.restore(saved, obs.copy()) == []
+        assert_vectors_continue_alike(one, two)
+
+
+def test_a_snapshot_of_another_number_of_environments_is_refused():
+    for backend in ("gymnasium", "gymnasium-async"):
+        with closing(make_vector("CartPole-v1", 2, backend, seed=2)) as one:
+            one.reset()
+            with pytest.raises(ValueError, match="not those of 2 environments"):
+                one.restore(one.snapshot()[:1], None)
+
+
+def test_worker_processes_refuse_a_snapshot_of_another_environment():
+    with closing(make_vector("CartPole-v1", 1, "gymnasium-async", seed=2)) as one:
+        one.reset()
+        with pytest.raises(ValueError, match="environment 0 cannot be restored"):
+            one.restore([[{}]], None)
+
+
+def assert_vectors_continue_alike(one, two):
+    n_envs = one.n_envs
     only_first = np.arange(n_envs) == 0
     for active in (only_first, None):
         first, second = one.step(np.zeros(n_envs, int), active), two.step(np.zeros(n_envs, int), active)
         np.testing.assert_array_equal(first.obs, second.obs)
     done = np.ones(n_envs, bool)
-    np.testing.assert_array_equal(one.reset_done(done), two.reset_done(done))
+    np.testing.assert_array_equal(one.reset_done(done).copy(), two.reset_done(done))

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import checkpoint, plain
+from rejeu import checkpoint, compilation, plain
 from rejeu.agents.checkpoints import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
@@ -39,8 +39,8 @@ NOISES = {
 }
 
 
-def vector(env_id, n_envs=3):
-    return lambda: rejeu.make_vector(env_id, n_envs, "gymnasium", seed=1)
+def vector(env_id, n_envs=3, backend="gymnasium"):
+    return lambda: rejeu.make_vector(env_id, n_envs, backend, seed=1)
 
 
 CASES = {
@@ -55,6 +55,10 @@ CASES = {
     "normalised": ("SAC", vector("Pendulum-v1", 2), {**OFF, "normalize": True}),
     "schedule": ("SAC", vector("Pendulum-v1", 1), {**OFF, "learning_rate": rejeu.Linear(1e-2, 0.0)}),
     **{f"{n} noise": ("DDPG", vector("Pendulum-v1", 2), {**OFF, "action_noise": x}) for n, x in NOISES.items()},
+    "EnvPool": ("SAC", vector("Pendulum-v1", 2, "envpool"), OFF),
+    "EnvPool, PPO": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "batch_size": 16}),
+    "EnvPool, whole episodes": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
+    "worker processes": ("SAC", vector("Pendulum-v1", 2, "gymnasium-async"), OFF),
     "PPO": ("PPO", vector("CartPole-v1"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "PPO, normalised": ("PPO", vector("Pendulum-v1"), {**SMALL, "n_steps": 16, "batch_size": 16, "normalize": True}),
     "PPO, whole episodes": ("PPO", vector("rejeu/Ball-v0"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
@@ -280,6 +284,16 @@ def test_where_the_state_cannot_be_carried_new_episodes_begin_and_a_warning_says
     agent.learn()
     assert agent.num_timesteps == 60
     assert agent.replay_buffer.size() == 60
+
+
+def test_the_number_of_threads_is_saved_and_a_resumed_run_says_if_it_has_another(tmp_path, monkeypatch):
+    cut_run(tmp_path)
+    header, _ = checkpoint.read(run_files(tmp_path)[0], "run")
+    assert header["threads"] == compilation.threads()
+    assert rejeu.SAC.resume(tmp_path).resumed.exact
+    monkeypatch.setattr(compilation, "threads", lambda: header["threads"] + 1)
+    with pytest.warns(UserWarning, match=rf"computes with {header['threads'] + 1} threads here and had"):
+        assert not rejeu.SAC.resume(tmp_path).resumed.exact
 
 
 def test_a_rollout_keeps_the_steps_of_the_episodes_that_cannot_go_on(tmp_path):

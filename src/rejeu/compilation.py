@@ -35,6 +35,7 @@ SMALL = 2**19
 
 _seconds = 0.0
 _listening = False
+_threads: int | None = None
 
 
 def enable_cache() -> None:
@@ -52,19 +53,51 @@ def enable_cache() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def start_device(work: float) -> None:
-    """Starts JAX's device, with a single thread on a CPU if ``work``, in multiplications of a layer, is little.
+def cores() -> int:
+    """Returns the number of processor cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS and Windows
+        return os.cpu_count() or 1
 
-    The number of threads is chosen once in a process, when the device starts; where the program has used JAX before or
+
+def threads_for(work: float) -> int:
+    """Returns how many threads suit an update whose largest layer takes ``work`` multiplications."""
+    return 1 if work <= LITTLE_WORK else cores()
+
+
+def start_device(n_threads: int) -> None:
+    """Starts JAX's device; on a CPU with so many threads.
+
+    The number of threads is fixed when the device starts, once in a process. Where the program has used JAX before, or
     ``NPROC`` is set, nothing is chosen here.
     """
-    if THREADS in os.environ or work > LITTLE_WORK:
+    global _threads
+    if _threads is not None:
         return
-    os.environ[THREADS] = "1"
+    if _is_running() or THREADS in os.environ:
+        _threads = int(os.environ.get(THREADS, cores()))
+        return
+    _threads = n_threads
+    os.environ[THREADS] = str(n_threads)
     try:
         jax.local_devices()
     finally:
         del os.environ[THREADS]
+
+
+def threads() -> int:
+    """Returns the number of threads of JAX's device on a CPU; sums of large layers depend on it in their last bits."""
+    return cores() if _threads is None else _threads
+
+
+def _is_running() -> bool:
+    """Returns whether the program has started JAX's device already."""
+    try:
+        from jax._src.xla_bridge import backends_are_initialized  # there is no public way to ask
+    except ImportError:
+        return False
+    return backends_are_initialized()
 
 
 def run_once(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -260,6 +260,26 @@ def check_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
         raise ValueError(f"{owner} has actions from {action.min()} to {action.max()}, expected {space}")
 
 
+def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
+    """Checks actions ``(n, ...)`` of a file in the environment's own range, before they are handed to an environment.
+
+    ``owner`` is what holds them, for the message.
+
+    Raises:
+        ValueError: if one is not in the space, up to rounding.
+    """
+    if not action.size:
+        return
+    if isinstance(space, spaces.Box):
+        valid = bool(np.isfinite(action).all() and (action >= space.low).all() and (action <= space.high).all())
+    else:
+        start = 0 if isinstance(space, spaces.MultiBinary) else getattr(space, "start", 0)
+        n = space.n if isinstance(space, spaces.Discrete) else getattr(space, "nvec", 2)
+        valid = bool((action >= start).all() and (action < np.add(start, n)).all())
+    if not valid:
+        raise ValueError(f"{owner} has actions from {action.min()} to {action.max()}, expected {space}")
+
+
 def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
     """Returns whether two spaces hold arrays of the same structure, shapes and dtypes, and the same bounds if asked.
 

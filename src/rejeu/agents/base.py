@@ -92,7 +92,8 @@ class Agent(ABC):
         self._own_env = isinstance(env, str)
         vector = self._vector(env, 1, seed=self.seed)
         check_policy(policy, vector.observation_space)
-        self._build(vector.observation_space, vector.action_space, vector.n_envs)
+        self._build(vector.observation_space, vector.action_space)
+        compilation.start_device(self._threads(vector.n_envs))
         self._start(vector)
 
     def _set_up(
@@ -138,7 +139,7 @@ class Agent(ABC):
         """Whether the environment was given by its id."""
         compilation.enable_cache()
 
-    def _build(self, observation_space: gym.Space, action_space: gym.Space, n_envs: int) -> None:
+    def _build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
         """Compiles the algorithm for these spaces."""
         self.observation_space, self.action_space = observation_space, action_space
         self._obs_leaves = spaces.leaves(observation_space)
@@ -150,14 +151,13 @@ class Agent(ABC):
             explorer = exploration.make(algorithm, noise)
             algorithm = normalised(algorithm, explorer, self._obs_leaves, self.config.normalize)
         self._compiled = Compiled(algorithm, noise, self.config.nonfinite == "skip")
-        compilation.start_device(self._work(n_envs))
 
-    def _work(self, n_envs: int) -> float:
-        """Returns about how many multiplications the largest layer of an update takes; of images, any number."""
+    def _threads(self, n_envs: int) -> int:
+        """Returns how many threads suit updates on ``n_envs`` environments, by the largest layer; for images all."""
         if any(leaf.kind == "image" for leaf in self._obs_leaves):
-            return math.inf
+            return compilation.cores()
         weights = [leaf.size for leaf in jax.tree.leaves(self._compiled.shapes) if len(leaf.shape) > 1]
-        return self._batch_size(n_envs) * max(weights, default=0)
+        return compilation.threads_for(self._batch_size(n_envs) * max(weights, default=0))
 
     def _start(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
         """Begins a run on ``env`` with a fresh state, or the given one, and an empty buffer; None only predicts."""
@@ -477,9 +477,10 @@ class Agent(ABC):
         """Returns the agent of a run as its newest checkpoint holds it; ``learn()`` then goes on to the end that was set.
 
         Everything stands as it stood: what was learnt, the replay buffer, running episodes, exploration, random numbers,
-        counters, statistics, callbacks' own memory (give ``learn`` the same callbacks). Where the state of the environments
-        can be carried (see :mod:`rejeu.envs.state`), the run that follows is the same, bit for bit, that would have
-        followed without a break; elsewhere new episodes begin, and a warning says so. ``resumed`` tells which.
+        counters, statistics, callbacks' own memory (give ``learn`` the same callbacks). Where the environments
+        can be saved (see :mod:`rejeu.envs.state`) or repeat their episodes (EnvPool), the run that follows is the same,
+        bit for bit, that would have followed without a break; elsewhere new episodes begin, and a warning says so.
+        ``resumed`` tells which.
 
         Args:
             folder: as given to :class:`rejeu.callbacks.Checkpoint`.

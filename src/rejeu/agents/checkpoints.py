@@ -28,11 +28,10 @@ import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
-from rejeu import checkpoint, finite, plain
+from rejeu import checkpoint, compilation, finite, plain
 from rejeu.agents import files
 from rejeu.config import number, whole
 from rejeu.core import PyTree
-from rejeu.envs import state as env_state
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.loops.host import Progress, Run
 from rejeu.replay.ring import Ring
@@ -259,7 +258,7 @@ def step_of(path: Path) -> int:
 def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Returns header and arrays of a run, the rows of its replay buffer left out."""
     run = agent._run
-    states = None if reason or run.obs is None else env_state.carried(run.env)
+    states = None if reason or run.obs is None else run.env.snapshot()
     if states is None and not reason:
         where = f"{run.env.env_id} ({run.env.backend})"
         reason = "none was under way" if run.obs is None else f"the state of {where} cannot be carried"
@@ -299,6 +298,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,
         "own_env": agent._own_env,
+        "threads": compilation.threads(),
         "run": plain.encode(everything, arrays, "run"),
     }
     return header, arrays

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from rejeu import checkpoint, config as configs, spaces
+from rejeu import checkpoint, compilation, config as configs, spaces
 from rejeu.agents import loading
 from rejeu.errors import CheckpointError
 
@@ -63,6 +63,7 @@ def load(
     arrays: Mapping[str, np.ndarray],
     make_env: Callable[[A], VectorEnv | None],
     changes: dict[str, Any],
+    threads: int | None = None,
 ) -> A:
     """Returns the agent that a header and the arrays of its state describe; its buffer is empty.
 
@@ -73,6 +74,7 @@ def load(
         arrays: everything learnt, by name.
         make_env: returns where it goes on learning, None for an agent that only predicts.
         changes: constructor arguments or hyper-parameters to set otherwise.
+        threads: that JAX's device is to have; None for the number that suits the agent.
 
     Raises:
         CheckpointError: if something is damaged or of another algorithm or environment.
@@ -95,13 +97,15 @@ def load(
         saved.stats_window_size, saved.success_threshold,
     )  # fmt: skip
     try:
-        agent._build(saved.observation_space, saved.action_space, 1)
+        agent._build(saved.observation_space, saved.action_space)
     except loading.WRONG as error:
         raise CheckpointError(f"{path}: {loading.brief(error)}") from None
     state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
     vector = make_env(agent)
     if vector is not None:
         agent._check_spaces(vector, "the given environment")
+    n_envs = 1 if vector is None else vector.n_envs
+    compilation.start_device(agent._threads(n_envs) if threads is None else threads)
     try:
         stand(agent, vector, state, saved)
     except (ArithmeticError, MemoryError, ValueError) as error:

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu import checkpoint, plain, spaces
+from rejeu import checkpoint, compilation, plain, spaces
 from rejeu.agents import files, loading
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import PER_ENV, ROWS_FILE, SCALARS, RowFiles, run_files
 from rejeu.config import number, whole
 from rejeu.core import PyTree
-from rejeu.envs import state as env_state
+from rejeu.envs.contract import DivergedError
 from rejeu.envs.vector import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.loops.host import Run, is_finite
@@ -35,21 +35,22 @@ A = TypeVar("A", bound="Agent")
 
 MOST_ENVS = 4096
 """More environments than so many are not made because a file says so."""
+MOST_THREADS = 1024
+"""More threads than so many are not started because a file says so."""
 
 
 class Resumed(NamedTuple):
-    """Where a run was taken up again."""
+    """Where a run was resumed."""
 
     step: int
     """Environment steps that had been taken."""
     exact: bool
-    """Whether the environments go on where they stood too, so that the run is the same as without a break."""
+    """Whether the run continues as it would have without the break, bit for bit."""
     reason: str
-    """Why not, in words; empty where it is exact."""
+    """What differs otherwise; empty where it is exact."""
 
     def __str__(self) -> str:
-        where = "exactly where it stood" if self.exact else f"at the start of new episodes: {self.reason}"
-        return f"resumed at step {self.step:,}, {where}"
+        return f"resumed at step {self.step:,}, {'exactly where it stood' if self.exact else self.reason}"
 
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
@@ -108,10 +109,12 @@ def _resume_within(made: ExitStack, cls: type[A], path: Path, env: Any, changes:
             ) from error
         return vector
 
-    agent = files.load(cls, path, header, state, make_env, changes)
+    agent = files.load(cls, path, header, state, make_env, changes, threads(path, header))
     try:
         parts = [checkpoint.read(path.parent / name, "rows")[1] for name in rows]
-        restore(agent, saved, parts, {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}, path)
+        best = {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}
+        reason = restore(agent, saved, parts, best, path)
+        agent.resumed = Resumed(agent._run.step, not reason, reason) if reason else compared(agent, header)
         if "train_freq" not in changes:
             check_owed(agent)
         agent._run_id, agent._own_env = text(header["run_id"]), env is None
@@ -124,6 +127,18 @@ def _resume_within(made: ExitStack, cls: type[A], path: Path, env: Any, changes:
         heads = [part["head"] for part in parts]
         agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
     return agent
+
+
+def compared(agent: Agent, header: dict[str, Any]) -> Resumed:
+    """Returns how a run resumes whose environments stand where they stood."""
+    before, here = header.get("threads", compilation.threads()), compilation.threads()
+    if before == here:
+        return Resumed(agent._run.step, True, "")
+    return Resumed(
+        agent._run.step, False,
+        f"where it stood, but JAX computes with {here} threads here and had {before}, so results may differ in their last "
+        f"bits; resume in a new process, with the environment variable {compilation.THREADS}={before} if JAX is used before",
+    )  # fmt: skip
 
 
 def refusal(path: Path, error: BaseException) -> CheckpointError:
@@ -150,6 +165,18 @@ def check_owed(agent: Agent) -> None:
         raise ValueError(f"owed={agent._run.owed} is not below train_freq={frequency!r}")
 
 
+def threads(path: Path, header: dict[str, Any]) -> int | None:
+    """Returns the number of threads that a run computed with; None for a checkpoint that does not say.
+
+    Raises:
+        CheckpointError: if it cannot be that.
+    """
+    try:
+        return None if "threads" not in header else whole("threads", header["threads"], least=1, most=MOST_THREADS)
+    except ValueError as error:
+        raise refusal(path, error) from None
+
+
 def environment(path: Path, header: dict[str, Any]) -> tuple[str, int, Backend]:
     """Returns id, number and backend of the environments that a run had.
 
@@ -169,8 +196,10 @@ def environment(path: Path, header: dict[str, Any]) -> tuple[str, int, Backend]:
 
 def restore(
     agent: Agent, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
-) -> None:
+) -> str:
     """Puts an agent that was loaded from the same checkpoint where its run stood.
+
+    Returns where else its environments begin and why, empty where they continue.
 
     Raises:
         LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
@@ -197,8 +226,9 @@ def restore(
         run.td_errors = with_draws(run.replay.priorities, saved["buffer"]["priorities"]["drawn"], td_errors)
     if isinstance(run.replay, RolloutBuffer):
         spaces.check_actions(agent.action_space, saved["buffer"]["rollout"]["action"], "the rollout")
+    reason = text(saved["reason"])
     if saved["envs"] is not None:
-        put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
+        reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
     elif saved["seed"] is not None:
         run.seed = loading.whole_seed(saved["seed"])
     agent.history.replace(saved["history"])
@@ -220,13 +250,14 @@ def restore(
     statistics = agent.get_vec_normalize_env()
     if statistics is not None and saved["vec_normalize"] is not None:
         statistics.put_statistics(saved["vec_normalize"])
-    agent.resumed = Resumed(run.step, not text(saved["reason"]), saved["reason"])
+    return f"at the start of new episodes: {reason}" if reason else ""
 
 
-def put_envs_back(run: Run, saved: dict[str, Any], n_episodes: int | None) -> None:
+def put_envs_back(run: Run, saved: dict[str, Any], n_episodes: int | None) -> str:
     """Lets the environments stand where they stood, with the observations and the actions that were chosen there.
 
-    Where rollouts are ``n_episodes`` whole episodes, those that have played theirs may stand at the end of one.
+    Where rollouts are ``n_episodes`` whole episodes, those that have played theirs may stand at the end of one. Returns why
+    new episodes must begin instead, empty where they need not.
     """
     n_envs = run.env.n_envs
     for key in PER_ENV:
@@ -246,14 +277,18 @@ def put_envs_back(run: Run, saved: dict[str, Any], n_episodes: int | None) -> No
     )
     if not all(is_finite(leaf) for leaf in jax.tree.leaves(obs)):
         raise ValueError("the observations are not finite")
-    env_state.put_back(run.env, saved["envs"], obs)
-    if over := [i for i in env_state.over(run.env) if waiting is None or not waiting[i]]:
+    try:
+        must_reset = run.env.restore(saved["envs"], obs)
+    except DivergedError as error:
+        return str(error)
+    if over := [i for i in must_reset if waiting is None or not waiting[i]]:
         raise ValueError(f"the episode of environment {over[0]} is over, and it was not reset")
-    run.obs = obs
+    run.obs, run.seed = obs, None
     if saved["action"] is not None:
         expected = np.asarray(spaces.random_action(run.env.action_space, n_envs, np.random.default_rng(0)))
         run.action = exactly(saved["action"], expected.shape, expected.dtype, "action")
         spaces.check_actions(run.env.action_space, run.action, "the checkpoint")
+    return ""
 
 
 def restore_buffer(

@@ -24,6 +24,10 @@ SUCCESS_KEYS = ("is_success", "success")
 """Where an info says whether the goal was reached; the first that is there counts."""
 
 
+class DivergedError(RuntimeError):
+    """Environments did not repeat what was recorded, so a run cannot be resumed in the middle of their episodes."""
+
+
 class Step(NamedTuple):
     """What one step of all environments returned."""
 
@@ -144,6 +148,34 @@ class VectorEnv(ABC):
     @abstractmethod
     def goals(self) -> GoalFunctions | None:
         """Returns the goal functions, or None for environments without goals."""
+
+    @property
+    def must_reset(self) -> bool:
+        """Whether the next call must be :meth:`reset`; an agent begins new episodes then."""
+        return False
+
+    def snapshot(self) -> Any:
+        """Returns the state of the running environments as plain data (see :mod:`rejeu.plain`).
+
+        None where the backend or an environment does not offer it.
+        """
+        return None
+
+    def restore(self, saved: Any, obs: Any) -> list[int]:
+        """Restores what :meth:`snapshot` returned, into environments of the same kind.
+
+        Args:
+            saved: the snapshot.
+            obs: the observations at that moment, a pytree of arrays ``(n_envs, ...)``.
+
+        Returns:
+            Which environments must be reset before they can be stepped, as far as they say so.
+
+        Raises:
+            ValueError: if the snapshot is damaged or of other environments.
+            DivergedError: if the environments do not repeat what was recorded.
+        """
+        raise ValueError(f"there is no snapshot of environments of the {self.backend} backend")
 
     @abstractmethod
     def close(self) -> None:

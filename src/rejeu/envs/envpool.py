@@ -6,10 +6,13 @@ import warnings
 from typing import Any
 
 import gymnasium as gym
+import jax
 import numpy as np
 
+from rejeu.config import whole
 from rejeu.envs import goals as goals_module
-from rejeu.envs.contract import SUCCESS_KEYS, Step, VectorEnv, replaced
+from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
+from rejeu.envs.contract import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
 from rejeu.envs.registry import make_env, provider, register, unknown_environment
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, leaves
@@ -19,46 +22,64 @@ NO_LIMIT = 2**31 - 1
 
 
 class EnvPool(VectorEnv):
-    """Environments of the EnvPool package, stepped by C++ threads."""
+    """Environments of the EnvPool package, stepped by C++ threads.
+
+    A pool keeps its state to itself, but it is deterministic given its seed and the actions. So the actions since it was made
+    are recorded, and a run is resumed by replaying them. Where the record is full (see :mod:`rejeu.envs.action_log`) the pool
+    is made again with a seed that follows from the one before; that is a part of every run, resumed or not.
+    """
 
     backend = "envpool"
 
     def __init__(self, env_id: str, n_envs: int, seed: int | None = None) -> None:
         self.env_id = env_id
         self.n_envs = n_envs
-        self._pool = self._make(seed)
+        self._pool = self._make(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
         self.observation_space = _bounded_rightly(self._pool.observation_space)
         self.action_space = self._pool.action_space
         limit = int(self._pool.spec.config.max_episode_steps)
         self.max_episode_steps = None if limit >= NO_LIMIT else limit
         self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
         self._leaves = leaves(self.observation_space)
+        self._log = self._new_log()
 
-    def _make(self, seed: int | None) -> Any:
+    def _make(self, seed: int) -> Any:
         import envpool
 
-        seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
-        seed %= 2**31 - self.n_envs  # environment i gets seed + i, and EnvPool takes int32
+        self._seed = seed
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
-            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seed)
+            # Environment i gets the seed + i, which EnvPool takes as int32.
+            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seed % (2**31 - self.n_envs))
             pool.observation_space, pool.action_space  # noqa: B018 - made when first asked for, and kept
         return pool
 
+    def _new_log(self) -> ActionLog:
+        draws_images = any(leaf.kind == "image" for leaf in self._leaves)
+        return ActionLog(self.n_envs, self.action_space, MOST_IMAGE_STEPS if draws_images else MOST_STEPS)
+
+    @property
+    def must_reset(self) -> bool:
+        return self._log.is_full
+
     def reset(self, seed: int | None = None) -> Any:
+        if seed is None and self.must_reset:
+            seed = int(np.random.SeedSequence([self._seed, 1]).generate_state(1)[0])
         if seed is not None:
-            self._pool = self._make(seed)
+            self._pool, self._log = self._make(seed), self._new_log()
+        self._log.reset()
         self._obs = cast(self.observation_space, self._leaves, self._pool.reset()[0])
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
-        obs, reward, terminated, truncated, info = self._pool.step(action)
+        obs, reward, terminated, truncated, info = self._pool.step(self._log.step(action))
         self._obs = cast(self.observation_space, self._leaves, obs)
         return Step(self._obs, np.asarray(reward, np.float32), terminated, truncated, info)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         ids = np.flatnonzero(active).astype(np.int32)
-        obs, reward, terminated, truncated, info = self._pool.step(np.asarray(action)[ids], ids)  # rows in order of ids
+        action = self._log.step(np.asarray(action)[ids], ids)
+        obs, reward, terminated, truncated, info = self._pool.step(action, ids)  # rows in order of ids
         self._obs = replaced(self._obs, ids, cast(self.observation_space, self._leaves, obs))
 
         def spread(part: np.ndarray, dtype: Any) -> np.ndarray:
@@ -71,9 +92,33 @@ class EnvPool(VectorEnv):
 
     def reset_done(self, done: np.ndarray) -> Any:
         ended = np.flatnonzero(done).astype(np.int32)
+        self._log.reset(ended)
         fresh = cast(self.observation_space, self._leaves, self._pool.reset(ended)[0])
         self._obs = replaced(self._obs, ended, fresh)
         return self._obs
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"seed": self._seed, **self._log.to_plain()}
+
+    def restore(self, saved: Any, obs: Any) -> list[int]:
+        if not isinstance(saved, dict) or {*saved} != {"seed", "n_operations", "blocks"}:
+            raise ValueError("the record of actions is not one of EnvPool")
+        self._pool.close()
+        self._pool, self._log = self._make(whole("seed", saved["seed"], least=0)), self._new_log()
+        for which, action in replay(self._log, saved, self.env_id):
+            active = np.isin(np.arange(self.n_envs), which) if which is not None else None
+            if action is None:
+                self.reset() if active is None else self.reset_done(active)
+            elif active is None:
+                self._step_all(action)
+            else:
+                every = np.zeros((self.n_envs, *action.shape[1:]), action.dtype)
+                every[active] = action
+                self._step_some(every, active)
+        pairs = zip(jax.tree.leaves(self._obs), jax.tree.leaves(obs), strict=True)
+        if not all(np.array_equal(here, there) for here, there in pairs):
+            raise DivergedError(f"{self.env_id} on this EnvPool does not repeat the episodes of the run")
+        return []
 
     def success(self, step: Step, env: int) -> float:
         value = step.info.get("is_success", step.info.get("success"))

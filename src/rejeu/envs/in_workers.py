@@ -10,7 +10,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.envs import faults, goals as goals_module, worker_process
+from rejeu.envs import faults, goals as goals_module, state, worker_process
 from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.worker_process import Failure
 from rejeu.envs.workers import RESTARTED, TIMEOUT, Restarted, Workers
@@ -156,6 +156,23 @@ class InWorkers(VectorEnv):
 
     def goals(self) -> GoalFunctions | None:
         return goals_module.goal_functions(self._make_one())
+
+    def snapshot(self) -> list[Any] | None:
+        said = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
+        known = all(isinstance(one, list) for one in said.values())  # None: not offered; Restarted: lost just now
+        return [said[i] for i in range(self.n_envs)] if known else None
+
+    def restore(self, saved: Any, obs: Any) -> list[int]:
+        state.check_count(saved, self.n_envs)
+        answers = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
+        for i, answer in answers.items():
+            if not isinstance(answer, bool):
+                why = answer.message if isinstance(answer, Failure) else answer.why
+                raise ValueError(f"environment {i} cannot be restored: {why}")
+        for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
+            store[...] = leaf
+        self._seed = None
+        return [i for i, is_over in answers.items() if is_over]
 
     def close(self) -> None:
         """Ends the processes; a second call does nothing."""

@@ -1,14 +1,13 @@
-"""The whole state of running environments, taken out and put back, so that a run goes on in the middle of an episode.
+"""The whole state of a running environment, taken out and put back, so that a run resumes in the middle of an episode.
 
-It can be carried where it is known what an environment remembers: Gymnasium's classic control and MuJoCo environments, the
+It can be saved where it is known what an environment remembers: Gymnasium's classic control and MuJoCo environments, the
 ball, and any environment or wrapper with the two methods ::
 
     get_state() -> a dict of numbers, texts, lists, tuples, dicts and arrays
     set_state(state)
 
 which then answer for themselves and everything inside, random numbers included; around them, the wrappers of Gymnasium and
-rejeu that are listed here. Nothing can be carried of EnvPool, which does not offer it, of Box2D and highway-env, whose
-worlds are not plain data, and of vector environments that were given ready-made.
+rejeu that are listed here. It cannot be saved of Box2D and highway-env, whose worlds are not plain data.
 """
 
 from __future__ import annotations
@@ -16,15 +15,13 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
-import jax
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs import classic_control
 
 from rejeu.envs.ball import Ball
-from rejeu.envs.masks import MaskedVector, MaskInObservation
+from rejeu.envs.mask_wrapper import MaskInObservation
 from rejeu.envs.monitor import Monitor
-from rejeu.envs.vector import InProcess, VectorEnv
 
 STATELESS = (
     wrappers.ClipAction,
@@ -71,34 +68,6 @@ LISTS = ("rewards", "episode_returns", "episode_lengths", "episode_times")
 """Attributes of a Monitor that are lists of numbers, one for each step or episode."""
 ABSENT = "absent"
 """Stands for an attribute that is not there yet, as ``last_u`` before the first step."""
-
-
-def carried(env: VectorEnv) -> list[Any] | None:
-    """Returns the state of each environment as plain data (see :mod:`rejeu.plain`), None where it cannot be carried."""
-    if isinstance(env, MaskedVector):
-        return carried(env.inner)
-    if not isinstance(env, InProcess):
-        return None
-    states = [state_of(one) for one in env.envs]
-    return None if any(state is None for state in states) else states
-
-
-def put_back(env: VectorEnv, states: list[Any], obs: Any) -> None:
-    """Puts the states that :func:`carried` returned into environments of the same kind, ``obs`` being their observations.
-
-    Raises:
-        ValueError: if they do not fit.
-    """
-    if isinstance(env, MaskedVector):
-        shown = {"observation": obs.obs, "action_mask": obs.mask.astype(np.int8)}
-        return put_back(env.inner, states, shown)
-    if not isinstance(env, InProcess) or len(states) != env.n_envs:
-        raise ValueError(f"{len(states)} states do not fit {env.n_envs} environments of the {env.backend} backend")
-    for one, state in zip(env.envs, states, strict=True):
-        restore(one, state)
-    for store, leaf in zip(jax.tree.leaves(env._obs), jax.tree.leaves(obs), strict=True):
-        store[...] = leaf
-    env._seed = None  # they have been reset, in another process
 
 
 def state_of(env: gym.Env) -> list[Any] | None:
@@ -168,14 +137,14 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
         layer.unwrapped.np_random.bit_generator.state = state["rng"]
 
 
-def over(env: VectorEnv) -> list[int]:
-    """Returns which environments must be reset before they can be stepped, as far as their layers say so."""
-    if isinstance(env, MaskedVector):
-        return over(env.inner)
-    return [i for i, one in enumerate(env.envs) if _is_over(one)] if isinstance(env, InProcess) else []
+def check_count(states: Any, n_envs: int) -> None:
+    """Raises ``ValueError`` unless ``states`` is a list with one entry per environment."""
+    if not isinstance(states, list) or len(states) != n_envs:
+        raise ValueError(f"the states are not those of {n_envs} environments")
 
 
-def _is_over(env: gym.Env) -> bool:
+def is_over(env: gym.Env) -> bool:
+    """Returns whether an environment must be reset before it can be stepped, as far as its layers say so."""
     layer = env
     while isinstance(layer, gym.Wrapper):
         if isinstance(layer, Monitor) and layer.needs_reset:

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from rejeu.envs import answers, conversions, faults
+from rejeu.envs import answers, conversions, faults, state
 from rejeu.envs.vec_env import is_wrapped
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves
@@ -124,6 +124,11 @@ def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
         from rejeu.video import rgb_frame  # which imports what imports this module
 
         return env.render() if env.render_mode == "human" else rgb_frame(env)
+    if name == "snapshot":
+        return state.state_of(env)
+    if name == "restore":
+        state.restore(env, arguments[0])
+        return state.is_over(env)
     if name == "get_attr":
         return env.get_wrapper_attr(arguments[0])
     if name == "set_attr":

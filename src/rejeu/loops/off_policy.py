@@ -64,12 +64,12 @@ def off_policy(
     began = time.perf_counter() - run.seconds["total"]
     per_turn = updates_per_turn(config, n_envs)
     check_state(run, compiled)
-    if run.obs is None:
-        restart(run)
-        run.replay.begin(run.obs)
-    if run.action is None:
-        run.action = np.asarray(choose_or_draw(run, compiled, config, clock_of(run, 0.0)))
     while last is None or run.step < last:
+        if run.obs is None or env.must_reset:
+            restart(run)
+            run.replay.begin(run.obs)
+        if run.action is None:
+            run.action = np.asarray(choose_or_draw(run, compiled, config, clock_of(run, progress(run.step - first))))
         remaining = counted(run, n_envs, last)
         active = None if remaining is None else np.arange(remaining)
         t0 = time.perf_counter()

@@ -59,13 +59,13 @@ def on_policy(
     first, last = run.step, None if n_steps is None else run.step + n_steps
     began = time.perf_counter() - run.seconds["total"]
     check_state(run, compiled)
-    if run.obs is None:
-        restart(run)
-        if rollout.length and config.n_episodes is None:
-            rollout.cut()
-        else:
-            begin(run, config)
     while last is None or run.step < last:
+        if run.obs is None or (env.must_reset and not rollout.length):
+            restart(run)
+            if rollout.length and config.n_episodes is None:
+                rollout.cut()
+            else:
+                begin(run, config)
         t0 = time.perf_counter()
         run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
         run.watch.read(run, compiled)  # while the rollout that it learnt from still stands

@@ -1,0 +1,164 @@
+"""What was done to environments since they were made, recorded so that it can be done again.
+
+Environments that keep their state to themselves, but are deterministic given their seed and the actions, are restored by
+replaying them. A log is a sequence of operations: a step of all environments, a step of some, a reset of all, a reset of some.
+An operation is stored as one byte for its kind, a bit per environment where it is for some, and the actions; blocks of about a
+megabyte are compressed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from rejeu.config import whole
+from rejeu.spaces import action_scaler, check_env_actions, random_action
+
+STEP, STEP_SOME, RESET, RESET_SOME = range(4)
+BLOCK = 2**20
+"""Bytes of operations that are compressed together."""
+MOST_STEPS = 500_000
+"""Environment steps after which a log is full; replaying takes 10 to 60 microseconds a step."""
+MOST_IMAGE_STEPS = 100_000
+"""The same for environments that draw images, which take about ten times as long."""
+MOST_BYTES = 2**24
+"""Bytes of actions after which a log is full, whatever the number of steps."""
+MANY_OPERATIONS = 20_000
+"""Operations from which on replaying shows a progress bar."""
+
+
+class Operation(NamedTuple):
+    """One call of the environments."""
+
+    which: np.ndarray | None
+    """Indices of the environments, ``int32 (k,)``; None for all."""
+    action: np.ndarray | None
+    """Their actions ``(k, ...)`` in the environment's own range; None for a reset."""
+
+
+class ActionLog:
+    """The operations on ``n_envs`` environments since they were made. Mutable."""
+
+    def __init__(self, n_envs: int, action_space: gym.Space, most_steps: int = MOST_STEPS) -> None:
+        self.n_envs = n_envs
+        self.n_steps = 0
+        """Environment steps taken, over all environments."""
+        self.n_operations = 0
+        example = action_scaler(action_space)(random_action(action_space, 1, np.random.default_rng(0)))
+        self._space, self._dtype, self._shape = action_space, example.dtype, example.shape[1:]
+        self._row_bytes = example.nbytes
+        self._most_steps = min(most_steps, MOST_BYTES // max(self._row_bytes, 1))
+        self._blocks: list[np.ndarray] = []
+        self._open = bytearray()
+
+    @property
+    def is_full(self) -> bool:
+        """Whether so much was recorded that replaying it would take too long."""
+        return self.n_steps >= self._most_steps
+
+    def step(self, action: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
+        """Records a step and returns the actions in the form in which they are recorded, ``(k, ...)``.
+
+        Args:
+            action: of all environments, or of those in ``which``.
+            which: indices of the environments that are stepped; None for all.
+        """
+        rows = self.n_envs if which is None else len(which)
+        action = np.ascontiguousarray(action, self._dtype).reshape(rows, *self._shape)
+        self._add(STEP if which is None else STEP_SOME, which, action.tobytes())
+        self.n_steps += rows
+        return action
+
+    def reset(self, which: np.ndarray | None = None) -> None:
+        """Records a reset of all environments, or of those in ``which``."""
+        self._add(RESET if which is None else RESET_SOME, which, b"")
+
+    def _add(self, kind: int, which: np.ndarray | None, action: bytes) -> None:
+        self.n_operations += 1
+        self._open.append(kind)
+        if which is not None:
+            flags = np.zeros(self.n_envs, bool)
+            flags[which] = True
+            self._open += np.packbits(flags).tobytes()
+        self._open += action
+        if len(self._open) >= BLOCK:
+            self._blocks.append(_compressed(self._open))
+            self._open = bytearray()
+
+    def to_plain(self) -> dict[str, Any]:
+        """Returns the log as plain data (see :mod:`rejeu.plain`)."""
+        return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
+
+    def operations(self, saved: dict[str, Any]) -> Iterator[Operation]:
+        """Yields the operations of a log that :meth:`to_plain` returned, oldest first.
+
+        Raises:
+            ValueError: if it is damaged, or of other environments.
+        """
+        n_flags = (self.n_envs + 7) // 8
+        longest = BLOCK + 1 + n_flags + self.n_envs * self._row_bytes
+        for block in saved["blocks"]:
+            data, at = _expanded(block, longest), 0
+            while at < len(data):
+                kind = data[at]
+                at += 1
+                if kind > RESET_SOME:
+                    raise ValueError(f"{kind} is no kind of operation")
+                which = None
+                if kind in (STEP_SOME, RESET_SOME):
+                    flags = np.unpackbits(_part(data, at, n_flags).view(np.uint8), count=self.n_envs)
+                    which = np.flatnonzero(flags).astype(np.int32)
+                    at += n_flags
+                action = None
+                if kind in (STEP, STEP_SOME):
+                    rows = self.n_envs if which is None else len(which)
+                    action = _part(data, at, rows * self._row_bytes).view(self._dtype).reshape(rows, *self._shape)
+                    check_env_actions(self._space, action, "the record of actions")
+                    at += rows * self._row_bytes
+                yield Operation(which, action)
+
+
+def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[Operation]:
+    """Yields the operations of a saved log, with a progress bar on a terminal if they are many.
+
+    Raises:
+        ValueError: if the log is damaged.
+    """
+    n = whole("n_operations", saved["n_operations"], least=0)
+    console = Console(stderr=True)
+    hidden = n < MANY_OPERATIONS or not (console.is_terminal or console.is_jupyter)
+    operations = log.operations(saved)
+    text = f"Replaying {title}"
+    yield from track(operations, text, total=n, console=console, transient=True, disable=hidden)
+    if log.n_operations != n:
+        raise ValueError(f"the record of actions holds {log.n_operations} operations, expected {n}")
+
+
+def _compressed(data: bytearray) -> np.ndarray:
+    return np.frombuffer(zlib.compress(bytes(data), 1), np.uint8)
+
+
+def _expanded(block: Any, longest: int) -> bytes:
+    """Returns the bytes of a block, of which there may be at most ``longest``."""
+    if not isinstance(block, np.ndarray) or block.dtype != np.uint8 or block.ndim != 1:
+        raise ValueError("a block of the record of actions is no array of bytes")
+    reader = zlib.decompressobj()
+    try:
+        data = reader.decompress(block.tobytes(), longest)
+    except zlib.error as error:
+        raise ValueError(f"a block of the record of actions is damaged: {error}") from None
+    if not reader.eof:
+        raise ValueError("a block of the record of actions is too long or cut short")
+    return data
+
+
+def _part(data: bytes, at: int, n: int) -> np.ndarray:
+    if at + n > len(data):
+        raise ValueError("the record of actions is cut short")
+    return np.frombuffer(data, np.uint8, n, at).copy()
