@@ -11,6 +11,7 @@ import numpy as np
 
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.spaces import scale_action
+from rejeu.text import counted
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Evaluation:
         low, high = self.return_interval
         text = (
             f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % interval of the mean {low:.2f} to {high:.2f}), "
-            f"length {self.mean_length:.1f}, {len(self.returns)} episodes"
+            f"length {self.mean_length:.1f}, {counted(len(self.returns), 'episode')}"
         )
         if not math.isnan(self.success_rate):
             low, high = self.success_interval
