@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,6 @@ import numpy as np
 
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.spaces import scale_action
-from rejeu.text import counted
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Evaluation:
         low, high = self.return_interval
         text = (
             f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % interval of the mean {low:.2f} to {high:.2f}), "
-            f"length {self.mean_length:.1f}, {counted(len(self.returns), 'episode')}"
+            f"length {self.mean_length:.1f}, {len(self.returns)} episodes"
         )
         if not math.isnan(self.success_rate):
             low, high = self.success_interval
@@ -138,6 +138,9 @@ def evaluate_policy(
     Where vector wrappers such as ``VecNormalize`` change rewards, the returns are those that a ``Monitor`` beneath them
     counted, if there is one.
 
+    An agent that trains on the same environments goes on
+    with new episodes there.
+
     Args:
         model: anything with ``predict(obs, state=..., episode_start=..., deterministic=...) -> (action, state)``.
         env: a Gymnasium environment, a vector environment, an id, or a function that makes an environment.
@@ -152,8 +155,11 @@ def evaluate_policy(
     Raises:
         ValueError: if the mean return is below ``reward_threshold``.
     """
-    vector = make_vector(env)
+    from rejeu.agents import Agent  # which imports this module
+    from rejeu.agents.evaluating import lent
 
+    agent = model if isinstance(model, Agent) else None
+    vector = make_vector(env)
     memory: Any = None
 
     def policy(obs: Any, began: np.ndarray) -> np.ndarray:
@@ -168,26 +174,27 @@ def evaluate_policy(
     episode_counts = np.zeros(vector.n_envs, int)
     episode_rewards: list[float] = []
     episode_lengths: list[int] = []
-    observations, dones = vector.reset(), np.ones(vector.n_envs, bool)
-    while len(episode_rewards) < n_eval_episodes:
-        actions = policy(observations, dones)
-        step = vector.step(actions)
-        rewards, dones, infos = step.reward, step.terminated | step.truncated, step.info
-        current_rewards += rewards
-        current_lengths += 1
-        for i in range(vector.n_envs):
-            if callback is not None and episode_counts[i] < share[i]:
-                reward, done, info = rewards[i], dones[i], infos[i] if isinstance(infos, list) else infos
-                callback(locals(), globals())
-            if dones[i]:
-                if episode_counts[i] < share[i]:
-                    episode_rewards.append(step.return_of(i, current_rewards[i]))
-                    episode_lengths.append(int(current_lengths[i]))
-                    episode_counts[i] += 1
-                current_rewards[i] = current_lengths[i] = 0
-        observations = vector.reset_done(dones) if dones.any() else step.obs
-        if render and hasattr(env, "render"):
-            env.render()
+    with nullcontext() if agent is None else lent(agent, vector):
+        observations, dones = vector.reset(), np.ones(vector.n_envs, bool)
+        while len(episode_rewards) < n_eval_episodes:
+            actions = policy(observations, dones)
+            step = vector.step(actions)
+            rewards, dones, infos = step.reward, step.terminated | step.truncated, step.info
+            current_rewards += rewards
+            current_lengths += 1
+            for i in range(vector.n_envs):
+                if callback is not None and episode_counts[i] < share[i]:
+                    reward, done, info = rewards[i], dones[i], infos[i] if isinstance(infos, list) else infos
+                    callback(locals(), globals())
+                if dones[i]:
+                    if episode_counts[i] < share[i]:
+                        episode_rewards.append(step.return_of(i, current_rewards[i]))
+                        episode_lengths.append(int(current_lengths[i]))
+                        episode_counts[i] += 1
+                    current_rewards[i] = current_lengths[i] = 0
+            observations = vector.reset_done(dones) if dones.any() else step.obs
+            if render and hasattr(env, "render"):
+                env.render()
     mean, std = float(np.mean(episode_rewards)), float(np.std(episode_rewards))
     if reward_threshold is not None and not mean > reward_threshold:
         raise ValueError(f"the mean return {mean:.2f} is not above reward_threshold={reward_threshold:.2f}")

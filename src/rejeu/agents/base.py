@@ -192,6 +192,19 @@ class Agent(ABC):
     def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         """Returns the loop."""
 
+    @abstractmethod
+    def _begin_episodes(self) -> None:
+        """Begins an episode in every environment."""
+
+    def _give_up_episodes(self) -> None:
+        """Gives up the running episodes, of whose environments somebody else has made use.
+
+        New ones begin with the next ``learn``; within one at once, so that a checkpoint of this step can hold them.
+        """
+        self._run.obs = self._run.action = None
+        if self._learning:
+            self._begin_episodes()
+
     @property
     def name(self) -> str:
         """The algorithm's name."""
@@ -351,9 +364,13 @@ class Agent(ABC):
             env: where, as for the constructor; None: new environments like the agent's own if it was given an id,
                 else the agent's own, whose running episodes are then given up.
             deterministic: the policy's mode; False draws from the policy.
-            seed: of the environments; None draws one.
+            seed: of the environments, the agent's own included; None draws one for new environments, and lets the
+                random numbers of others go on.
             success_threshold: return from which on an episode counts as a success where the environment does not say;
                 None takes the agent's own.
+
+        It may be called by a callback while the agent learns. Where it plays in the environments that the agent trains
+        on, be they given or not, training goes on in new episodes.
         """
         return evaluating.play(self, episodes, env, deterministic, seed, success_threshold)
 
@@ -368,7 +385,7 @@ class Agent(ABC):
         if env is None:
             return None
         if not self._learning:
-            self._run.obs = self._run.action = None
+            self._give_up_episodes()
         if env.venv is None:
             inside = env.envs if isinstance(env, InProcess) else []
             env.venv = around(inside) if inside else AutoResetView(env)
@@ -390,7 +407,13 @@ class Agent(ABC):
 
         Raises:
             ValueError: if the spaces differ.
+            RuntimeError: while it learns.
         """
+        if self._learning:
+            raise RuntimeError(
+                "set_env was called while the agent learns; stop training first (a callback that returns False), then "
+                "call set_env and learn(..., reset_num_timesteps=False)"
+            )
         vector = self._vector(env, 1, seed=self.seed)
         self._check_spaces(vector, "the new environment")
         self._own_env = isinstance(env, str)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rejeu.agents import predicting
+from rejeu.envs.auto_reset import identities
 from rejeu.envs.vec_normalize import unwrap_vec_normalize
 from rejeu.envs.vector import VectorEnv
 from rejeu.evaluation import Evaluation, evaluate
@@ -28,23 +30,38 @@ def play(
     run = agent._run
     if env is None and run.env is None:
         raise ValueError("this agent has no environment; give one: evaluate(env=...)")
-    own = env is None and not agent._own_env
-    if own:
-        vector = run.env
-    elif env is None:
-        vector = agent._vector(run.env.env_id, min(episodes, 16), run.env.backend, seed)
-    else:
+    made_here = isinstance(env, str) or callable(env)
+    if env is not None:
         vector = agent._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
+    elif agent._own_env:
+        vector = agent._vector(run.env.env_id, min(episodes, 16), run.env.backend, seed)
+        made_here = True
+    else:
+        vector = run.env
     try:
         agent._check_spaces(vector, "the environment to evaluate in")
         check_scaled(agent, vector)
-        again = seed if isinstance(env, VectorEnv) else None  # others have just been made with it
-        return evaluate(policy(agent, deterministic), vector, episodes, threshold, again)
+        again = None if made_here else seed  # others have just been made with it
+        with lent(agent, vector):
+            return evaluate(policy(agent, deterministic), vector, episodes, threshold, again)
     finally:
-        if own:
-            run.obs = run.action = None
-        elif env is None or isinstance(env, str) or callable(env):
+        if made_here:
             vector.close()
+
+
+@contextmanager
+def lent(agent: Agent, vector: VectorEnv) -> Iterator[None]:
+    """While entered, ``vector`` may be played in: if the agent trains on the same environments, its episodes are given up.
+
+    Training goes on in new ones, whether it is under way or still to come.
+    """
+    run = agent._run
+    shared = run.env is not None and not identities(run.env).isdisjoint(identities(vector))
+    if shared:
+        run.obs = run.action = None  # also if playing fails
+    yield
+    if shared:
+        agent._give_up_episodes()
 
 
 def policy(agent: Agent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:

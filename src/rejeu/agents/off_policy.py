@@ -19,7 +19,7 @@ from rejeu.envs.vector import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise
 from rejeu.loops.host import Progress
-from rejeu.loops.off_policy import off_policy
+from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer, counters
 from rejeu.replay.prioritized import Priorities
 from rejeu.replay.ring import Ring
@@ -65,8 +65,8 @@ class OffPolicyAgent(Agent):
         except ValueError as error:
             raise CheckpointError(f"{path}: {loading.brief(error)}") from None
         self._run.learn_from = self.config.learning_starts
-        self._run.obs = self._run.action = None
         self._run.td_errors = []  # of steps that are gone
+        self._give_up_episodes()
 
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return make_vector(env, n_envs, backend, seed)
@@ -86,6 +86,9 @@ class OffPolicyAgent(Agent):
 
     def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         return off_policy(self._run, self._compiled, self.config, n_steps, progress)
+
+    def _begin_episodes(self) -> None:
+        begin_episodes(self._run)
 
     def _make_buffer(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
         config = self.config

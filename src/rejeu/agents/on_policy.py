@@ -19,7 +19,7 @@ from rejeu.envs.masks import make_masked, mask_leaf, n_choices
 from rejeu.envs.vector import Backend, VectorEnv, make_vector
 from rejeu.exploration.noise import Noise
 from rejeu.loops.host import Progress
-from rejeu.loops.on_policy import on_policy
+from rejeu.loops.on_policy import begin_episodes, on_policy
 from rejeu.replay.rollout import RolloutBuffer
 
 
@@ -52,6 +52,9 @@ class OnPolicyAgent(Agent):
 
     def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         return on_policy(self._run, self._compiled, self.config, n_steps, progress)
+
+    def _begin_episodes(self) -> None:
+        begin_episodes(self._run, self.config)
 
     def _make_buffer(self, env: VectorEnv) -> RolloutBuffer:
         config = self.config

@@ -12,7 +12,6 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from rejeu.cli import run_folder, settings
 from rejeu.cli.run_folder import Which
-from rejeu.text import counted
 
 if TYPE_CHECKING:
     from rejeu.play import Game
@@ -96,6 +95,6 @@ def scores(game: Game) -> str:
     lines = []
     for player in game.players:
         n = len(player.scores)
-        told = counted(n, "episode")
+        told = f"{n} episode{'s' if n != 1 else ''}"
         lines.append(f"{player.name}: {told}" + (f", mean {player.mean:.2f}, best {player.best:.2f}" if n else ""))
     return "\n".join(lines)

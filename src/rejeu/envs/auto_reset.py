@@ -18,7 +18,9 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs import answers, conversions, faults
 from rejeu.envs.contract import VectorEnv
+from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
+from rejeu.envs.masks import MaskedVector
 from rejeu.envs.vec_env import Indices, StepResult, VecEnv, VecEnvWrapper, is_wrapped, tile
 from rejeu.errors import BadEnvironmentError
 from rejeu.video import VideoFile, check_renders, rgb_frame
@@ -158,10 +160,16 @@ def around(envs: Sequence[gym.Env]) -> DummyVecEnv:
 
 
 def identities(env: VectorEnv | VecEnv) -> set[int]:
-    """Identifies a vector and the environments behind it, so that two vectors around the same ones are recognised."""
+    """Identifies a vector and the environments behind it, so that two vectors around the same ones are recognized."""
+    if isinstance(env, MaskedVector):
+        return {id(env)} | identities(env.inner)
+    if isinstance(env, AutoResetView):
+        return {id(env)} | identities(env.vector)
+    if isinstance(env, GymnasiumVector):
+        return {id(env), id(env.env.unwrapped)}
     venv = env if isinstance(env, VecEnv) else env.venv
     vectors = (env, env if venv is None else venv.unwrapped)
-    inside = [one for vector in vectors if isinstance(vector, InProcess | DummyVecEnv) for one in vector.envs]
+    inside = [one.unwrapped for vector in vectors if isinstance(vector, InProcess | DummyVecEnv) for one in vector.envs]
     return {id(one) for one in (*vectors, *inside)}
 
 

@@ -66,8 +66,7 @@ def off_policy(
     check_state(run, compiled)
     while last is None or run.step < last:
         if run.obs is None or env.must_reset:
-            restart(run)
-            run.replay.begin(run.obs)
+            begin_episodes(run)
         if run.action is None:
             run.action = np.asarray(choose_or_draw(run, compiled, config, clock_of(run, progress(run.step - first))))
         remaining = counted(run, n_envs, last)
@@ -123,6 +122,12 @@ def off_policy(
         run.seconds["total"] = t7 - began
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, taken, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
+
+
+def begin_episodes(run: Run) -> None:
+    """Begins an episode in every environment; those that run are given up."""
+    restart(run)
+    run.replay.begin(run.obs)
 
 
 def choose_or_draw(run: Run, compiled: Compiled, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:

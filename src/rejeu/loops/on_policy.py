@@ -61,11 +61,7 @@ def on_policy(
     check_state(run, compiled)
     while last is None or run.step < last:
         if run.obs is None or (env.must_reset and not rollout.length):
-            restart(run)
-            if rollout.length and config.n_episodes is None:
-                rollout.cut()
-            else:
-                begin(run, config)
+            begin_episodes(run, config)
         t0 = time.perf_counter()
         run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
         run.watch.read(run, compiled)  # while the rollout that it learnt from still stands
@@ -103,6 +99,18 @@ def on_policy(
         run.seconds["update"] += (t1 - t0) + (t5 - t4)
         run.seconds["total"] = t5 - began
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
+
+
+def begin_episodes(run: Run, config: OnPolicyConfig) -> None:
+    """Begins an episode in every environment; those that run are given up.
+
+    The rollout under way keeps its steps, unless it is to hold whole episodes: then it begins again too.
+    """
+    restart(run)
+    if run.replay.length and config.n_episodes is None:
+        run.replay.cut()
+    else:
+        begin(run, config)
 
 
 def begin(run: Run, config: OnPolicyConfig) -> None:
