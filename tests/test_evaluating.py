@@ -211,3 +211,71 @@ def test_an_agent_without_environment_may_be_evaluated(tmp_path):
     agent = rejeu.load(small_sac(Reach()).save(tmp_path / "model"))
     assert len(agent.evaluate(3, env=InProcess([Reach()])).returns) == 3
     assert len(evaluate_policy(agent, Reach(), 3, return_episode_rewards=True)[0]) == 3
+
+
+# Action masks.
+
+
+class One(gym.Env):
+    """Allows one of ten actions at a time and counts the others; episodes of 6 steps."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(10)
+
+    def __init__(self):
+        self.taken = self.illegal = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self._see()
+
+    def step(self, action):
+        self.taken += 1
+        legal = action == self.allowed
+        self.illegal += not legal
+        self.time += 1
+        obs, info = self._see()
+        return obs, float(legal), False, self.time == 6, info
+
+    def _see(self):
+        self.allowed = int(self.np_random.integers(10))
+        return np.zeros(1, np.float32), {"action_mask": np.arange(10) == self.allowed}
+
+
+@pytest.fixture(scope="module")
+def masked():
+    """An agent that takes masks; tests may train it."""
+    return rejeu.MaskablePPO("MlpPolicy", One(), n_steps=12, batch_size=12, policy_kwargs={"net_arch": [4]}, seed=0)
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, lambda env: DummyVecEnv([lambda: env]), lambda env: InProcess([env])]
+)
+def test_evaluate_policy_keeps_to_the_masks(masked, wrap, deterministic):
+    env = One()
+    mean, _ = evaluate_policy(masked, wrap(env), 3, deterministic)
+    assert (env.taken, env.illegal) == (18, 0)
+    assert mean == 6.0
+
+
+def test_eval_callback_keeps_to_the_masks(masked):
+    env = One()
+    callback = EvalCallback(env, eval_freq=12, n_eval_episodes=3, verbose=0)
+    masked.learn(24, callback=callback)
+    assert (env.taken, env.illegal) == (36, 0)
+    assert callback.best_mean_reward == 6.0
+
+
+def test_an_evaluation_whose_masks_cannot_be_reached_is_refused_before_training(masked):
+    from rejeu.envs.vec_wrappers import VecMonitor
+
+    with pytest.raises(TypeError, match="the masks of SelfResetting cannot be reached"):
+        masked.learn(12, callback=EvalCallback(VecMonitor(DummyVecEnv([One])), eval_freq=12))
+
+
+def test_a_masked_agent_may_be_evaluated_in_its_own_environment_while_it_learns(masked):
+    env = masked.env.inner.envs[0].env
+    masked.learn(24, every(7, lambda agent: (agent.evaluate(1, env=env), evaluate_policy(agent, env, 1))))
+    assert env.illegal == 0

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.core import Masked
+from rejeu.envs.masks import make_masked
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.spaces import scale_action
 
@@ -138,7 +140,7 @@ def evaluate_policy(
     Where vector wrappers such as ``VecNormalize`` change rewards, the returns are those that a ``Monitor`` beneath them
     counted, if there is one.
 
-    An agent that trains on the same environments goes on
+    An agent that takes action masks is given those of the environment. An agent that trains on the same environments goes on
     with new episodes there.
 
     Args:
@@ -154,17 +156,21 @@ def evaluate_policy(
 
     Raises:
         ValueError: if the mean return is below ``reward_threshold``.
+        TypeError: if the model takes action masks, and those of the environment cannot be reached.
     """
     from rejeu.agents import Agent  # which imports this module
     from rejeu.agents.evaluating import lent
 
     agent = model if isinstance(model, Agent) else None
-    vector = make_vector(env)
+    vector = make_masked(env) if agent is not None and agent.takes_masks else make_vector(env)
     memory: Any = None
 
     def policy(obs: Any, began: np.ndarray) -> np.ndarray:
         nonlocal memory
-        action, memory = model.predict(obs, state=memory, episode_start=began, deterministic=deterministic)
+        masks = {}
+        if isinstance(obs, Masked):
+            obs, masks["action_masks"] = obs
+        action, memory = model.predict(obs, state=memory, episode_start=began, deterministic=deterministic, **masks)
         return action
 
     if n_eval_episodes < 1:

@@ -11,6 +11,7 @@ import numpy as np
 from rejeu.checkpoint import SUFFIX
 from rejeu.config import whole
 from rejeu.envs.auto_reset import around, identities
+from rejeu.envs.masks import make_masked
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vec_normalize import sync_envs_normalization
 from rejeu.evaluation import evaluate_policy
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 class EvalCallback(EventCallback):
     """Evaluates every so many calls, keeps the best model and writes down every result.
+
+    An agent that takes action masks is given those of ``eval_env``, which must be a Gymnasium environment or a
+    ``DummyVecEnv``.
 
     If the agent trains in a ``VecNormalize``, ``eval_env`` must be wrapped alike, with ``training=False``; its statistics
     are copied before each evaluation.
@@ -97,8 +101,11 @@ class EvalCallback(EventCallback):
 
         Raises:
             ValueError: if it was given the environments that the agent trains on.
+            TypeError: if the agent takes action masks, and those of ``eval_env`` cannot be reached.
         """
         super().init_callback(model)
+        if model.takes_masks:
+            make_masked(self.eval_env)
         if identities(self.training_env) & identities(self.eval_env):
             raise ValueError("EvalCallback was given the environments that the agent trains on; give it others")
         if self.callback_on_new_best is not None:
