@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from rejeu.envs.ball_drawing import BallDrawing
+
+if TYPE_CHECKING:
+    from rejeu.figures import Picture
 
 WALL = 10.0
 """The box is [-WALL, WALL] in every dimension."""
@@ -96,11 +100,10 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self.position = self.np_random.uniform(-STRONGEST_PUSH, STRONGEST_PUSH, self.dimension).tolist()
         self.n_steps = 0
         self.over = False
-        if self.render_mode is not None:
-            self._trail.clear()
-            self._trail.append(tuple(self.position))
-            self._push = []
-            self._show()
+        self._trail.clear()
+        self._trail.append(tuple(self.position))
+        self._push = []
+        self._show()
         return self._observe(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -125,12 +128,27 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self.n_steps += 1
         held = not lost and self.n_steps >= N_STEPS
         self.over = lost or held
-        if self.render_mode is not None:
-            self._trail.append(tuple(position))
-            self._push = pushes
-            self._show()
+        self._trail.append(tuple(position))
+        self._push = pushes
+        self._show()
         reward = LOST_REWARD if lost else HELD_REWARD if held else 1.0
         return self._observe(), reward, lost, held, {"is_success": held} if self.over else {}
+
+    @property
+    def trajectory(self) -> np.ndarray:
+        """The positions of the episode so far, ``float64 (n_steps + 1, dimension)``, where it left the box included."""
+        return np.array(self._trail, np.float64).reshape(-1, self.dimension)
+
+    def plot(self, path: str | Path | None = None) -> Picture:
+        """Returns :attr:`trajectory` as a matplotlib figure, which a notebook shows by itself; see :mod:`rejeu.plots`.
+
+        Raises:
+            MissingExtra: if matplotlib is not installed.
+            ValueError: before the first reset.
+        """
+        from rejeu import plots
+
+        return plots.trajectory(self.trajectory, path, low=-WALL, high=WALL)
 
     def get_state(self) -> dict[str, Any]:
         """Returns everything that the further course depends on, as JSON values; :meth:`set_state` puts it back."""
@@ -142,7 +160,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continues where :meth:`get_state` was called, exactly; the trail that is drawn begins here.
+        """Continues where :meth:`get_state` was called, exactly; the trajectory begins here.
 
         Raises:
             ValueError: if the state is of another dimension, or no episode can stand there.

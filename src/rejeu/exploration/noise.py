@@ -36,6 +36,8 @@ class ActionNoise(ABC):
     (2,)
     """
 
+    mean: tuple[float, ...]
+    sigma: tuple[float, ...]
     _by_hand: _ByHand | None = None
 
     @abstractmethod

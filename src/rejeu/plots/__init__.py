@@ -4,6 +4,8 @@ They are drawn without a display and without matplotlib's global state. Every fu
 and returns the figure.
 """
 
+from rejeu.plots.exploration import noise, repulsive_boundary, saturation
 from rejeu.plots.learning import learning_curve
+from rejeu.plots.trajectories import trajectory
 
-__all__ = ["learning_curve"]
+__all__ = ["learning_curve", "noise", "repulsive_boundary", "saturation", "trajectory"]

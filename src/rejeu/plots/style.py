@@ -63,7 +63,7 @@ def head(panel: Axes, title: str) -> None:
         panel.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=4, borderaxespad=0.2, **style)
 
 
-def thousands(value: float, _: int | None = None) -> str:
+def thousands(value: float, _: float | None = None) -> str:
     """Returns a number with thousands separators and a true minus sign.
 
     >>> thousands(12500.0)
