@@ -1,0 +1,245 @@
+"""Kills runs of many kinds at random moments, resumes each in a new process, and compares with a run that nothing interrupted.
+
+    python trials/kill_processes.py --kills 20 --only parking lunar
+    python trials/kill_processes.py --kills 4
+
+Every life of a run is a process of its own, as ``rejeu resume`` is: large networks, many environments, EnvPool, worker
+processes, priorities, n-step returns, hindsight, normalization and noise on parameters. The run that is not interrupted saves
+no checkpoints. Everything learned, the buffers, the history but its clock, the generator's state and the best weights are
+compared bit for bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+RESULT = Path(__file__).parent / "results" / "kill_processes.json"
+LARGE = {"policy_kwargs": {"net_arch": [256, 256]}}
+SMALL = {"policy_kwargs": {"net_arch": [32, 32]}}
+REPLAY = {"learning_starts": 200, "batch_size": 64, "buffer_size": 4000}
+
+
+class Case(NamedTuple):
+    """One kind of run."""
+
+    algorithm: str
+    env_id: str
+    n_envs: int
+    backend: str
+    steps: int
+    every: int
+    """Environment steps between two checkpoints."""
+    settings: Callable[[], dict[str, Any]]
+
+
+def hindsight(**more: Any) -> dict[str, Any]:
+    import rejeu
+
+    return {"replay_buffer_class": rejeu.HerReplayBuffer, **more}
+
+
+def parameter_noise() -> dict[str, Any]:
+    import rejeu
+
+    return {**SMALL, **REPLAY, "action_noise": rejeu.ParameterNoise(), "normalize": True}
+
+
+CASES: dict[str, Case] = {
+    "parking": Case(
+        "SAC", "parking-v0", 8, "envpool", 56_000, 1000,
+        lambda: hindsight(learning_rate=1e-3, gamma=0.95, batch_size=128, policy_kwargs={"net_arch": [64, 64]}),
+    ),
+    "lunar": Case(
+        "PPO", "LunarLanderContinuous-v3", 16, "envpool", 400_000, 8000,
+        lambda: {"n_steps": 256, "batch_size": 512, "n_epochs": 4, "normalize": True},
+    ),
+    "A2C, 64 environments, 256-256": Case("A2C", "CartPole-v1", 64, "gymnasium", 40_000, 2000, lambda: dict(LARGE)),
+    "PPO, 64 environments, 256-256": Case(
+        "PPO", "CartPole-v1", 64, "gymnasium", 60_000, 4000,
+        lambda: {**LARGE, "n_steps": 32, "batch_size": 1024, "n_epochs": 2},
+    ),
+    "SAC, 256-256, batches of 512, normalized": Case(
+        "SAC", "Pendulum-v1", 4, "gymnasium", 2400, 200, lambda: {**LARGE, **REPLAY, "batch_size": 512, "normalize": True}
+    ),
+    "DQN, priorities, 3-step": Case(
+        "DQN", "CartPole-v1", 2, "gymnasium", 8000, 500, lambda: {**SMALL, **REPLAY, "priorities": {}, "n_steps": 3}
+    ),
+    "DDPG, noise on parameters, normalized": Case("DDPG", "Pendulum-v1", 2, "gymnasium", 8000, 500, parameter_noise),
+    "SAC, hindsight, priorities, 3-step": Case(
+        "SAC", "parking-v0", 4, "envpool", 8000, 500, lambda: hindsight(**SMALL, **REPLAY, priorities={}, n_steps=3)
+    ),
+    "SAC in worker processes": Case(
+        "SAC", "Pendulum-v1", 2, "gymnasium-async", 4000, 400, lambda: {**SMALL, **REPLAY}
+    ),
+    "RecurrentPPO": Case(
+        "RecurrentPPO", "rejeu/CartPoleNoVelocity-v0", 4, "gymnasium", 20_000, 1000,
+        lambda: {**SMALL, "n_steps": 64, "batch_size": 64},
+    ),
+}  # fmt: skip
+
+
+def vector(case: Case) -> Any:
+    import rejeu
+
+    return rejeu.make_vector(case.env_id, case.n_envs, case.backend, seed=3)
+
+
+def live(name: str, folder: str, kept: bool) -> None:
+    """Trains to the end, from the newest checkpoint if there is one; says where it began and a digest of all at the end."""
+    import rejeu
+    from rejeu.agents.checkpoints import run_files
+    from rejeu.callbacks import Checkpoint
+
+    case = CASES[name]
+    agent_class = rejeu.AGENTS[case.algorithm]
+    callbacks = [Checkpoint(folder, every=case.every)] if kept else []
+    env = vector(case)
+    restore, seconds = env.restore, [0.0]
+
+    def timed(saved: Any, obs: Any) -> list[int]:
+        began = time.perf_counter()
+        said = restore(saved, obs)
+        seconds[0] = time.perf_counter() - began
+        return said
+
+    env.restore = timed
+    if kept and run_files(Path(folder)):
+        agent = agent_class.resume(folder, env)
+        say(resumed=agent.num_timesteps, exact=agent.resumed.exact, replay=seconds[0], trained=agent.seconds["total"])
+        if agent.num_timesteps < case.steps:
+            agent.learn(callback=callbacks)
+    else:
+        policy = "MultiInputPolicy" if case.env_id == "parking-v0" else "MlpPolicy"
+        agent = agent_class(policy, env, seed=5, **case.settings())
+        say(resumed=0, exact=True, replay=0.0, trained=0.0)
+        agent.learn(case.steps, callback=callbacks)
+    say(digest=digest(agent), trained=agent.seconds["total"])
+    env.close()
+
+
+def say(**what: Any) -> None:
+    os.write(1, (json.dumps(what) + "\n").encode())
+
+
+def digest(agent: Any) -> dict[str, str]:
+    """Returns a hash of each array that a run consists of."""
+    import jax
+    import numpy as np
+
+    rows = agent.history.table()
+    rows[:, 5] = 0.0  # the clock
+    run = agent._run
+    best = {} if agent.best is None else {f"best.{i}": leaf for i, leaf in enumerate(agent.best.state)}
+    arrays = {
+        **agent.get_parameters(),
+        **{f"buffer.{key}": value for key, value in run.replay.arrays().items()},
+        **{f"obs.{i}": leaf for i, leaf in enumerate(jax.tree.leaves(run.obs))},
+        **{f"carry.{i}": leaf for i, leaf in enumerate(jax.tree.leaves(run.carry))},
+        **best,
+        "history": rows,
+        "counters": np.array([agent.num_timesteps, agent.n_updates]),
+        "generator": np.frombuffer(json.dumps(run.rng.bit_generator.state).encode(), np.uint8),
+    }
+    return {key: hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest() for key, value in arrays.items()}
+
+
+def start(name: str, folder: Path, kept: bool) -> subprocess.Popen[bytes]:
+    command = [sys.executable, __file__, "--live", name, str(folder), "kept" if kept else "not kept"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
+
+
+def said(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """Returns the next thing that a life says, empty if it has ended."""
+    line = process.stdout.readline()
+    return json.loads(line) if line else {}
+
+
+def finished(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """Returns what a life says at its end."""
+    last: dict[str, Any] = {}
+    while one := said(process):
+        last = one
+    if process.wait() or "digest" not in last:
+        raise SystemExit(f"a life ended with {process.returncode}")
+    return last
+
+
+def try_case(name: str, kills: int, rng: random.Random) -> dict[str, Any]:
+    case = CASES[name]
+    with tempfile.TemporaryDirectory() as root:
+        whole = finished(start(name, Path(root) / "none", kept=False))
+        folder = Path(root) / "run"
+        lives = []
+        began = time.monotonic()
+        done, end = 0, None
+        while end is None:
+            process = start(name, folder, kept=True)
+            first = said(process)
+            lives.append(first)
+            if done == kills:
+                end = finished(process)
+                break
+            time.sleep(rng.uniform(0.0, 1.4 * whole["trained"] / kills))  # random, once it has started
+            if process.poll() is not None:
+                end = finished(process)  # the run was over before its last kill
+                break
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            done += 1
+        resumed = [life for life in lives if life["resumed"]]
+        different = [key for key in whole["digest"] if whole["digest"][key] != end["digest"].get(key)]
+        return {
+            "case": name,
+            **{key: getattr(case, key) for key in ("algorithm", "env_id", "n_envs", "backend", "steps", "every")},
+            "kills": done,
+            "resumed_after_step_0": len(resumed),
+            "all_exact": all(life["exact"] for life in lives),
+            "arrays": len(whole["digest"]),
+            "arrays_that_differ": different,
+            "equal": not different and whole["digest"].keys() == end["digest"].keys(),
+            "seconds_of_training_without_kills": round(whole["trained"], 1),
+            "seconds_of_replaying": [round(life["replay"], 2) for life in resumed],
+            "seconds_trained_when_resumed": [round(life["trained"], 1) for life in resumed],
+            "seconds_in_all": round(time.monotonic() - began, 1),
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="*", choices=CASES, help="cases to try, instead of all")
+    parser.add_argument("--live", nargs=3, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.live:
+        name, folder, kept = arguments.live
+        live(name, folder, kept == "kept")
+        return
+    known = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    for name in arguments.only or CASES:
+        result = try_case(name, arguments.kills, random.Random(f"{arguments.seed} {name}"))
+        only = f' --only "{name}"'
+        known[name] = {"command": f"python trials/kill_processes.py --kills {arguments.kills}{only}", "commit": commit}
+        known[name] |= {"date": time.strftime("%Y-%m-%d"), **result}
+        print(json.dumps(known[name]), flush=True)
+        RESULT.parent.mkdir(parents=True, exist_ok=True)
+        RESULT.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
