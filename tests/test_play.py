@@ -15,8 +15,8 @@ from rejeu import play as play_package
 from rejeu.cli import main
 from rejeu.envs.registry import make_env
 from rejeu.play import Game, play, watch
-from rejeu.play.game import Pace
-from rejeu.play.window import Window
+from rejeu.play.game import Pace, Player
+from rejeu.play.window import HEADER, MARGIN, Window, message, so_far
 from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
 
 
@@ -336,6 +336,50 @@ def test_the_window_shows_both_pictures_side_by_side_and_the_keys_held():
         assert held > 100 > (shown[-30:] == (40, 104, 190)).all(2).sum()
 
     perform(script, play, LEVER, against=Pull())
+
+
+def test_messages_are_written_beside_the_picture():
+    def script(window, game):
+        def shows(text, grey):
+            picture = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)[
+                HEADER : HEADER + 300, MARGIN : MARGIN + 400
+            ]
+            assert message(game, game.players[0]) == text
+            assert (picture == grey).all()
+
+        yield
+        yield
+        shows("press a key to begin", 0)
+        tap("d")
+        yield
+        tap("p")
+        yield
+        shows("paused", 40)
+        tap("p")
+        down("d")
+        for _ in range(5):
+            yield
+        shows("success: 10", 200)
+
+    perform(script, play, LEVER)
+
+
+def test_a_lost_episode_is_called_failed():
+    def script(window, game):
+        down("a")
+        for _ in range(6):
+            yield
+        assert message(game, game.players[0]) == "failed: 0"
+
+    perform(script, play, LEVER)
+
+
+def test_scores_are_summed_up_once_there_is_one():
+    player = Player("you", None, None)
+    assert so_far(player, by_hand=False) == so_far(player, by_hand=True) == ""
+    player.scores.append(-3.0)
+    assert so_far(player, by_hand=False) == "mean -3 of 1 episode   best -3"
+    assert so_far(player, by_hand=True) == "best -3"
 
 
 def test_a_smaller_window_shows_everything_smaller():

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Discrete, MultiBinary
 
 from rejeu.play import keys
 from rejeu.play.known import KNOWN, full_name, keys_for
+from rejeu.play.window import legend
 
 LANDER, MOUNTAIN = Discrete(4), Discrete(3)
 
@@ -116,7 +117,10 @@ def test_unknown_actions_are_labelled_by_number():
     assert [b.label for b in keys_for("Other-v0", Box(-1, 1, (2,))).bindings] == [
         "number 1 down", "number 1 up", "number 2 down", "number 2 up"
     ]  # fmt: skip
-    assert [b.label for b in keys_for("Other-v0", Discrete(2, start=3), {"j": 4}).bindings][-2:] == ["action 4", "4"]
+    assert [b.label for b in keys_for("Other-v0", Discrete(2, start=3), {"j": 4}).bindings][-2:] == [
+        "action 4",
+        "action 4",
+    ]
 
 
 def test_box_actions_keep_their_shape_and_type():
@@ -129,7 +133,20 @@ def test_box_actions_keep_their_shape_and_type():
 def test_own_keys_change_those_that_are_known():
     bound = keys_for("MountainCar-v0", MOUNTAIN, {"D": 0, "j": 2})
     assert [int(bound.action([key], 0)) for key in "adj"] == [0, 0, 2]
-    assert [binding.label for binding in bound.bindings] == ["left", "0", "2"]
+    assert [binding.label for binding in bound.bindings] == ["left", "left", "right"]
+
+
+def test_the_legend_has_one_entry_for_an_action_with_all_its_keys():
+    bound = keys_for("Taxi-v4", Discrete(6), {"s": 0, "w": 1, "d": 2, "a": 3, "space": 4, "return": 5})
+    shown = [([key for key, _ in entry.keys], entry.label) for entry in legend(bound)]
+    assert shown == [
+        (["0", "s"], "action 0"),
+        (["1", "w"], "action 1"),
+        (["2", "d"], "action 2"),
+        (["3", "a"], "action 3"),
+        (["4", "space"], "action 4"),
+        (["5", "return"], "action 5"),
+    ]
 
 
 def test_a_combination_has_an_action_of_its_own():

@@ -14,6 +14,7 @@ from rejeu.core import Masked
 from rejeu.envs.masks import make_masked
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.spaces import scale_action
+from rejeu.text import counted
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Evaluation:
         low, high = self.return_interval
         text = (
             f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % interval of the mean {low:.2f} to {high:.2f}), "
-            f"length {self.mean_length:.1f}, {len(self.returns)} episodes"
+            f"length {self.mean_length:.1f}, {counted(len(self.returns), 'episode')}"
         )
         if not math.isnan(self.success_rate):
             low, high = self.success_interval

@@ -12,6 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from rejeu.cli import run_folder, settings
 from rejeu.cli.run_folder import Which
+from rejeu.text import counted
 
 if TYPE_CHECKING:
     from rejeu.play import Game
@@ -95,6 +96,6 @@ def scores(game: Game) -> str:
     lines = []
     for player in game.players:
         n = len(player.scores)
-        told = f"{n} episode{'s' if n != 1 else ''}"
+        told = counted(n, "episode")
         lines.append(f"{player.name}: {told}" + (f", mean {player.mean:.2f}, best {player.best:.2f}" if n else ""))
     return "\n".join(lines)

@@ -32,6 +32,7 @@ def run(arguments: Record) -> int:
     """Films, prints where, and returns the exit status."""
     from rejeu import load
     from rejeu.config import whole
+    from rejeu.text import counted
     from rejeu.video import record_video
 
     episodes = whole("--episodes", arguments.episodes, least=1)
@@ -39,5 +40,5 @@ def run(arguments: Record) -> int:
     beside = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
     out = beside if arguments.out is None else arguments.out
     path = record_video(load(model), out, env=run_folder.environment_of(model), episodes=episodes, seed=arguments.seed)
-    print(f"{path}: {episodes} episodes of {model}", flush=True)
+    print(f"{path}: {counted(episodes, 'episode')} of {model}", flush=True)
     return 0

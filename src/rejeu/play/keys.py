@@ -116,7 +116,7 @@ class BoxKeys:
 KeyMap = DiscreteKeys | BoxKeys
 
 
-def bind(space: gym.Space, actions: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> KeyMap:
+def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[Any, str]] = ()) -> KeyMap:
     """Returns the map for a space that ``actions`` describes; see the module.
 
     Args:
@@ -124,20 +124,23 @@ def bind(space: gym.Space, actions: Mapping[str, Any], labels: Mapping[str, str]
         actions: by keys. Of a Box action with one number that number will do. ``none`` may hold several Discrete actions
             to be taken in turn, or ``"wait"``; without it Discrete actions wait, and Box actions are 0, or in the middle
             of bounds that leave 0 out.
-        labels: what is shown of some of them; by default the action itself.
+        labels: ``(action, label)`` pairs that say what some actions do; of others the action itself is shown.
 
     Raises:
         ValueError: for unknown keys, actions outside the space, and spaces that are neither Discrete nor Box.
     """
     if not isinstance(space, gym.spaces.Discrete | gym.spaces.Box):
         raise ValueError(f"the actions {space} cannot be played by hand; Discrete and Box actions can")
-    labels = labels or {}
-    convert: Callable[[Any, str, Any], Any] = _discrete if isinstance(space, gym.spaces.Discrete) else _box
+    is_discrete = isinstance(space, gym.spaces.Discrete)
+    convert: Callable[[Any, str, Any], Any] = _discrete if is_discrete else _box
+    said = {convert(space, label, action): label for action, label in labels}
     by_keys: dict[frozenset[str], Binding] = {}
     for name, action in actions.items():
         if name != NONE:
             held = _keys(name)
-            by_keys[held] = Binding(held, convert(space, name, action), labels.get(name, _text(action)))
+            converted = convert(space, name, action)
+            label = said.get(converted, f"action {converted}" if is_discrete else _text(action))
+            by_keys[held] = Binding(held, converted, label)
     bindings = tuple(by_keys.values())
     if isinstance(space, gym.spaces.Box):
         rest = _resting(space) if NONE not in actions else _box(space, NONE, actions[NONE])
@@ -185,17 +188,16 @@ def default_actions(space: gym.Space) -> dict[str, Any]:
     return actions
 
 
-def default_labels(space: gym.Space) -> dict[str, str]:
-    """Returns what is shown of :func:`default_actions`.
+def default_labels(space: gym.Space) -> list[tuple[Any, str]]:
+    """Returns what is shown of those of :func:`default_actions` that are not numbers of a Discrete space.
 
-    >>> default_labels(gym.spaces.Discrete(2))["d"], default_labels(gym.spaces.Box(-1, 1, (2,)))["w"]
-    ('action 1', 'number 2 up')
+    >>> default_labels(gym.spaces.Discrete(2)), default_labels(gym.spaces.Box(-2, 2, (1,)))
+    ([], [([-2.0], 'number 1 down'), ([2.0], 'number 1 up')])
     """
-    actions = default_actions(space)
     if not isinstance(space, gym.spaces.Box):
-        return {key: f"action {action}" for key, action in actions.items()}
+        return []
     sides = {key: (i, side) for i, pair in enumerate(AXIS_KEYS) for key, side in zip(pair, ("down", "up"), strict=True)}
-    return {key: f"number {sides[key][0] + 1} {sides[key][1]}" for key in actions}
+    return [(action, f"number {sides[key][0] + 1} {sides[key][1]}") for key, action in default_actions(space).items()]
 
 
 def spellings(binding: Binding, bindings: tuple[Binding, ...]) -> frozenset[str]:

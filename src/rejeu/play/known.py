@@ -82,12 +82,12 @@ def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None
     ['left', 'right']
     """
     own = dict(own or {})
-    labels: dict[str, str] = {}
+    labels: list[tuple[Any, str]] = []
     if env_id in KNOWN:
         actions = {key: action for key, (action, _) in KNOWN[env_id].items()}
-        labels = {key: label for key, (_, label) in KNOWN[env_id].items()}
+        labels = [(action, label) for key, (action, label) in KNOWN[env_id].items() if key != keys.NONE]
     elif own and isinstance(space, gym.spaces.Box) and space.low.size > len(keys.AXIS_KEYS):
         actions = {}
     else:
         actions, labels = keys.default_actions(space), keys.default_labels(space)
-    return keys.bind(space, {**actions, **own}, {key: label for key, label in labels.items() if key not in own})
+    return keys.bind(space, {**actions, **own}, labels)

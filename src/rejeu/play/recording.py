@@ -16,6 +16,7 @@ import numpy as np
 
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
+from rejeu.text import counted
 from rejeu.video import HOLD_SECONDS, VideoFile, ffmpeg
 
 VIDEO_NAME = "video.mp4"
@@ -65,7 +66,7 @@ class Recording:
         if not self.episodes:
             return f"{self.folder}: nothing was played, nothing is recorded"
         return (
-            f"{self.folder}: {self.episodes} episodes in {VIDEO_NAME} and for MINARI_DATASETS_PATH={self.folder}, "
+            f"{self.folder}: {counted(self.episodes, 'episode')} in {VIDEO_NAME} and for MINARI_DATASETS_PATH={self.folder}, "
             f"minari.load_dataset({self.dataset_id!r})"
         )
 

@@ -11,13 +11,16 @@ import numpy as np
 from rejeu.errors import MissingExtra
 from rejeu.play.game import Game, Player
 from rejeu.play.keys import KeyMap, spellings
+from rejeu.text import counted
 
 Colour = tuple[int, int, int]
+Keycap = tuple[str, frozenset[str]]
+"""What stands on a key of the legend, and the names of the keys that press it."""
 
 PAPER, INK, FAINT, LINE = (246, 246, 243), (52, 58, 70), (128, 134, 145), (214, 217, 222)
 BLUE, GREEN, WHITE = (40, 104, 190), (38, 150, 96), (255, 255, 255)
-MARGIN, HEADER, LEGEND_ROW = 14, 62, 26
-"""Pixels around and between the pictures, above each, and of a row of the legend."""
+MARGIN, HEADER, MESSAGE_ROW, LEGEND_ROW = 14, 62, 38, 26
+"""Pixels around and between the pictures, above each, below each for its message, and of a row of the legend."""
 LEAST_HEIGHT, MOST_WIDTH = 360, 720
 """Pictures much lower than this are enlarged, by a whole number, until they are as high or would get too wide."""
 SHARE_OF_SCREEN = 0.9
@@ -34,6 +37,15 @@ class Event(NamedTuple):
     """``press``, ``release``, ``leave`` (the keyboard went to another window) or ``close``."""
     key: str = ""
     """SDL's name of the key, in lower case."""
+
+
+class Entry(NamedTuple):
+    """An action in the legend."""
+
+    keys: list[Keycap]
+    """Each does it."""
+    label: str
+    """What it does."""
 
 
 class Window:
@@ -69,18 +81,18 @@ class Window:
         self.canvas: Any = None
         """What is shown, at its natural size."""
         self._screen: Any = None
-        self._legend: list[tuple[str, str, frozenset[str]]] = []
+        self._legend: list[Entry] = []
         self._sizes: list[tuple[int, int]] = []
 
     def open(self, game: Game, keys: KeyMap | None) -> None:
         """Opens the window at a size that holds the game's pictures, with the keys' meanings if there are any."""
         pygame = self.pygame
-        self._fonts = {size: pygame.font.Font(None, size) for size in (20, 22, 24, 34)}
+        self._fonts = {size: pygame.font.Font(None, size) for size in (20, 22, 24)}
         self._legend = [] if keys is None else legend(keys)
         self._sizes = [picture_size(player.frame) for player in game.players]
         width = sum(size[0] for size in self._sizes) + MARGIN * (len(self._sizes) + 1)
         self._rows = self._arrange(width)
-        height = HEADER + max(size[1] for size in self._sizes) + LEGEND_ROW * len(self._rows) + MARGIN
+        height = HEADER + max(size[1] for size in self._sizes) + MESSAGE_ROW + LEGEND_ROW * len(self._rows)
         self.canvas = pygame.Surface((width, height))
         screen_width, screen_height = pygame.display.get_desktop_sizes()[0]
         fit = min(1.0, SHARE_OF_SCREEN * screen_width / width, SHARE_OF_SCREEN * screen_height / height)
@@ -111,7 +123,8 @@ class Window:
             self._draw_picture(player.frame, (left, HEADER), size)
             text = message(game, player)
             if text:
-                self._draw_message(text, left + size[0] / 2, HEADER + 0.2 * size[1], player.success == 1.0)
+                middle = left + size[0] / 2, HEADER + size[1] + MESSAGE_ROW / 2
+                self._draw_message(text, middle, GREEN if player.success == 1.0 else INK)
             left += size[0] + MARGIN
         self._draw_legend(game)
         self._present()
@@ -141,9 +154,7 @@ class Window:
 
     def _draw_header(self, player: Player, left: int, width: int, by_hand: bool) -> None:
         self._write(player.name, (left, 12), 24, INK)
-        best = f"best {number(player.best)}"
-        mean = f"mean {number(player.mean)} of {len(player.scores)}"
-        self._write(best if by_hand else f"{mean}   {best}", (left + width, 14), 22, FAINT, right=True)
+        self._write(so_far(player, by_hand), (left + width, 14), 22, FAINT, right=True)
         self._write(f"score {number(player.score)}", (left, 37), 24, BLUE)
         self._write(f"step {player.steps}", (left + width, 38), 22, FAINT, right=True)
 
@@ -155,62 +166,75 @@ class Window:
         self.canvas.blit(picture, corner)
         self.pygame.draw.rect(self.canvas, LINE, (corner[0] - 1, corner[1] - 1, size[0] + 2, size[1] + 2), 1)
 
-    def _draw_message(self, text: str, x: float, y: float, success: bool) -> None:
-        drawn = self._fonts[34].render(text, True, WHITE)
-        width, height = drawn.get_width() + 36, drawn.get_height() + 22
-        plate = self.pygame.Surface((width, height), self.pygame.SRCALPHA)
-        colour = GREEN if success else INK
-        self.pygame.draw.rect(plate, (*colour, 215), plate.get_rect(), border_radius=8)
-        plate.blit(drawn, (18, 12))
-        self.canvas.blit(plate, (round(x - width / 2), round(y - height / 2)))
+    def _draw_message(self, text: str, middle: tuple[float, float], colour: Colour) -> None:
+        """Writes on a plate beside the picture, never on it, where it would cover a goal."""
+        drawn = self._fonts[24].render(text, True, WHITE)
+        plate = drawn.get_rect().inflate(28, 10)
+        plate.center = round(middle[0]), round(middle[1])
+        self.pygame.draw.rect(self.canvas, colour, plate, border_radius=8)
+        self.canvas.blit(drawn, (plate.x + 14, plate.y + 6))
 
-    def _arrange(self, width: int) -> list[list[tuple[str, str, frozenset[str], int]]]:
+    def _arrange(self, width: int) -> list[list[tuple[Entry, int]]]:
         """Returns the legend in rows that fit, each entry with its left edge; the window's own keys come last."""
-        entries = [*self._legend, *((key, label, frozenset[str]()) for key, label in HELP)]
-        rows: list[list[tuple[str, str, frozenset[str], int]]] = [[]]
+        entries = [*self._legend, *(Entry([(key, frozenset())], label) for key, label in HELP)]
+        rows: list[list[tuple[Entry, int]]] = [[]]
         left = MARGIN
-        for key, label, names in entries:
-            wide = self._fonts[22].size(key)[0] + self._fonts[20].size(label)[0] + 32
+        for entry in entries:
+            wide = sum(self._key_width(text) + 4 for text, _ in entry.keys) + self._fonts[20].size(entry.label)[0] + 16
             if left + wide > width and rows[-1]:
                 rows.append([])
                 left = MARGIN
-            rows[-1].append((key, label, names, left))
+            rows[-1].append((entry, left))
             left += wide
         return rows
+
+    def _key_width(self, text: str) -> int:
+        return int(self._fonts[22].size(text)[0]) + 12
 
     def _draw_legend(self, game: Game) -> None:
         top = self.canvas.get_height() - LEGEND_ROW * len(self._rows) - 2
         for row, entries in enumerate(self._rows):
             y = top + LEGEND_ROW * row
-            for key, label, names, left in entries:
-                wide = self._fonts[22].size(key)[0] + 12
-                plate = (left, y, wide, LEGEND_ROW - 6)
-                down = bool(names & game.held)
-                self.pygame.draw.rect(self.canvas, BLUE if down else WHITE, plate, border_radius=4)
-                self.pygame.draw.rect(self.canvas, BLUE if down else LINE, plate, 1, border_radius=4)
-                self._write(key, (left + 6, y + 3), 22, WHITE if down else INK)
-                self._write(label, (left + wide + 6, y + 4), 20, FAINT)
+            for entry, left in entries:
+                for text, names in entry.keys:
+                    plate = (left, y, self._key_width(text), LEGEND_ROW - 6)
+                    down = bool(names & game.held)
+                    self.pygame.draw.rect(self.canvas, BLUE if down else WHITE, plate, border_radius=4)
+                    self.pygame.draw.rect(self.canvas, BLUE if down else LINE, plate, 1, border_radius=4)
+                    self._write(text, (left + 6, y + 3), 22, WHITE if down else INK)
+                    left += self._key_width(text) + 4
+                self._write(entry.label, (left + 2, y + 4), 20, FAINT)
 
     def _write(self, text: str, corner: tuple[int, int], size: int, colour: Colour, right: bool = False) -> None:
         drawn = self._fonts[size].render(text, True, colour)
         self.canvas.blit(drawn, (corner[0] - drawn.get_width() if right else corner[0], corner[1]))
 
 
-def legend(keys: KeyMap) -> list[tuple[str, str, frozenset[str]]]:
-    """Returns what is shown of each binding: its keys, what they do, and the names of the keys that do it."""
-    return [
-        ("+".join(sorted(binding.keys)), binding.label, spellings(binding, keys.bindings)) for binding in keys.bindings
-    ]
+def legend(keys: KeyMap) -> list[Entry]:
+    """Returns what is shown of each action, in the order of the bindings: all keys that do it, and what it does."""
+    entries: dict[Any, Entry] = {}
+    for binding in keys.bindings:
+        entry = entries.setdefault(binding.action, Entry([], binding.label))
+        entry.keys.append(("+".join(sorted(binding.keys)), spellings(binding, keys.bindings)))
+    return list(entries.values())
 
 
 def message(game: Game, player: Player) -> str:
-    """Returns what is written over a player's picture, empty for nothing."""
+    """Returns what is written below a player's picture, empty for nothing."""
     if player.over and player.steps:
-        outcome = {1.0: "done", 0.0: "missed"}.get(player.success, "over")
+        outcome = {1.0: "success", 0.0: "failed"}.get(player.success, "over")
         return f"{outcome}: {number(player.score)}"
     if game.paused:
         return "paused"
     return "press a key to begin" if game.phase == "ready" else ""
+
+
+def so_far(player: Player, by_hand: bool) -> str:
+    """Returns what is written of the episodes played to their end, empty before there is one; by hand without the mean."""
+    if not player.scores:
+        return ""
+    best = f"best {number(player.best)}"
+    return best if by_hand else f"mean {number(player.mean)} of {counted(len(player.scores), 'episode')}   {best}"
 
 
 def picture_size(frame: np.ndarray) -> tuple[int, int]:
