@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -51,6 +53,39 @@ def test_every_environment_plays_its_share_so_short_episodes_are_not_counted_mor
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_exactly_as_many_episodes_are_played_as_asked_for(n_envs):
     assert len(evaluate(still, InProcess([Counter((2,)) for _ in range(n_envs)]), 7).returns) == 7
+
+
+def timed(monkeypatch, envs, episodes, seconds):
+    """Returns the lengths of the episodes played where every step of all environments takes one second."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr("rejeu.evaluation.time", SimpleNamespace(perf_counter=lambda: clock.now))
+
+    def policy(obs, began):
+        clock.now += 1.0
+        return still(obs, began)
+
+    return evaluate(policy, InProcess(envs), episodes, seconds=seconds).lengths.tolist()
+
+
+def test_when_the_time_is_over_no_episode_begins_and_the_one_under_way_is_played_to_its_end(monkeypatch):
+    """Episodes of 3 and 5 steps in turn end after 3, 8 and 11 s: the third began before 10 s, and no fourth begins."""
+    assert timed(monkeypatch, [Counter((3, 5))], None, 10.0) == [3, 5, 3]
+
+
+def test_long_episodes_under_way_when_the_time_is_over_count(monkeypatch):
+    assert sorted(timed(monkeypatch, [Counter((2,)), Counter((30,))], None, 9.0)) == [2, 2, 2, 2, 2, 30]
+
+
+def test_of_a_number_of_episodes_and_a_time_the_nearer_limit_ends_an_evaluation(monkeypatch):
+    assert timed(monkeypatch, [Counter((2,))], 3, 100.0) == [2, 2, 2]
+    assert timed(monkeypatch, [Counter((2,))], 100, 3.0) == [2, 2]
+
+
+def test_an_agent_evaluates_for_minutes_and_refuses_none_or_less():
+    agent = rejeu.DDPG("MlpPolicy", Counter((4,)), policy_kwargs={"net_arch": [4]}, seed=0)
+    assert agent.evaluate(minutes=1e-9).lengths.tolist() == [4]
+    with pytest.raises(ValueError, match="minutes=0 must be a finite number, above 0"):
+        agent.evaluate(minutes=0)
 
 
 def test_success_comes_from_the_last_step():

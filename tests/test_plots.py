@@ -121,3 +121,21 @@ def test_without_matplotlib_the_error_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "rejeu.figures", raising=False)
     with pytest.raises(MissingExtra, match=r"rejeu\[plot\]"):
         learning_curve(history())
+
+
+def test_an_evaluation_draws_every_episode_by_success_and_the_mean_with_its_interval(tmp_path):
+    result = Evaluation(np.array([1.0, 5.0, 3.0]), np.array([9, 9, 9]), np.array([0.0, 1.0, 1.0]))
+    panel = result.plot(tmp_path / "evaluation.png").axes[0]
+    shown = {line.get_label(): (line.get_xdata(), line.get_ydata()) for line in panel.lines}
+    np.testing.assert_array_equal(shown["success (2)"], [[2, 3], [5.0, 3.0]])
+    np.testing.assert_array_equal(shown["no success (1)"], [[1], [1.0]])
+    assert shown["mean 3"][1][0] == 3.0
+    (band,) = panel.patches
+    assert (band.get_y(), band.get_y() + band.get_height()) == pytest.approx(result.return_interval)
+    assert (tmp_path / "evaluation.png").exists()
+
+
+def test_an_evaluation_of_one_episode_without_success_can_be_drawn():
+    panel = Evaluation(np.array([1.0]), np.array([9]), np.array([np.nan])).plot().axes[0]
+    assert not panel.patches
+    assert [line.get_label() for line in panel.lines] == ["mean 1", "episodes"]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +17,9 @@ from rejeu.envs.masks import make_masked
 from rejeu.envs.vector import VectorEnv, make_vector
 from rejeu.spaces import scale_action
 from rejeu.text import counted
+
+if TYPE_CHECKING:
+    from rejeu.figures import Picture
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,19 @@ class Evaluation:
         bounds = stats.binomtest(int(self.successes.sum()), len(self.successes)).proportion_ci(method="wilson")
         return float(bounds.low), float(bounds.high)
 
+    def plot(self, path: str | Path | None = None) -> Picture:
+        """Returns a matplotlib figure of the episodes' returns and their mean; a notebook shows it by itself.
+
+        Args:
+            path: of a file to write, whose suffix says the format; None for none.
+
+        Raises:
+            MissingExtra: if matplotlib is not installed.
+        """
+        from rejeu import plots
+
+        return plots.evaluation(self, path)
+
     def __str__(self) -> str:
         low, high = self.return_interval
         text = (
@@ -85,42 +103,50 @@ class Evaluation:
 def evaluate(
     policy: Callable[[Any, np.ndarray], np.ndarray],
     env: VectorEnv,
-    episodes: int,
+    episodes: int | None,
     success_threshold: float | None = None,
     seed: int | None = None,
+    seconds: float | None = None,
 ) -> Evaluation:
-    """Plays ``episodes`` whole episodes and returns what they came to.
+    """Plays whole episodes and returns what they came to.
 
-    Every environment plays its own fixed share of the episodes, so that short ones are not counted more often.
+    Every environment plays its own fixed share of the episodes, so that short ones are not counted more often. When the time
+    is over, no further episode begins, and those under way are played to their end and count: to leave them out would leave
+    out the long ones.
 
     Args:
         policy: maps observations ``(n_envs, ...)``, and where an episode begins with one, ``bool (n_envs,)``, to actions in
             the algorithm's range.
         env: reset at the beginning; left wherever the last episode ended.
-        episodes: at least 1.
+        episodes: at most so many, at least 1; None with ``seconds`` for as many as there is time for.
         success_threshold: return from which on an episode counts as a success where the environment does not say; None
             takes the environment's reward threshold.
         seed: of the environments' reset; None lets their random numbers go on.
+        seconds: of wall time in which episodes begin; None for no limit. Every environment that has a share of the episodes
+            plays at least one.
     """
-    if episodes < 1:
+    if episodes is None and seconds is None:
+        raise ValueError("evaluate needs a number of episodes or a time")
+    if episodes is not None and episodes < 1:
         raise ValueError(f"episodes={episodes} must be at least 1")
-    share = (episodes + np.arange(env.n_envs)) // env.n_envs
-    played = np.zeros(env.n_envs, int)
+    n_envs, most = env.n_envs, np.iinfo(np.int64).max
+    to_play = np.full(n_envs, most) if episodes is None else (episodes + np.arange(n_envs)) // n_envs
+    end = math.inf if seconds is None else time.perf_counter() + seconds
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
     rows: list[tuple[float, int, float]] = []
     obs, done = env.reset(seed), np.ones(env.n_envs, bool)
-    while len(rows) < episodes:
+    while to_play.any():
         step = env.step(scale_action(env.action_space, policy(obs, done)))
         total += step.reward
         length += 1
         done = step.terminated | step.truncated
         for i in np.flatnonzero(done).tolist():
-            if played[i] < share[i]:
+            if to_play[i]:
                 value = step.return_of(i, total[i])
                 rows.append((value, length[i], env.judge(step, i, value, success_threshold)))
-                played[i] += 1
+                to_play[i] = 0 if time.perf_counter() >= end else to_play[i] - 1
             total[i] = length[i] = 0
-        obs = env.reset_done(done) if done.any() and len(rows) < episodes else step.obs
+        obs = env.reset_done(done) if done.any() and to_play.any() else step.obs
     returns, lengths, successes = zip(*rows, strict=True)
     return Evaluation(np.array(returns), np.array(lengths), np.array(successes))
 

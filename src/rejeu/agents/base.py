@@ -351,16 +351,18 @@ class Agent(ABC):
 
     def evaluate(
         self,
-        episodes: int = 100,
+        episodes: int | None = None,
         env: Any = None,
         deterministic: bool = True,
         seed: int | None = None,
         success_threshold: float | None = None,
+        *,
+        minutes: float | None = None,
     ) -> Evaluation:
         """Plays whole episodes and returns their returns, lengths, successes and 95 % intervals.
 
         Args:
-            episodes: how many.
+            episodes: how many; None: 100, or with ``minutes`` as many as there is time for.
             env: where, as for the constructor; None: new environments like the agent's own if it was given an id,
                 else the agent's own, whose running episodes are then given up.
             deterministic: the policy's mode; False draws from the policy.
@@ -368,11 +370,14 @@ class Agent(ABC):
                 random numbers of others go on.
             success_threshold: return from which on an episode counts as a success where the environment does not say;
                 None takes the agent's own.
+            minutes: of wall time; when they are over, no further episode begins. Episodes that have begun are played to
+                their end and count, so that long ones are not left out: it takes up to one episode longer, and every
+                environment plays at least one. None for no limit.
 
         It may be called by a callback while the agent learns. Where it plays in the environments that the agent trains
         on, be they given or not, training goes on in new episodes.
         """
-        return evaluating.play(self, episodes, env, deterministic, seed, success_threshold)
+        return evaluating.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
 
     def get_env(self) -> VecEnv | None:
         """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rejeu.agents import predicting
+from rejeu.config import number, whole
 from rejeu.envs.auto_reset import identities
 from rejeu.envs.vec_normalize import unwrap_vec_normalize
 from rejeu.envs.vector import VectorEnv
@@ -18,8 +19,20 @@ if TYPE_CHECKING:
     from rejeu.agents.base import Agent
 
 
+USUAL_EPISODES = 100
+"""How many are played if neither a number nor a time is given."""
+MOST_ENVS = 16
+"""Most environments that are made to play in."""
+
+
 def play(
-    agent: Agent, episodes: int, env: Any, deterministic: bool, seed: int | None, success_threshold: float | None
+    agent: Agent,
+    episodes: int | None,
+    env: Any,
+    deterministic: bool,
+    seed: int | None,
+    success_threshold: float | None,
+    minutes: float | None,
 ) -> Evaluation:
     """Returns what whole episodes came to; the arguments are those of :meth:`Agent.evaluate`.
 
@@ -30,11 +43,16 @@ def play(
     run = agent._run
     if env is None and run.env is None:
         raise ValueError("this agent has no environment; give one: evaluate(env=...)")
+    if episodes is None and minutes is None:
+        episodes = USUAL_EPISODES
+    episodes = None if episodes is None else whole("episodes", episodes, least=1)
+    seconds = None if minutes is None else 60 * number("minutes", minutes, above=0)
+    n_envs = MOST_ENVS if episodes is None else min(episodes, MOST_ENVS)
     made_here = isinstance(env, str) or callable(env)
     if env is not None:
-        vector = agent._vector(env, min(episodes, 16) if isinstance(env, str) else 1, seed=seed)
+        vector = agent._vector(env, n_envs if isinstance(env, str) else 1, seed=seed)
     elif agent._own_env:
-        vector = agent._vector(run.env.env_id, min(episodes, 16), run.env.backend, seed)
+        vector = agent._vector(run.env.env_id, n_envs, run.env.backend, seed)
         made_here = True
     else:
         vector = run.env
@@ -43,7 +61,7 @@ def play(
         check_scaled(agent, vector)
         again = None if made_here else seed  # others have just been made with it
         with lent(agent, vector):
-            return evaluate(policy(agent, deterministic), vector, episodes, threshold, again)
+            return evaluate(policy(agent, deterministic), vector, episodes, threshold, again, seconds)
     finally:
         if made_here:
             vector.close()

@@ -4,8 +4,9 @@ They are drawn without a display and without matplotlib's global state. Every fu
 and returns the figure.
 """
 
+from rejeu.plots.evaluations import evaluation
 from rejeu.plots.exploration import noise, repulsive_boundary, saturation
 from rejeu.plots.learning import learning_curve
 from rejeu.plots.trajectories import trajectory
 
-__all__ = ["learning_curve", "noise", "repulsive_boundary", "saturation", "trajectory"]
+__all__ = ["evaluation", "learning_curve", "noise", "repulsive_boundary", "saturation", "trajectory"]
