@@ -12,6 +12,7 @@ from rich.console import Console
 import rejeu
 from rejeu.callbacks import Evaluate, Film, ProgressBar, better, crossed, progress_bar, stop_on_return, stop_on_success
 from rejeu.evaluation import Evaluation
+from rejeu.failed_writes import FailedWrites
 from rejeu.history import History
 from rejeu.loops.host import Episode, Progress
 from tests.environments import Counter
@@ -34,7 +35,8 @@ def scripted_agent(evaluations):
     """An agent whose evaluations are given, and which remembers what was saved."""
     remaining = deque(evaluations)
     saved = []
-    agent = SimpleNamespace(env=None, n_envs=1, saved=saved, save=saved.append, remember_best=lambda score, by: True)
+    agent = SimpleNamespace(env=None, n_envs=1, saved=saved, remember_best=lambda score, by: True)
+    agent.failed_writes, agent.snapshot = FailedWrites(), lambda path: lambda: saved.append(path)
     agent.evaluate = lambda episodes, env, seed: remaining.popleft()
     return agent
 

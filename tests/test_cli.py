@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.callbacks import Evaluate
 from rejeu.cli import main, one_line, run_folder, settings
 from rejeu.logging import CsvFile
+from tests.full_disk import FullDisk
 
 FILES = {
     "agent.safetensors",
@@ -382,6 +384,44 @@ def test_resume_explains_what_it_cannot_go_on_with(run, tmp_path, capsys):
     config.write_text(json.dumps(content))
     shutil.rmtree(tmp_path / "run" / "checkpoints")
     assert "no checkpoint in" in error_of(capsys, "resume", str(tmp_path / "run"))
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_resume_says_that_it_skipped_a_damaged_checkpoint(run, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "run")
+    newest = max((tmp_path / "run" / "checkpoints").glob("run_*"))
+    content = bytearray(newest.read_bytes())
+    content[-9] ^= 1
+    newest.write_bytes(content)
+    assert main(["resume", str(tmp_path / "run"), "--steps", "10"]) == 0
+    said = capsys.readouterr()
+    assert "resumed at step 0" in said.out
+    warning = (
+        rf"warning: {re.escape(str(newest))}: the array '?\S+ is damaged .*; resuming from the checkpoint before it\n"
+    )
+    assert re.fullmatch(warning, said.err)
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_what_could_not_be_written_is_repeated_at_the_end_of_the_command(tmp_path, capsys, monkeypatch):
+    disk, call = FullDisk(monkeypatch), Evaluate.__call__
+
+    def fill(self, agent, progress):
+        call(self, agent, progress)
+        disk.full = progress.step >= 50
+
+    monkeypatch.setattr(Evaluate, "__call__", fill)
+    out = tmp_path / "run"
+    assert train(out, "--seed", "3", "--evaluate-every", "40", env="rejeu/Ball-v0", steps=100) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert all(line.startswith("warning: ") for line in lines)
+    said = lines[-1].removeprefix("warning: ")
+    assert said.startswith("not written (No space left on device): ")
+    for name in ("checkpoints", "evaluations.csv", "episodes.csv", "agent.safetensors"):
+        assert str(out / name) in said
+    assert [row["step"] for row in rows(out / "evaluations.csv")] == ["40"]
+    assert not (out / "agent.safetensors").exists()
+    assert rejeu.load(out / "best.safetensors").num_timesteps == 40
 
 
 def test_an_error_of_many_lines_becomes_one():

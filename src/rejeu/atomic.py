@@ -62,6 +62,26 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     _sync_folder(path.parent)
 
 
+def append(path: Path, content: bytes) -> None:
+    """Adds bytes at the end of a file, all of them or none; they are not brought to disk at once.
+
+    Raises:
+        OSError: if that is impossible, as for :func:`replacing`; the file is then as long as before.
+    """
+    try:
+        with path.open("r+b", buffering=0) as file:
+            end = file.seek(0, os.SEEK_END)
+            try:
+                rest = memoryview(content)
+                while rest:
+                    rest = rest[file.write(rest) :]
+            except BaseException:
+                file.truncate(end)
+                raise
+    except OSError as error:
+        raise _explained(error, path) from error
+
+
 def remove_stale(path: Path, age: float = STALE) -> None:
     """Removes temporary files of :func:`replacing` for ``path`` that nothing has written to for ``age`` seconds."""
     ours = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.tmp")

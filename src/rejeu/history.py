@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from array import array
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rejeu import atomic
 from rejeu.loops.host import Episode
 
 if TYPE_CHECKING:
@@ -86,11 +88,13 @@ class History:
         return sums / np.where(counts, counts, np.nan)
 
     def write_csv(self, path: str | Path) -> None:
-        """Writes the table with a header line."""
-        with Path(path).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(COLUMNS)
-            writer.writerows(self.episodes)
+        """Writes the table with a header line; an older file is replaced only once the new one is complete."""
+        text = io.StringIO()
+        writer = csv.writer(text)
+        writer.writerow(COLUMNS)
+        writer.writerows(self.episodes)
+        with atomic.replacing(Path(path)) as file:
+            file.write(text.getvalue().encode())
 
     def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
         """Returns a matplotlib figure of returns and, where known, success; a notebook shows it by itself.

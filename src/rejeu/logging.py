@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
+import os
+import secrets
+import socket
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from rejeu import atomic
 from rejeu.errors import MissingExtra
 
 
@@ -24,6 +30,9 @@ class Sink(Protocol):
 
 class Console:
     """Prints a table, grouped by the part of the name before the slash."""
+
+    def __str__(self) -> str:
+        return "the console"
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         from rich import box
@@ -49,64 +58,109 @@ class Console:
 class CsvFile:
     """Appends rows to a CSV file; a row may bring new columns, which are then empty in those before it.
 
+    Each row is there entirely or not at all. Where rows or columns that are already written change, a new file takes the
+    place of the old one once it is complete.
+
     Args:
         path: of the file.
-        up_to: of a file that is there already, keep the rows up to this step; None begins it anew.
+        up_to: of a file that is there already, keep the rows up to this step; None starts an empty one.
     """
 
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
         self.path = Path(path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._columns: list[str] = []
         kept: list[dict[str, str]] = []
         if up_to is not None and self.path.exists():
-            with self.path.open(newline="", encoding="utf-8") as file:
-                kept = [row for row in csv.DictReader(file) if (row.get("step") or "").isdigit()]
-            kept = [row for row in kept if int(row["step"]) <= up_to and None not in row and None not in row.values()]
-        self._file = self.path.open("w+", newline="", encoding="utf-8")
-        self._writer: csv.DictWriter[str] = csv.DictWriter(self._file, [*kept[0]] if kept else [], restval="")
+            rows = [row for row in self._read() if (row.get("step") or "").isdigit()]
+            kept = [row for row in rows if int(row["step"]) <= up_to and None not in row and None not in row.values()]
         if kept:
-            self._writer.writeheader()
-            self._writer.writerows(kept)
-            self._file.flush()
+            self._columns = [*kept[0]]
+        content = self._header() + self._lines(kept)
+        if not self.path.exists() or self.path.read_bytes() != content:
+            self._replace(content)
+
+    def __str__(self) -> str:
+        return str(self.path)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Adds a row.
+
+        Raises:
+            OSError: if that is impossible; the file is then as it was.
+        """
         row = {"step": step, **metrics}
-        if new := [name for name in row if name not in self._writer.fieldnames]:
-            self._widen(new)
-        self._writer.writerow(row)
-        self._file.flush()
+        if new := [name for name in row if name not in self._columns]:
+            rows = self._read()
+            before, self._columns = self._columns, [*self._columns, *new]
+            try:
+                self._replace(self._header() + self._lines([*rows, row]))
+            except OSError:
+                self._columns = before
+                raise
+        else:
+            atomic.append(self.path, self._lines([row]))
 
     def close(self) -> None:
-        self._file.close()
+        """Does nothing: rows are in the file as soon as they are written."""
 
-    def _widen(self, new: list[str]) -> None:
-        """Writes the whole file again with more columns."""
-        self._file.seek(0)
-        rows = list(csv.DictReader(self._file))
-        self._file.seek(0)
-        self._file.truncate()
-        self._writer = csv.DictWriter(self._file, [*self._writer.fieldnames, *new], restval="")
-        self._writer.writeheader()
-        self._writer.writerows(rows)
+    def _read(self) -> list[dict[str, str]]:
+        with self.path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(line for line in file if "\0" not in line))
+
+    def _header(self) -> bytes:
+        return self._lines([{name: name for name in self._columns}]) if self._columns else b""
+
+    def _lines(self, rows: Iterable[Mapping[str, Any]]) -> bytes:
+        text = io.StringIO()
+        csv.DictWriter(text, self._columns, restval="").writerows(rows)
+        return text.getvalue().encode()
+
+    def _replace(self, content: bytes) -> None:
+        with atomic.replacing(self.path) as file:
+            file.write(content)
 
 
 class TensorBoard:
-    """Writes scalars for TensorBoard into a folder."""
+    """Writes scalars for TensorBoard into a folder.
+
+    Each row is appended at once, where TensorBoard's own writer does so in a thread, which ends when a write fails and takes
+    the rows that wait with it.
+    """
 
     def __init__(self, folder: str | Path) -> None:
         try:
-            from tensorboard.summary import Writer
+            from tensorboard.compat.proto.event_pb2 import Event
+            from tensorboard.summary.writer.record_writer import RecordWriter
         except ImportError:
             raise MissingExtra("tensorboard_log", "tensorboard", "tensorboard") from None
-        self._writer = Writer(str(folder))
+        self._event, self._record_writer = Event, RecordWriter
+        name = f"events.out.tfevents.{time.time_ns() // 10**9:010d}.{socket.gethostname()}.{os.getpid()}"
+        self.path = Path(folder) / f"{name}.{secrets.token_hex(4)}"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.touch(exist_ok=False)
+        self._append(Event(wall_time=time.time(), file_version="brain.Event:2"))
+
+    def __str__(self) -> str:
+        return str(self.path)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Adds a row.
+
+        Raises:
+            OSError: if that is impossible; the file is then as it was.
+        """
+        event = self._event(wall_time=time.time(), step=step)
         for name, value in metrics.items():
-            self._writer.add_scalar(name, value, step=step)
+            event.summary.value.add(tag=name, simple_value=value)
+        self._append(event)
 
     def close(self) -> None:
-        self._writer.flush()
-        self._writer.close()
+        """Does nothing: rows are in the file as soon as they are written."""
+
+    def _append(self, event: Any) -> None:
+        record = io.BytesIO()
+        self._record_writer(record).write(event.SerializeToString())
+        atomic.append(self.path, record.getvalue())
 
 
 class Logger:

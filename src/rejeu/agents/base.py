@@ -37,6 +37,7 @@ from rejeu.envs.vector import Backend, InProcess, VectorEnv
 from rejeu.evaluation import Evaluation
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
+from rejeu.failed_writes import FailedWrites
 from rejeu.history import History
 from rejeu.hooks import BaseCallback
 from rejeu.logging import Logger, Sink
@@ -119,6 +120,8 @@ class Agent(ABC):
         self.interrupted_by: int | None = None
         """The number of that signal."""
         self.logger = Logger()
+        self.failed_writes = FailedWrites()
+        """What ``learn`` could not write, such as checkpoints and log rows on a full disk; training continues without."""
         """Takes further numbers for the rows of statistics."""
         self.best: best.Best | None = None
         """The best weights so far, by smoothed training return or by evaluation."""
@@ -472,8 +475,17 @@ class Agent(ABC):
         ``.safetensors`` is added to a path without a suffix. The file holds everything learnt, the hyper-parameters, the
         spaces and the counters. An older file at that path is replaced only once the new one is complete.
         """
-        self.last_saved = checkpoint.write(path, "agent", checkpoint.tree_to_arrays(self.state), files.header(self))
-        return self.last_saved
+        return self.snapshot(path)()
+
+    def snapshot(self, path: str | Path) -> Callable[[], Path]:
+        """Returns a function that does what :meth:`save` does, with the model as it is now, whenever it is called."""
+        arrays, header = self.get_parameters(), files.header(self)
+
+        def write() -> Path:
+            self.last_saved = checkpoint.write(path, "agent", arrays, header)
+            return self.last_saved
+
+        return write
 
     @classmethod
     def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:

@@ -15,11 +15,12 @@ whenever the process dies, the newest complete checkpoint is at most one interva
 
 from __future__ import annotations
 
+import math
 import re
 import secrets
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ from rejeu.agents import files
 from rejeu.config import number, whole
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
+from rejeu.failed_writes import RETRY_SECONDS
 from rejeu.loops.host import Progress, Run
 from rejeu.replay.ring import Ring
 from rejeu.replay.rollout import RolloutBuffer
@@ -113,6 +115,7 @@ class Checkpoint:
         self._named: dict[Path, list[str]] = {}
         self._last_step = 0
         self._last_time = 0.0
+        self._retry_at = math.inf
 
     @contextmanager
     def held(self, agent: Agent) -> Iterator[None]:
@@ -163,9 +166,18 @@ class Checkpoint:
         """Saves if a checkpoint has fallen due in this step."""
         before, self._last_step = self._last_step, progress.step
         by_steps = self.every is not None and before // self.every < progress.step // self.every
-        by_time = self.minutes is not None and time.monotonic() - self._last_time >= 60 * self.minutes
-        if by_steps or by_time:
-            self.save(agent)
+        now = time.monotonic()
+        by_time = self.minutes is not None and now - self._last_time >= 60 * self.minutes
+        if by_steps or by_time or now >= self._retry_at:
+            self.attempt(agent)
+
+    def attempt(self, agent: Agent) -> None:
+        """Saves as :meth:`save` does; where that is impossible, warns and tries again after a minute."""
+        written = agent.failed_writes.attempt(f"checkpoints in {self.folder}", lambda: self.save(agent), retry=False)
+        self._retry_at = math.inf
+        if not written:
+            self._last_time = time.monotonic()
+            self._retry_at = self._last_time + RETRY_SECONDS
 
     def save(self, agent: Agent, reason: str = "") -> Path | None:
         """Saves now, unless nothing has happened since the last time; returns the path, or None.
@@ -207,10 +219,11 @@ class Checkpoint:
         """Saves what is whole after an error in the course of a step: the run goes on at the start of new episodes."""
         if any(array.is_deleted() for array in agent._run.state):
             return  # the error came between two states
+        reason = f"the run ended with {type(error).__name__}"
         try:
-            self.save(agent, f"the run ended with {type(error).__name__}")
+            agent.failed_writes.attempt(f"checkpoints in {self.folder}", lambda: self.save(agent, reason), retry=False)
         except Exception as second:  # the first error is what the user must see
-            error.add_note(f"and no checkpoint could be written: {second}")
+            error.add_note(f"and no checkpoint could be saved: {second}")
 
     def _write_rows(self, ring: Ring, row_files: RowFiles, step: int) -> None:
         if not all((self.folder / name).exists() for name, _ in row_files.files):
@@ -224,12 +237,12 @@ class Checkpoint:
         """Deletes the checkpoints that are too many, and the rows that no other names."""
         found = run_files(self.folder)
         for path in found[self.keep :]:
-            path.unlink(missing_ok=True)
+            _remove(path)
             self._named.pop(path, None)
         needed = {name for path in found[: self.keep] for name in self._rows_of(path)}
         for path in self.folder.iterdir():
             if ROWS_FILE.fullmatch(path.name) and path.name not in needed:
-                path.unlink(missing_ok=True)
+                _remove(path)
 
     def _rows_of(self, path: Path) -> list[str]:
         """Returns the files of rows that a checkpoint names; none, if it is damaged."""
@@ -239,6 +252,12 @@ class Checkpoint:
             except (CheckpointError, KeyError, TypeError):
                 self._named[path] = []
         return self._named[path]
+
+
+def _remove(path: Path) -> None:
+    """Removes a file that is not needed any more; one that cannot be is left for the next checkpoint to remove."""
+    with suppress(OSError):
+        path.unlink()
 
 
 def run_files(folder: Path) -> list[Path]:

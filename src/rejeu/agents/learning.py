@@ -14,6 +14,7 @@ from rejeu.agents.best import note_training_return
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import Checkpoint
 from rejeu.errors import NonFiniteError
+from rejeu.failed_writes import RetryingSink
 from rejeu.hooks import Hooks, told_apart
 from rejeu.interrupt import Interrupt
 from rejeu.logging import Console, Sink, TensorBoard, next_folder
@@ -112,7 +113,9 @@ def carry_out(
     callbacks = [one for one in callbacks if not isinstance(one, Checkpoint)]
     agent._call = call
     agent._callbacks = [one for one in (*callbacks, hooks.callback) if hasattr(one, "state_dict")]
+    agent.failed_writes.forget_written()
     with ExitStack() as held:
+        held.callback(agent.failed_writes.warn)
         outputs = open_outputs(agent, sinks, tb_log_name, held)
         if progress_bar:
             from rejeu.callbacks import ProgressBar
@@ -124,7 +127,7 @@ def carry_out(
         agent.interrupted, agent.interrupted_by = False, None
         agent._run.success_threshold = agent.success_threshold
         held.callback(_stop, agent, agent.logger.outputs)
-        agent.logger.outputs, agent._learning = outputs, True
+        agent.logger.outputs, agent._learning = [*outputs], True
         for saver in savers:
             held.enter_context(saver.held(agent))
         remaining = None if call.last_step is None else call.last_step - agent._run.step
@@ -146,10 +149,13 @@ def carry_out(
             raise
         hooks.end()
         for saver in savers:
-            saver.save(agent)
+            saver.attempt(agent)
+        agent.failed_writes.retry()
 
 
-def open_outputs(agent: Agent, sinks: Iterable[Sink], tb_log_name: str | None, held: ExitStack) -> list[Sink]:
+def open_outputs(
+    agent: Agent, sinks: Iterable[Sink], tb_log_name: str | None, held: ExitStack
+) -> Sequence[RetryingSink]:
     """Returns where rows of statistics go; ``held`` closes those that are opened here."""
     loggers = agent.logger.outputs
     outputs: list[Sink] = [*sinks, *loggers]
@@ -159,7 +165,7 @@ def open_outputs(agent: Agent, sinks: Iterable[Sink], tb_log_name: str | None, h
         tensorboard = TensorBoard(next_folder(agent.tensorboard_log, tb_log_name or agent.name))
         held.callback(tensorboard.close)
         outputs.append(tensorboard)
-    return outputs
+    return [RetryingSink(output, agent.failed_writes) for output in outputs]
 
 
 def _stop(agent: Agent, loggers: list[Sink]) -> None:
@@ -186,6 +192,7 @@ def iterate(agent: Agent, call: Call, company: Company, interrupt: Interrupt) ->
         answers.append(company.hooks.step(agent, turn, run.obs))
         for saver in company.savers:
             saver(agent, turn)
+        agent.failed_writes.retry_if_due()
         agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
         refused = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
         if refused or agent.interrupted or call.is_over(turn.step, run.episode):

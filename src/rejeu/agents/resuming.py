@@ -48,6 +48,8 @@ class Resumed(NamedTuple):
     """Whether the run continues as it would have without the break, bit for bit."""
     reason: str
     """What differs otherwise; empty where it is exact."""
+    skipped: tuple[str, ...] = ()
+    """What was wrong with each newer checkpoint, which could not be read; newest first."""
 
     def __str__(self) -> str:
         return f"resumed at step {self.step:,}, {'exactly where it stood' if self.exact else self.reason}"
@@ -58,13 +60,19 @@ def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
     found = run_files(folder)
     if not found:
         raise FileNotFoundError(f"there is no checkpoint in {folder}")
+    skipped: list[str] = []
     for i, path in enumerate(found):
         try:
-            return _resume(cls, path, env, dict(changes))
+            agent = _resume(cls, path, env, dict(changes))
         except CheckpointError as error:
             if i + 1 == len(found):
                 raise
-            warnings.warn(f"{error}; going on from the checkpoint before it", UserWarning, stacklevel=3)
+            skipped.append(str(error))
+            warnings.warn(f"{error}; resuming from the checkpoint before it", UserWarning, stacklevel=3)
+        else:
+            assert agent.resumed is not None
+            agent.resumed = agent.resumed._replace(skipped=tuple(skipped))
+            return agent
     raise AssertionError
 
 

@@ -62,7 +62,8 @@ class Evaluate:
             env: as for the agent; an id or a function is made into at most 16 environments. Never the agent's own.
             every: environment steps between two evaluations.
             episodes: of each evaluation.
-            best_path: where the best model so far is saved, replacing the one before it; None for nowhere.
+            best_path: where the best model so far is saved, replacing the one before it; None for nowhere. Where it cannot be
+                written, training continues with a warning, and the write is tried again.
             seed: with the number of steps taken, of the environments at each evaluation; None takes the agent's.
             report: called with each result and whether it is the best so far.
         """
@@ -103,7 +104,7 @@ class Evaluate:
             self.best = result
             agent.remember_best(merit(result.evaluation), "evaluation")
             if self.best_path is not None:
-                agent.save(self.best_path)
+                agent.failed_writes.attempt(f"best model {self.best_path}", agent.snapshot(self.best_path))
         if self.report is not None:
             self.report(result, is_best)
         return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +77,9 @@ class Film:
             from rejeu.video import record_video
 
             path = self.folder / f"step_{progress.step}.mp4"
-            self.paths.append(record_video(agent, path, self.env, self.episodes, self.max_steps, self.seed))
+            film = partial(record_video, agent, path, self.env, self.episodes, self.max_steps, self.seed)
+            if agent.failed_writes.attempt(f"film {path}", film, retry=False):
+                self.paths.append(path)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns what it counts, as plain data for a checkpoint."""

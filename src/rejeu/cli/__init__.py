@@ -6,8 +6,9 @@ What a command needs is imported when it runs, so that asking for help is quick.
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TextIO
 
 import tyro
 
@@ -52,13 +53,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     run = next(function for kind, function in COMMANDS.values() if isinstance(arguments, kind))
     try:
-        return run(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = show_warning
+            return run(arguments)
     except KeyboardInterrupt:
         print("rejeu: interrupted", file=sys.stderr)
         return INTERRUPTED
     except expected_errors() as error:
         print(f"rejeu: error: {one_line(error)}", file=sys.stderr)
         return 2
+
+
+def show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Prints a warning for the user on one line; others with the place in the code, as Python does."""
+    if category is UserWarning:
+        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    else:
+        print(warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr, end="")
 
 
 def expected_errors() -> tuple[type[Exception], ...]:

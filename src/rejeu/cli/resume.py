@@ -50,7 +50,7 @@ def run(arguments: Resume) -> int:
         raise CheckpointError(f"{folder.config} names the algorithm {config.algorithm[:40]!r}, which is unknown")
     with closing(make_vector(config.env, config.n_envs, config.backend, config.seed)) as env:  # type: ignore[arg-type]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # what it says is printed below
+            warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
             agent = AGENTS[config.algorithm].resume(folder.checkpoints, env)
         say(f"run folder    {folder.path}: {config.env}, {config.algorithm}, seed {config.seed}")
         say(f"checkpoint    {agent.resumed}")

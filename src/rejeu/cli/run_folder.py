@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+from rejeu import atomic
 from rejeu.errors import CheckpointError
 
 Which = Literal["best", "last"]
@@ -144,7 +145,8 @@ def check_free(out: Path | None) -> None:
 def write_config(folder: RunFolder, config: RunConfig) -> None:
     """Writes ``config.json``, with the versions of what ran."""
     content = {**asdict(config), "versions": versions()}
-    folder.config.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with atomic.replacing(folder.config) as file:
+        file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_config(folder: RunFolder) -> RunConfig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -72,7 +73,7 @@ class Train:
 
 
 def run(arguments: Train) -> int:
-    """Trains and returns the exit status: 0, 130 after Ctrl-C or 143 after SIGTERM."""
+    """Trains and returns the exit status: 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
     watch = Watch()
     from rejeu import presets
     from rejeu.envs.measuring import sentence
@@ -115,10 +116,15 @@ class Watch:
 
 
 def finish(agent: Agent, config: RunConfig, folder: RunFolder, evaluate: Evaluate, watch: Watch) -> int:
-    """Draws and films what a run came to, says so, and returns the exit status."""
+    """Draws and films what a run came to, says so and what could not be written, and returns the exit status."""
+    written = agent.failed_writes.retry()
     picture(agent, evaluate, config, folder)
     say(summary(agent, evaluate, folder, *watch.seconds()))
-    return 0 if agent.interrupted_by is None else 128 + agent.interrupted_by
+    if failed := agent.failed_writes.summary():
+        print(f"warning: {failed}", file=sys.stderr)
+    if agent.interrupted_by is not None:
+        return 128 + agent.interrupted_by
+    return 0 if written else 2
 
 
 def check(arguments: Train) -> None:
@@ -264,11 +270,13 @@ def train(
     """
     from rejeu import errors
     from rejeu.callbacks import Checkpoint, Evaluate, Film
+    from rejeu.failed_writes import RetryingSink
     from rejeu.logging import CsvFile
 
     agent.report_folder = folder.path
     up_to = None if anew else agent.num_timesteps
-    metrics, table = CsvFile(folder.metrics, up_to), CsvFile(folder.evaluations, up_to)
+    metrics = CsvFile(folder.metrics, up_to)
+    table = RetryingSink(CsvFile(folder.evaluations, up_to), agent.failed_writes)
     evaluate = Evaluate(
         evaluation_env, config.evaluate_every, config.evaluate_episodes, folder.best, report=reporter(agent, table)
     )
@@ -286,20 +294,23 @@ def train(
             minutes=limits.minutes,
             sinks=[metrics],
         )
-        agent.save(folder.agent)
+        save(agent, folder.agent)
         evaluated_last = bool(evaluate.results) and evaluate.results[-1].step == agent.num_timesteps
         if not agent.interrupted and not evaluated_last:
             evaluate.run(agent, agent.num_timesteps)
         if not evaluate.results:
-            agent.save(folder.best)
+            save(agent, folder.best)
     except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
-        agent.save(folder.agent)
+        save(agent, folder.agent)
         raise
     finally:
-        agent.history.write_csv(folder.episodes)
-        metrics.close()
-        table.close()
+        agent.failed_writes.attempt(f"table {folder.episodes}", lambda: agent.history.write_csv(folder.episodes))
     return evaluate
+
+
+def save(agent: Agent, path: Path) -> None:
+    """Saves a model, or warns and tries again at the end of the command."""
+    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
 
 
 def reporter(agent: Agent, table: Sink) -> Callable[[Evaluated, bool], None]:
@@ -336,8 +347,8 @@ def picture(agent: Agent, evaluate: Evaluate, config: RunConfig, folder: RunFold
         plots.learning_curve(
             agent.history, folder.curve, evaluations=evaluate.results, title=f"{config.env}, {config.algorithm}"
         )
-    except ImportError as error:
-        say(f"no curve: {error}")
+    except (ImportError, OSError) as error:
+        say(f"no curve: {' '.join(str(error).split())}")
     if agent.interrupted:
         say(f"no video of a run that was stopped; rejeu record {folder.path} makes one")
         return
@@ -369,7 +380,8 @@ def summary(agent: Agent, evaluate: Evaluate, folder: RunFolder, seconds: float,
     if agent.interrupted:
         how = f"; rejeu resume {folder.path} goes on" if folder.checkpoints.is_dir() else ""
         name = "Ctrl-C" if agent.interrupted_by == signal.SIGINT else "SIGTERM"
-        lines.append(f"stopped by {name}; everything is saved{how}")
+        saved = "; everything is saved" if agent.failed_writes.complete else ""
+        lines.append(f"stopped by {name}{saved}{how}")
     if agent.ep_info_buffer:
         lines.append(f"training      last {len(agent.ep_info_buffer)} episodes: {training(agent)}")
     if evaluate.best is not None:

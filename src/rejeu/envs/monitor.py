@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+
+from rejeu import atomic
+from rejeu.failed_writes import FailedWrites
 
 SUFFIX = "monitor.csv"
 
@@ -19,7 +24,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     rejeu counts episodes itself and needs no Monitor; it is for scripts that read its numbers or its file. The file is
     CSV: one line ``#{"t_start": ..., "env_id": ...}``, then the columns ``r,l,t`` and the keywords. It is opened for
-    each row and held by nobody in between.
+    each row and held by nobody in between. Rows that cannot be written wait, with a warning.
 
     Args:
         env: what to watch.
@@ -64,6 +69,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.total_steps = 0
         self.current_reset_info: dict[str, Any] = {}
         self.path = None if filename is None else monitor_path(filename)
+        self._failed_writes = FailedWrites()
         if self.path is not None and (override_existing or not self.path.exists()):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             env_id = str(env.spec.id if env.spec is not None else None)
@@ -118,12 +124,18 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         row = {"r": round(total, 6), "l": length, "t": round(seconds, 6)}
         row |= {key: info[key] for key in self.info_keywords} | self.current_reset_info
         if self.path is not None:
-            with self.path.open("a", newline="\n", encoding="utf-8") as file:
-                csv.DictWriter(file, self._columns()).writerow(row)
+            line = csv_line(row, self._columns())
+            self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), line)
         return row
 
     def _columns(self) -> tuple[str, ...]:
         return ("r", "l", "t", *self.reset_keywords, *self.info_keywords)
+
+    def close(self) -> None:
+        """Closes the environment, after a last attempt at rows that could not be written."""
+        self._failed_writes.retry()
+        self._failed_writes.warn()
+        super().close()
 
     def get_total_steps(self) -> int:
         """Returns the steps taken in all."""
@@ -140,6 +152,13 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def get_episode_times(self) -> list[float]:
         """Returns when each episode ended, in seconds since construction."""
         return self.episode_times
+
+
+def csv_line(row: Mapping[str, Any], columns: Sequence[str]) -> bytes:
+    """Returns a row as a line of a CSV file."""
+    text = io.StringIO()
+    csv.DictWriter(text, columns).writerow(row)
+    return text.getvalue().encode()
 
 
 def monitor_path(filename: str | Path) -> Path:

@@ -7,15 +7,18 @@ import json
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.envs.monitor import Monitor, monitor_path
+from rejeu import atomic
+from rejeu.envs.monitor import Monitor, csv_line, monitor_path
 from rejeu.envs.vec_env import StepResult, VecEnv, VecEnvWrapper
 from rejeu.errors import BadEnvironmentError
+from rejeu.failed_writes import FailedWrites
 
 LAST = "terminal_observation"
 
@@ -110,11 +113,18 @@ class VecMonitor(VecEnvWrapper):
         self.episode_returns = np.zeros(self.num_envs)
         self.episode_lengths = np.zeros(self.num_envs, np.int64)
         self.path = None if filename is None else monitor_path(filename)
+        self._failed_writes = FailedWrites()
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("w", newline="\n", encoding="utf-8") as file:
                 file.write(f"#{json.dumps({'t_start': self.t_start, 'env_id': None})}\n")
                 csv.writer(file).writerow(("r", "l", "t", *self.info_keywords))
+
+    def close(self) -> None:
+        """Closes the environments, after a last attempt at rows that could not be written."""
+        self._failed_writes.retry()
+        self._failed_writes.warn()
+        super().close()
 
     def reset(self) -> Any:
         """Resets the environments and returns the observations."""
@@ -145,8 +155,8 @@ class VecMonitor(VecEnvWrapper):
         self.episode_count += 1
         self.episode_returns[i] = self.episode_lengths[i] = 0
         if self.path is not None:
-            with self.path.open("a", newline="\n", encoding="utf-8") as file:
-                csv.DictWriter(file, ("r", "l", "t", *self.info_keywords)).writerow(row)
+            line = csv_line(row, ("r", "l", "t", *self.info_keywords))
+            self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), line)
         return row
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
+from rejeu import atomic
 from rejeu.checkpoint import SUFFIX
 from rejeu.config import whole
 from rejeu.envs.auto_reset import around, identities
@@ -147,7 +149,8 @@ class EvalCallback(EventCallback):
             if self.verbose >= 1:
                 print("New best mean reward!")
             if self.best_model_save_path is not None:
-                self.model.save(Path(self.best_model_save_path) / f"best_model{SUFFIX}")
+                path = Path(self.best_model_save_path) / f"best_model{SUFFIX}"
+                self.model.failed_writes.attempt(f"best model {path}", self.model.snapshot(path))
             if self.callback_on_new_best is not None:
                 goes_on = self.callback_on_new_best.on_step()
         return goes_on and self._on_event()
@@ -167,14 +170,11 @@ class EvalCallback(EventCallback):
             self.evaluations_successes.append(self._successes)
             if {len(row) for row in self.evaluations_successes} == {self.n_eval_episodes}:
                 parts["successes"] = np.array(self.evaluations_successes)
-        Path(self.log_path).parent.mkdir(parents=True, exist_ok=True)
-        np.savez(
-            self.log_path,
-            timesteps=np.array(self.evaluations_timesteps),
-            results=np.array(self.evaluations_results),
-            ep_lengths=np.array(self.evaluations_length),
-            **parts,
-        )
+        parts["timesteps"] = np.array(self.evaluations_timesteps)
+        parts["results"] = np.array(self.evaluations_results)
+        parts["ep_lengths"] = np.array(self.evaluations_length)
+        path = Path(f"{self.log_path}.npz")
+        self.model.failed_writes.attempt(f"evaluations {path}", partial(_write_npz, path, parts))
 
     def _report(self, returns: list[float], lengths: list[int]) -> None:
         self.last_mean_reward = float(np.mean(returns))
@@ -237,6 +237,11 @@ class StopTrainingOnNoModelImprovement(BaseCallback):
         if self.verbose >= 1 and not goes_on:
             print(f"Stopping: no new best model in the last {self.no_improvement_evals} evaluations")
         return goes_on
+
+
+def _write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    with atomic.replacing(path) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def _evaluation(callback: BaseCallback) -> EvalCallback:

@@ -44,13 +44,19 @@ class CheckpointCallback(BaseCallback):
         from rejeu.agents.off_policy import OffPolicyAgent  # which imports this module
 
         if self.n_calls % self.save_freq == 0:
-            self._say(self.model.save(self._path("")))
+            self._write(self.model.save, "")
             if self.save_replay_buffer and isinstance(self.model, OffPolicyAgent):
-                self._say(self.model.save_replay_buffer(self._path("replay_buffer_")))
+                self._write(self.model.save_replay_buffer, "replay_buffer_")
             statistics = self.model.get_vec_normalize_env()
             if self.save_vecnormalize and statistics is not None:
-                self._say(statistics.save(self._path("vecnormalize_")))
+                self._write(statistics.save, "vecnormalize_")
         return True
+
+    def _write(self, save: Callable[[Path], Any], kind: str) -> None:
+        """Saves one file, or warns; the next call that is due writes one of another name."""
+        path = self._path(kind)
+        if self.model.failed_writes.attempt(str(path), lambda: save(path), retry=False):
+            self._say(path)
 
     def _path(self, kind: str) -> Path:
         return self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{SUFFIX}"

@@ -1,0 +1,35 @@
+"""A disk that is full for a while: files can be opened, and half of what is written to them arrives."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import pathlib
+
+
+class FullDisk:
+    """While ``full``, every write through ``Path.open`` fails after half of its bytes, as it does on a real disk."""
+
+    def __init__(self, monkeypatch):
+        self.full = False
+        self.failures = 0
+        opened = pathlib.Path.open
+
+        def open_(path, mode="r", *rest, **keywords):
+            if self.full and mode in ("xb", "r+b"):
+                return _Half(path, mode, self)
+            return opened(path, mode, *rest, **keywords)
+
+        monkeypatch.setattr(pathlib.Path, "open", open_)
+
+
+class _Half(io.FileIO):
+    def __init__(self, path, mode, disk):
+        super().__init__(path, mode)
+        self._disk = disk
+
+    def write(self, content):
+        super().write(memoryview(content)[: len(content) // 2])
+        self._disk.failures += 1
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
