@@ -8,7 +8,12 @@ import jax
 import numpy as np
 import pytest
 
+import rejeu
+from rejeu.agents.call import Call
+from rejeu.callbacks import Checkpoint
 from rejeu.schedules import Exponential, Linear, at, parse, to_json
+from tests.environments import Counter
+from tests.helpers import small_sac
 
 
 @pytest.mark.parametrize(("progress", "value"), [(0.0, 1.0), (0.25, 0.55), (0.5, 0.1), (0.8, 0.1), (1.0, 0.1)])
@@ -93,3 +98,92 @@ def test_a_fraction_outside_the_run_is_refused(make):
 def test_an_exponential_needs_positive_ends(ends):
     with pytest.raises(ValueError, match="exponential schedule needs positive ends"):
         Exponential(*ends)
+
+
+def progress_of_updates(agent, *calls):
+    """Returns for each call of ``learn``, given by its arguments, the progress that every update was told."""
+    update, told = agent._compiled.update, []
+
+    def updating(state, batches, clock):
+        told[-1].append(float(clock.progress))
+        return update(state, batches, clock)
+
+    agent._compiled.update = updating
+    for arguments in calls:
+        told.append([])
+        agent.learn(**arguments)
+    return told
+
+
+def test_schedules_continue_over_learn_as_in_stable_baselines3():
+    """Its ``_setup_learn`` adds the steps taken to the total: progress = num_timesteps / (steps at the start + total)."""
+    more = {"total_timesteps": 60, "reset_num_timesteps": False}
+    told = progress_of_updates(
+        small_sac(Counter(), learning_starts=0), {"total_timesteps": 20}, more, more, {"total_timesteps": 10}, more
+    )
+    expected = [
+        np.arange(1, 21) / 20,
+        (20 + np.arange(1, 61)) / 80,
+        (80 + np.arange(1, 61)) / 140,
+        np.arange(1, 11) / 10,
+        (10 + np.arange(1, 61)) / 70,
+    ]
+    for got, wanted in zip(told, expected, strict=True):
+        np.testing.assert_allclose(got, wanted[-len(got) :], rtol=1e-6)
+        assert len(got) >= len(wanted) - 1  # nothing can be drawn in the first turn
+
+
+def test_exploration_does_not_begin_again_with_the_next_slice_of_a_training():
+    env = rejeu.make_vector("CartPole-v1", 1, "gymnasium", seed=0)
+    settings = {"learning_starts": 4, "batch_size": 4, "buffer_size": 99, "train_freq": 1}
+    agent = rejeu.DQN("MlpPolicy", env, exploration_fraction=0.5, policy_kwargs={"net_arch": [4]}, seed=0, **settings)
+    rates = []
+    note = lambda agent, turn: rates.append(float((turn.metrics or {}).get("exploration_rate", 1.0)))  # noqa: E731
+    agent.learn(40, note)
+    agent.learn(40, note, reset_num_timesteps=False)
+    expected = np.concatenate([np.ones(4), np.maximum(1 - 0.95 * np.arange(5, 41) / 20, 0.05), np.full(40, 0.05)])
+    np.testing.assert_allclose(rates, expected, rtol=1e-5)
+
+
+def test_schedules_follow_episodes_likewise():
+    more = {"episodes": 6, "reset_num_timesteps": False}
+    told = progress_of_updates(small_sac(Counter(lengths=(1,)), learning_starts=0), {"episodes": 2}, more)
+    np.testing.assert_allclose(told[1], (2 + np.arange(1, 7)) / 8, rtol=1e-6)
+
+
+def test_schedules_follow_training_time_likewise(monkeypatch):
+    monkeypatch.setattr("time.perf_counter", lambda: 100.0)
+    call = Call(None, None, 60.0, 0, 0, 4, 0, seconds_before=20.0, began=100.0)
+    assert call.progress(5, 1) == 20 / 80
+    monkeypatch.setattr("time.perf_counter", lambda: 130.0)
+    assert call.progress(5, 1) == 50 / 80
+    monkeypatch.setattr("time.perf_counter", lambda: 160.0)
+    assert call.progress(5, 1) == 1.0
+    agent = small_sac(Counter()).learn(8)
+    spent = agent.seconds["total"]
+    agent.learn(minutes=1, callback=lambda *_: False, reset_num_timesteps=False)
+    assert agent._call.seconds_before == spent
+
+
+def test_a_resumed_call_keeps_its_progress_and_its_schedules_continue_after_it(tmp_path):
+    make = lambda: rejeu.make_vector("Pendulum-v1", 1, "gymnasium", seed=0)  # noqa: E731
+    agent = small_sac(make(), learning_starts=0).learn(20)
+    stop = lambda agent, turn: turn.step < 50  # noqa: E731
+    agent.learn(60, [stop, Checkpoint(tmp_path, every=1000)], reset_num_timesteps=False)
+    agent = rejeu.SAC.resume(tmp_path, make())
+    more = {"total_timesteps": 20, "reset_num_timesteps": False}
+    rest, after = progress_of_updates(agent, {}, more)
+    np.testing.assert_allclose(rest, np.arange(51, 81) / 80, rtol=1e-6)
+    np.testing.assert_allclose(after, np.arange(81, 101) / 100, rtol=1e-6)
+
+
+def test_schedules_of_a_loaded_agent_continue_by_the_steps_and_episodes_of_its_file(tmp_path):
+    agent = small_sac(Counter(lengths=(1,)), learning_starts=0).learn(10)
+    agent.learn(20).save(tmp_path / "agent")
+    agent = rejeu.SAC.load(tmp_path / "agent", Counter(lengths=(1,)))
+    by_steps, by_episodes = progress_of_updates(
+        agent, {"total_timesteps": 20, "reset_num_timesteps": False}, {"episodes": 10, "reset_num_timesteps": False}
+    )
+    np.testing.assert_allclose(by_steps[-1], 40 / 40)
+    np.testing.assert_allclose(by_steps[0], (20 + 21 - len(by_steps)) / 40, rtol=1e-6)
+    np.testing.assert_allclose(by_episodes, (40 + np.arange(1, 11)) / 50, rtol=1e-6)

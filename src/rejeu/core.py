@@ -87,7 +87,7 @@ class Clock(NamedTuple):
     episode: Any
     """Episodes finished so far, over all environments."""
     progress: Any
-    """Fraction of the present ``learn`` call that is done, in [0, 1]."""
+    """How far schedules are, in [0, 1]: the fraction that is done of the present ``learn`` call and those it continues."""
 
 
 class Explorer(NamedTuple):

@@ -135,6 +135,11 @@ class Agent(ABC):
         self._callbacks: list[Any] = []
         self._saved_callbacks: list[Any] | None = None
         self._steps_before = 0
+        """Environment steps taken in all when the last ``learn`` with ``reset_num_timesteps=True`` began."""
+        self._episodes_before = 0
+        """Episodes finished in all at that time."""
+        self._seconds_before = 0.0
+        """Training time in all at that time."""
         self._n_predictions = 0
         self._memory_form: Any = None
         """The form of what the policy remembers of one episode, once somebody has given it."""
@@ -266,10 +271,14 @@ class Agent(ABC):
                 Objects with hooks as in Stable-Baselines3 are taken too, see :mod:`rejeu.hooks`.
             log_interval: episodes between two rows of statistics.
             tb_log_name: name of the run in ``tensorboard_log``; None: the algorithm's.
-            reset_num_timesteps: start counting and log anew; learning itself goes on where it stood in either case.
+            reset_num_timesteps: count steps from 0 and begin schedules (learning rate, exploration, clip range, beta)
+                again. With False both continue as in Stable-Baselines3: steps taken before count as done and as part of
+                the whole, so ``learn(300, reset_num_timesteps=False)`` after 100 steps moves schedules from 1/4 of their
+                way to the end. Learning itself continues in either case.
             progress_bar: show one.
             episodes: stop when so many episodes have ended, over all environments.
-            minutes: stop after so much wall time. Schedules follow whichever limit is nearest.
+            minutes: stop after so much wall time. Schedules follow whichever limit is nearest; episodes and training time
+                before this call count as steps do.
             sinks: further places for the rows of statistics, such as ``rejeu.logging.CsvFile(path)``.
 
         Without any limit, an agent from :meth:`resume` goes on with the ``learn`` that was cut off, to its end; arguments

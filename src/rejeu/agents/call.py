@@ -29,6 +29,12 @@ class Call:
     """Episodes between two rows of statistics."""
     logged: int
     """Episodes in the history when the last row was written."""
+    steps_before: int = 0
+    """Environment steps that schedules count as taken before it: those since the last ``learn`` that began to count."""
+    episodes_before: int = 0
+    """Episodes likewise."""
+    seconds_before: float = 0.0
+    """Training time likewise."""
     spent: float = 0.0
     """Wall time that it had taken when it was last taken up, in seconds."""
     began: float = dataclasses.field(default_factory=time.perf_counter)
@@ -45,10 +51,14 @@ class Call:
         return None if self.n_steps is None else self.first_step + self.n_steps
 
     def progress(self, step: int, episode: int) -> float:
-        """Returns the fraction that is done when so many steps and episodes have passed in all, by the nearest limit."""
-        by_steps = (step - self.first_step) / self.n_steps if self.n_steps else 0.0
-        by_episodes = (episode - self.first_episode) / self.n_episodes if self.n_episodes else 0.0
-        by_time = self.elapsed / self.seconds if self.seconds else 0.0
+        """Returns the progress of schedules, in [0, 1], when so many steps and episodes have passed in all.
+
+        As in Stable-Baselines3, what came before counts as done, and as part of the whole: with 100 steps before and 300
+        to take, progress goes from 0.25 to 1. Of several limits the nearest counts.
+        """
+        by_steps = share(self.steps_before, step - self.first_step, self.n_steps)
+        by_episodes = share(self.episodes_before, episode - self.first_episode, self.n_episodes)
+        by_time = share(self.seconds_before, self.elapsed, self.seconds)
         return min(max(by_steps, by_episodes, by_time), 1.0)
 
     def is_over(self, step: int, episode: int) -> bool:
@@ -77,8 +87,20 @@ class Call:
             first_episode=whole("first_episode", saved["first_episode"], least=0),
             log_interval=whole("log_interval", saved["log_interval"], least=0),
             logged=whole("logged", saved["logged"], least=0),
+            steps_before=whole("steps_before", saved.get("steps_before", 0), least=0),
+            episodes_before=whole("episodes_before", saved.get("episodes_before", 0), least=0),
+            seconds_before=number("seconds_before", saved.get("seconds_before", 0.0), least=0),
             spent=number("spent", saved["spent"], least=0),
         )
+
+
+def share(before: float, taken: float, limit: float | None) -> float:
+    """Returns which share of ``before + limit`` is done once ``taken`` more have passed; 0 without a limit.
+
+    >>> share(100, 0, 300), share(100, 300, 300), share(100, 50, None)
+    (0.25, 1.0, 0.0)
+    """
+    return 0.0 if limit is None else (before + taken) / (before + limit)
 
 
 SAVED = [field.name for field in dataclasses.fields(Call) if field.name not in ("spent", "began")]

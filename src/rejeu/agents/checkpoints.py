@@ -301,7 +301,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "metrics": None if run.metrics is None else {key: np.asarray(value) for key, value in run.metrics.items()},
         "n_skipped": run.watch.n_skipped,
         "td_errors": leaves([td_error for _, td_error in run.td_errors]),
-        "seconds": {key: float(value) for key, value in run.seconds.items()},
+        "seconds": {**{key: float(value) for key, value in run.seconds.items()}, "before": agent._seconds_before},
         "buffer": buffer_content(run),
         "history": agent.history.table(),
         "best": best,

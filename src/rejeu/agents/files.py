@@ -49,6 +49,7 @@ def header(agent: Agent) -> dict[str, Any]:
         "counters": {
             "step": run.step,
             "steps_before": agent._steps_before,
+            "episodes_before": agent._episodes_before,
             "episode": run.episode,
             "n_updates": run.n_updates,
         },
@@ -123,4 +124,4 @@ def stand(agent: Agent, vector: VectorEnv | None, state: Any, saved: loading.Sav
     run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": saved.rng}
     run.learn_from = agent._learn_from(run.step)
     run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
-    agent._steps_before = counters["steps_before"]
+    agent._steps_before, agent._episodes_before = counters["steps_before"], counters["episodes_before"]

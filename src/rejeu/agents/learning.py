@@ -56,17 +56,24 @@ def begin(
     if goes_on:
         call = cut_off(agent)
     else:
+        n_steps = None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1)
+        n_episodes = None if episodes is None else configs.whole("episodes", episodes, least=1)
+        seconds = None if minutes is None else 60 * configs.number("minutes", minutes, above=0)
+        if reset_num_timesteps:
+            agent._steps_before, agent._episodes_before = run.step, run.episode
+            agent._seconds_before = run.seconds["total"]
         call = Call(
-            n_steps=None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1),
-            n_episodes=None if episodes is None else configs.whole("episodes", episodes, least=1),
-            seconds=None if minutes is None else 60 * configs.number("minutes", minutes, above=0),
+            n_steps,
+            n_episodes,
+            seconds,
             first_step=run.step,
             first_episode=run.episode,
             log_interval=log_interval,
             logged=len(agent.history),
+            steps_before=run.step - agent._steps_before,
+            episodes_before=run.episode - agent._episodes_before,
+            seconds_before=run.seconds["total"] - agent._seconds_before,
         )
-        if reset_num_timesteps:
-            agent._steps_before = run.step
     if run.env.venv is not None and (reset_num_timesteps or goes_on):  # may have been stepped by hand since
         run.obs = run.action = None
     return call

@@ -115,7 +115,7 @@ def _interpret(
             config,
             observation_space,
             spaces.rebuild(header["action_space"], largest),
-            {key: configs.whole(key, header["counters"][key], 0, 2**32 - 1) for key in COUNTERS},
+            check_counters(header["counters"]),
             {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")},
             policy,
             whole_seed(header["seed"]),
@@ -124,6 +124,18 @@ def _interpret(
         )
     except KeyError as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)} is missing") from None
+
+
+def check_counters(saved: Mapping[str, Any]) -> dict[str, int]:
+    """Returns the counters of a model file; what was counted before is no more than what was counted in all.
+
+    Raises:
+        KeyError, TypeError, ValueError: if they are damaged.
+    """
+    counters = {key: configs.whole(key, saved[key], 0, 2**32 - 1) for key in COUNTERS}
+    configs.whole("steps_before", counters["steps_before"], 0, counters["step"])
+    before = saved.get("episodes_before", 0)  # older files do not have it
+    return counters | {"episodes_before": configs.whole("episodes_before", before, 0, counters["episode"])}
 
 
 def check_sizes(config: Any, arrays: Mapping[str, np.ndarray]) -> None:

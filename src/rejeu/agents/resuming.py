@@ -225,6 +225,7 @@ def restore(
     run.watch.n_skipped = whole("n_skipped", saved["n_skipped"], least=0)
     td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved["td_errors"]]
     run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
+    agent._seconds_before = number("before", saved["seconds"].get("before", 0.0), least=0, most=run.seconds["total"])
     for key in PER_ENV:
         setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
     for part in rows:

@@ -48,7 +48,7 @@ def on_policy(
         compiled: the algorithm.
         config: its hyper-parameters.
         n_steps: over all environments; where their number does not divide it, the last turn keeps as many as remain.
-        progress: gives the fraction of the run that is done after so many steps of it; schedules follow it.
+        progress: gives the progress of schedules after so many steps.
 
     Raises:
         BadEnvironmentError: if a reward or an observation is not finite.
