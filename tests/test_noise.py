@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+import rejeu
 from rejeu.core import Algorithm, Clock
 from rejeu.exploration import explorer
 from rejeu.exploration.noise import (
@@ -20,6 +21,8 @@ from rejeu.exploration.noise import (
     parse,
     to_json,
 )
+from tests.environments import Counter
+from tests.helpers import small_sac
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0))
 
@@ -285,3 +288,53 @@ def test_what_was_done_by_hand_is_no_part_of_the_settings():
     assert repr(noise) == repr(fresh)
     assert to_json(noise) == to_json(fresh)
     np.testing.assert_array_equal(noise.init(2), fresh.init(2))
+
+
+# It belongs to training: nothing that predicts adds it.
+
+NOISES = {
+    "normal": NormalActionNoise([0.9], 0.5),
+    "Ornstein-Uhlenbeck": OrnsteinUhlenbeckActionNoise([0.9], 0.5, initial_noise=[0.9]),
+    "parameters": ParameterNoise(1.0),
+}
+
+
+@pytest.mark.parametrize("noise", list(NOISES))
+def test_a_deterministic_policy_predicts_the_same_action_whatever_the_noise_of_its_training(noise):
+    settings = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 0, "batch_size": 4, "seed": 0}
+    settings |= {"action_noise": NOISES[noise], "normalize": noise == "parameters"}
+    agent = rejeu.TD3("MlpPolicy", Counter((5,)), **settings).learn(6)
+    obs = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    expected, _ = agent.predict(obs, deterministic=True)
+    for _ in range(2):
+        np.testing.assert_allclose(agent.predict(obs)[0], expected, atol=1e-6)
+    assert np.abs(expected).max() < 1.0
+    env = Counter((5,))
+    agent.evaluate(2, env=env, deterministic=False)
+    last_seen = np.float32([1, 4, env.drawn])  # of the second episode, before its last step
+    np.testing.assert_allclose(env.actions[-1], agent.predict(last_seen, deterministic=True)[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", list(NOISES))
+def test_a_stochastic_policy_predicts_samples_without_the_noise_of_its_training(noise):
+    """Two agents of one seed have the same weights and draw the same numbers."""
+    plain, noisy = small_sac(Counter((5,))), small_sac(Counter((5,)), action_noise=NOISES[noise])
+    obs = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    first, second = plain.predict(obs)[0], plain.predict(obs)[0]
+    assert (first != second).any()
+    np.testing.assert_allclose(noisy.predict(obs)[0], first, atol=1e-6)
+    np.testing.assert_allclose(noisy.predict(obs)[0], second, atol=1e-6)
+
+
+def test_parameter_noise_of_dqn_is_not_predicted_with():
+    """With epsilon 0, what is predicted is the greedy action."""
+    agent = rejeu.DQN(
+        "MlpPolicy",
+        "CartPole-v1",
+        action_noise=ParameterNoise(10.0),
+        exploration_final_eps=0.0,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    )
+    obs = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    np.testing.assert_array_equal(agent.predict(obs)[0], agent.predict(obs, deterministic=True)[0])

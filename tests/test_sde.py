@@ -142,6 +142,16 @@ def test_prediction_draws_noise_of_its_own():
     assert np.array_equal(agent.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
 
 
+def test_predictions_have_the_deviation_of_the_noise():
+    agent = rejeu.PPO("MlpPolicy", Counter((5,), low=-3.0, high=3.0), **SMALL)
+    obs = np.float32([1.0, -0.5, 0.2])
+    drawn = agent.predict(np.tile(obs, (4000, 1)))[0][:, 0] / 3.0
+    distribution = agent.state.network.policy(obs[None])
+    deviation, middle = float(np.exp(distribution.log_std[0, 0])), float(distribution.mean[0, 0])
+    bounded = np.clip(middle + deviation * np.random.default_rng(0).normal(size=10**6), -1.0, 1.0)
+    np.testing.assert_allclose([drawn.mean(), drawn.std()], [bounded.mean(), bounded.std()], atol=0.05)
+
+
 def test_it_finds_the_best_action():
     """Of two sights, neither of them 0: there the hidden layer would be 0 at first, and with it the noise."""
     env = InProcess([BySightAndAction() for _ in range(4)], seed=0)

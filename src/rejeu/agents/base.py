@@ -339,7 +339,8 @@ class Agent(ABC):
             state: what the last call returned, for a policy with a memory; None where episodes begin.
             episode_start: where an episode begins with this observation, ``bool (batch,)``, so that what was remembered
                 is forgotten there; None for nowhere.
-            deterministic: the policy's mode; False draws from the policy.
+            deterministic: the policy's mode; False draws from the policy, which gives the same action again where the policy
+                is deterministic (DDPG, TD3). ``action_noise`` is never added: it belongs to training.
             action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, for agents that take masks; None
                 allows all.
 
@@ -377,7 +378,7 @@ class Agent(ABC):
             episodes: how many; None: 100, or with ``minutes`` as many as there is time for.
             env: where, as for the constructor; None: new environments like the agent's own if it was given an id,
                 else the agent's own, whose running episodes are then given up.
-            deterministic: the policy's mode; False draws from the policy.
+            deterministic: the policy's mode; False draws from the policy, as :meth:`predict` does.
             seed: of the environments, the agent's own included; None draws one for new environments, and lets the
                 random numbers of others go on.
             success_threshold: return from which on an episode counts as a success where the environment does not say;

@@ -54,7 +54,7 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
     Args:
         agent: whose policy; its updates under way are waited for.
         obs: a batch of observations, cast.
-        deterministic: the policy's mode; False draws from the policy.
+        deterministic: the policy's mode; False draws from the policy, without the noise that training adds.
         memory: what the last call returned; None stands for episodes that have not begun.
         ended: where an episode begins with these observations, ``bool (batch,)``.
 
@@ -66,19 +66,19 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
     has_memory = compiled.algorithm.recall is not None
     if deterministic and not has_memory:
         return np.asarray(compiled.exploit(run.state, obs)), None
-    if has_memory and memory is not None:
-        check_memory(agent, memory, n)
-        carry = memory
+    if not has_memory:
+        memory = ()
+    elif memory is None:
+        memory = compiled.initial_carry(n)
     else:
-        carry = compiled.initial_carry(n)
+        check_memory(agent, memory, n)
     if deterministic:
-        action, carry = compiled.recall(run.state, carry, obs, ended)
-        return np.asarray(action), carry
+        action, memory = compiled.recall(run.state, memory, obs, ended)
+        return np.asarray(action), memory
     clock = host.clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent._n_predictions % 2**31))
     agent._n_predictions += 1
-    ended = ended if has_memory else np.ones(n, bool)
-    action, carry = compiled.act(run.state, carry, obs, ended, run.key, clock)
-    return np.asarray(action), carry if has_memory else None
+    action, memory = compiled.sample(run.state, memory, obs, ended, run.key, clock)
+    return np.asarray(action), memory if has_memory else None
 
 
 def check_memory(agent: Agent, memory: Any, n: int) -> None:

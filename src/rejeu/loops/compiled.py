@@ -16,7 +16,7 @@ from jax import Array
 
 from rejeu import compilation, finite
 from rejeu.checkpoint import names
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Rollout, Transition, copy as copied
+from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Transition, copy as copied
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
 from rejeu.loops.packing import HostPacker, Message, Packing, Readings
@@ -48,13 +48,16 @@ class Compiled:
         def init(key: Array) -> PackedState:
             return packing.pack(algorithm.init(key))
 
-        @partial(jax.jit, static_argnums=4)
-        def act(
-            state: PackedState, carry: PyTree, key: Array, vectors: list[Array], plan: Message
-        ) -> tuple[Array, PyTree]:
-            obs, ended, clock = plan.unpack(vectors)
-            actor = algorithm.actor(packing.unpack(state))
-            return explorer.act(carry, actor, obs, ended, nth(key, clock.step), clock)
+        def acting(explorer: Explorer) -> Any:
+            @partial(jax.jit, static_argnums=4)
+            def act(
+                state: PackedState, carry: PyTree, key: Array, vectors: list[Array], plan: Message
+            ) -> tuple[Array, PyTree]:
+                obs, ended, clock = plan.unpack(vectors)
+                actor = algorithm.actor(packing.unpack(state))
+                return explorer.act(carry, actor, obs, ended, nth(key, clock.step), clock)
+
+            return act
 
         @partial(jax.jit, static_argnums=2)
         def exploit(state: PackedState, vectors: list[Array], plan: Message) -> Array:
@@ -120,7 +123,10 @@ class Compiled:
         self.observe = None if algorithm.observe is None else self._observe_packed
         """``observe(state, obs, running_return) -> state``, packed, whose predecessor is donated; None where the algorithm
         has no use for it (see :class:`rejeu.core.Algorithm`)."""
-        self._act, self._exploit, self._recall, self._observe, self._update = act, exploit, recall, observe, update
+        self._exploit, self._recall, self._observe, self._update = exploit, recall, observe, update
+        self._act = self._sample = acting(explorer)
+        if algorithm.recall is None and (noise is not None or algorithm.explorer is not None):
+            self._sample = acting(exploration.plain(algorithm))
 
     def act(
         self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
@@ -130,6 +136,15 @@ class Compiled:
         ``ended``, ``bool (n_envs,)``, is where an episode has just begun.
         """
         return self._act(state, carry, key, *self._act_packer((obs, ended, clock), len(ended)))
+
+    def sample(
+        self, state: PackedState, memory: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
+    ) -> tuple[Array, PyTree]:
+        """Returns actions drawn from the policy for ``obs`` ``(batch, ...)``, without any noise, and its memory after them.
+
+        ``memory`` is ``()`` for a policy without one; ``ended`` is as for :meth:`act`.
+        """
+        return self._sample(state, memory, key, *self._act_packer((obs, ended, clock), len(ended)))
 
     def recall(self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any) -> tuple[Array, PyTree]:
         """Returns the deterministic actions of a policy with a memory, and the memory after ``obs`` ``(batch, ...)``."""
