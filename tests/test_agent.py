@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu import callbacks
 from rejeu.envs.vector import InProcess
 from rejeu.errors import CheckpointError
 from tests.environments import Counter, Reach, Sampled
@@ -243,6 +244,43 @@ def test_best_weights_are_kept_from_the_20th_episode_on_whatever_the_window_of_s
     agent.learn(2 * 6)
     assert agent.best.score == pytest.approx(np.mean([2 * 100 * k + 1 for k in range(5, 25)]))
     assert (agent.best.by, agent.best.step) == ("training", 50)
+
+
+def test_with_a_window_of_one_the_weights_of_the_best_single_episode_are_kept():
+    agent = small_sac("rejeu/Ball-v0", learning_starts=8, best_window=1)
+    kept = []
+    agent.learn(300, lambda agent, turn: kept.append(agent.best.step) if turn.episodes else None)
+    records = agent.history.records()
+    assert 1 < len(records) < len(agent.history)
+    assert sorted({*kept}) == [episode.step for episode in records]
+    assert agent.best.score == agent.history.best_return == records[-1].episode_return
+
+
+def test_of_episodes_that_end_together_the_best_counts():
+    """The first environment returns twice what the second does, and is booked before it."""
+
+    class Twice(gym.RewardWrapper):
+        def reward(self, reward):
+            return 2 * reward
+
+    agent = small_sac(InProcess([Twice(Counter((2,))), Counter((2,))], seed=0), learning_starts=NEVER, best_window=1)
+    agent.learn(4)
+    assert agent.history["return"].tolist() == [2.0, 1.0]
+    assert agent.best.score == 2.0
+
+
+def test_no_best_weights_yet_says_how_many_episodes_it_takes():
+    agent = small_sac(counters(1), best_window=3)
+    with pytest.raises(ValueError, match="kept once 3 episodes of training ended"):
+        agent.restore_best()
+
+
+def test_the_best_return_stands_in_every_row_and_records_can_be_printed(capsys):
+    agent = small_sac(counters(1, (2,)), learning_starts=NEVER).learn(6, callbacks.print_records)
+    assert capsys.readouterr().out.splitlines() == [
+        f"\N{NORTH EAST ARROW} return {value:.2f} at step {step}" for value, step in ((1, 2), (201, 4), (401, 6))
+    ]
+    assert agent.statistics()["rollout/ep_rew_best"] == 401.0
 
 
 def test_success_is_counted_where_the_environment_tells():

@@ -82,6 +82,13 @@ def test_a_notebook_shows_the_curve_without_matplotlibs_magic():
     assert formatted["image/png"].startswith(b"\x89PNG")
 
 
+def test_records_are_marked():
+    returns = [3.0, 1.0, 3.0, 5.0]
+    record = History([Episode(10 * i, 0, value, 10, float("nan"), i) for i, value in enumerate(returns)])
+    marks = next(line for line in learning_curve(record).axes[0].lines if line.get_label() == "records")
+    assert list(zip(marks.get_xdata(), marks.get_ydata(), strict=True)) == [(0, 3.0), (30, 5.0)]
+
+
 def test_evaluations_are_drawn_at_their_steps():
     figure = learning_curve(history(), evaluations=[evaluated(50_000), evaluated(100_000)])
     points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))

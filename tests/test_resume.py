@@ -469,6 +469,18 @@ def test_callbacks_that_differ_from_the_saved_ones_are_named(tmp_path):
         rejeu.SAC.resume(tmp_path).learn(callback=[evaluate, Counting()])
 
 
+def test_the_best_single_episode_of_a_run_that_is_cut_off_is_that_of_the_run_without_a_break(tmp_path):
+    make = lambda: small_sac(BALL, best_window=1, seed=1)  # noqa: E731
+    whole = make().learn(300)
+    make().learn(300, [lambda agent, turn: turn.step < 150, Checkpoint(tmp_path, every=50)])
+    again = rejeu.SAC.resume(tmp_path).learn()
+    assert again.best_window == 1
+    assert whole.history.records()[0].step < 150 < whole.best.step
+    assert again.best[:3] == whole.best[:3]
+    np.testing.assert_equal([e[:5] for e in again.history.records()], [e[:5] for e in whole.history.records()])
+    assert_same(again.restore_best().get_parameters(), whole.restore_best().get_parameters())
+
+
 def test_best_weights_survive(tmp_path):
     agent = small_sac(BALL)
     keep = lambda a, turn: a.remember_best((0.5, -turn.step)) if turn.step == 17 else None  # noqa: E731

@@ -74,6 +74,7 @@ class Agent(ABC):
         tensorboard_log: str | Path | None = None,
         stats_window_size: int = 100,
         success_threshold: float | None = None,
+        best_window: int = best.BEST_WINDOW,
         device: str = "auto",
         **hyperparameters: Any,
     ) -> None:
@@ -89,6 +90,7 @@ class Agent(ABC):
             tensorboard_log,
             configs.whole("stats_window_size", stats_window_size, least=1),
             None if success_threshold is None else configs.number("success_threshold", success_threshold),
+            configs.whole("best_window", best_window, least=1),
         )
         self._own_env = isinstance(env, str)
         vector = self._vector(env, 1, seed=self.seed)
@@ -106,11 +108,13 @@ class Agent(ABC):
         tensorboard_log: str | Path | None,
         stats_window_size: int,
         success_threshold: float | None,
+        best_window: int,
     ) -> None:
         """Sets everything that does not depend on the environment."""
         self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
         self.tensorboard_log = tensorboard_log
         self.stats_window_size, self.success_threshold = stats_window_size, success_threshold
+        self.best_window = best_window
         self.history = History()
         self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=stats_window_size)
         """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
@@ -301,9 +305,9 @@ class Agent(ABC):
     def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
         """Keeps the present weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
 
-        ``learn`` calls it with the mean return of the last 20 training episodes, :class:`rejeu.callbacks.Evaluate` with
-        success rate and mean return; once it was called with the score of an evaluation, evaluations alone count.
-        Scores of one kind must compare with each other.
+        ``learn`` calls it with the mean return of the last ``best_window`` training episodes (20, or 1 for the best single
+        episode), :class:`rejeu.callbacks.Evaluate` with success rate and mean return; once it was called with the score of
+        an evaluation, evaluations alone count. Scores of one kind must compare with each other.
         """
         return best.remember(self, score, by)
 
@@ -314,7 +318,7 @@ class Agent(ABC):
         """Puts back the best weights so far: actor, critics, their targets and optimizers as they were together.
 
         Raises:
-            ValueError: if none were kept yet, which takes 20 finished episodes or one evaluation.
+            ValueError: if none were kept yet, which takes ``best_window`` finished episodes or one evaluation.
         """
         best.restore(self)
         return self

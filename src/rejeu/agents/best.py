@@ -8,12 +8,13 @@ import numpy as np
 
 from rejeu import finite
 from rejeu.loops.compiled import PackedState
+from rejeu.text import counted
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
 
 BEST_WINDOW = 20
-"""Training episodes over whose mean return the best weights are judged."""
+"""Training episodes over whose mean return the best weights are judged by default."""
 
 
 class Best(NamedTuple):
@@ -29,11 +30,16 @@ class Best(NamedTuple):
     """The algorithm's whole state at that moment, packed."""
 
 
-def note_training_return(agent: Agent) -> None:
-    """Keeps the present weights if the mean of the last episodes' returns is the best so far."""
-    returns = [episode.episode_return for episode in agent.history.last(BEST_WINDOW)]
-    if len(returns) == BEST_WINDOW and (agent.best is None or agent.best.by == "training"):
-        agent.remember_best(float(np.mean(returns)), "training")
+def note_training_return(agent: Agent, ended: int) -> None:
+    """Keeps the present weights if ``ended`` episodes that have just ended bring the best mean return so far.
+
+    Where several ended at once, each of them closes a window of its own.
+    """
+    window = agent.best_window
+    returns = [episode.episode_return for episode in agent.history.last(window + ended - 1)]
+    if len(returns) >= window and (agent.best is None or agent.best.by == "training"):
+        means = np.lib.stride_tricks.sliding_window_view(returns, window).mean(axis=-1)
+        agent.remember_best(float(means.max()), "training")
 
 
 def remember(agent: Agent, score: float | tuple[float, ...], by: str) -> bool:
@@ -53,7 +59,7 @@ def restore(agent: Agent) -> None:
     """
     if agent.best is None:
         raise ValueError(
-            f"no best weights are known yet: they are kept from the {BEST_WINDOW}th finished episode on, and at every "
-            "evaluation by rejeu.callbacks.Evaluate"
+            f"no best weights are known yet: they are kept once {counted(agent.best_window, 'episode')} of training "
+            "ended, and at every evaluation by rejeu.callbacks.Evaluate"
         )
     agent._run.state = agent._compiled.copy(agent.best.state)

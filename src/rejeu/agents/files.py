@@ -28,6 +28,8 @@ AGENT_ARGUMENTS = {
     "stats_window_size": "Episodes over which reported means are taken.",
     "success_threshold": "Return from which on an episode counts as a success where the environment does not say; None: "
     "the environment's own reward threshold, if it has one.",
+    "best_window": "Training episodes over whose mean return the best weights are kept; 1 keeps those of the best single "
+    "episode. Raising it is surer to find a policy that is good again, as a single return may be luck.",
     "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
 }
 """What every agent takes beside its hyper-parameters, with its meaning."""
@@ -46,6 +48,7 @@ def header(agent: Agent) -> dict[str, Any]:
         "seed": agent.seed,
         "stats_window_size": agent.stats_window_size,
         "success_threshold": agent.success_threshold,
+        "best_window": agent.best_window,
         "counters": {
             "step": run.step,
             "steps_before": agent._steps_before,
@@ -95,7 +98,7 @@ def load(
     agent = cls.__new__(cls)
     agent._set_up(
         saved.policy, saved.config, saved.seed, own.pop("verbose", 0), own.pop("tensorboard_log", None),
-        saved.stats_window_size, saved.success_threshold,
+        saved.stats_window_size, saved.success_threshold, saved.best_window,
     )  # fmt: skip
     try:
         agent._build(saved.observation_space, saved.action_space)

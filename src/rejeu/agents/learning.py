@@ -194,7 +194,7 @@ def iterate(agent: Agent, call: Call, company: Company, interrupt: Interrupt) ->
             for output in company.outputs:
                 output.write(agent.num_timesteps, row)
         if turn.episodes:
-            note_training_return(agent)
+            note_training_return(agent, len(turn.episodes))
         answers = [callback(agent, turn) for callback in company.callbacks]
         answers.append(company.hooks.step(agent, turn, run.obs))
         for saver in company.savers:

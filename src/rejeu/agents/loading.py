@@ -9,12 +9,13 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu import config as configs, spaces
+from rejeu.agents.best import BEST_WINDOW
 from rejeu.agents.policies import check_policy
 from rejeu.errors import CheckpointError
 
 COUNTERS = ("step", "steps_before", "episode", "n_updates")
 """What a model file counts; all below 2^32."""
-GIVEN = ("policy", "seed", "success_threshold", "stats_window_size")
+GIVEN = ("policy", "seed", "success_threshold", "stats_window_size", "best_window")
 """Constructor arguments that a model file keeps, and that may be given otherwise when it is loaded."""
 SIZES = ("n_critics", "n_quantiles")
 """Hyper-parameters outside ``policy_kwargs`` that networks grow with."""
@@ -40,6 +41,7 @@ class Saved(NamedTuple):
     seed: int
     success_threshold: float | None
     stats_window_size: int
+    best_window: int
 
 
 def interpret(
@@ -121,6 +123,7 @@ def _interpret(
             whole_seed(header["seed"]),
             None if threshold is None else configs.number("success_threshold", threshold),
             configs.whole("stats_window_size", header["stats_window_size"], 1),
+            configs.whole("best_window", header.get("best_window", BEST_WINDOW), 1),
         )
     except KeyError as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)} is missing") from None

@@ -18,6 +18,7 @@ from rejeu.callbacks.progress_bar import (
     status,
     time_spent,
 )
+from rejeu.callbacks.records import print_records
 from rejeu.callbacks.stopping import stop_on_return, stop_on_success
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "crossed",
     "duration",
     "merit",
+    "print_records",
     "status",
     "step_before",
     "stop_on_return",

@@ -35,7 +35,9 @@ def learning_curve(
     evaluations: Iterable[tuple[int, Evaluation]] = (),
     title: str = "",
 ) -> Picture:
-    """Draws the return of every episode, its moving average and, where known, the success rate below.
+    """Draws the return of every episode, its moving average, the records and, where known, the success rate below.
+
+    A record is an episode that returned more than all before it.
 
     Args:
         history: the episodes; may be empty.
@@ -62,6 +64,7 @@ def learning_curve(
     panels = figure.subplots(1 + has_success, sharex=True, squeeze=False, height_ratios=[3, 2][: 1 + has_success])[:, 0]
     means = [evaluation.mean_return for _, evaluation in evaluations]
     _episodes(panels[0], x, returns)
+    _records(panels[0], x, returns, history.record_rows)
     _line(panels[0], x, history.moving_average("return", window), window)
     _points(panels[0], at, means, [evaluation.return_interval for _, evaluation in evaluations])
     _fit(panels[0], returns, means)
@@ -108,6 +111,12 @@ def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
     size = float(np.clip(60 / math.sqrt(len(x)), 2.4, 5.0))
     opacity = float(np.clip(600 / len(x), 0.3, 0.6))
     panel.plot(x, y, "o", markersize=size, color=style.DOT_COLOR, alpha=opacity, markeredgewidth=0, label=EPISODES)
+
+
+def _records(panel: Axes, x: np.ndarray, returns: np.ndarray, rows: np.ndarray) -> None:
+    """Marks the episodes that returned more than all before them."""
+    if len(rows):
+        panel.plot(x[rows], returns[rows], "^", markersize=4.5, color=style.GOOD_COLOR, label="records", zorder=3)
 
 
 def _line(panel: Axes, x: np.ndarray, y: np.ndarray, window: int) -> None:

@@ -1,0 +1,27 @@
+"""A mark in the output wherever an episode returns more than all before it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rejeu.loops.host import Progress
+
+if TYPE_CHECKING:
+    from rejeu.agents import Agent
+
+
+def print_records(agent: Agent, progress: Progress) -> None:
+    """Prints a line for every record: an episode that returned more than all before it in the agent's history.
+
+    Give it to ``learn`` as a callback. ``agent.history.records()`` returns the same episodes.
+
+    >>> import rejeu
+    >>> agent = rejeu.DQN("MlpPolicy", "MountainCar-v0", learning_starts=10_000, seed=0)
+    >>> agent = agent.learn(400, print_records)
+    ↗ return -200.00 at step 200
+    """
+    if not progress.episodes:
+        return
+    for record in agent.history.records():
+        if record.step == progress.step:
+            print(f"↗ return {record.episode_return:,.2f} at step {record.step:,}", flush=True)
