@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from rejeu.figures import Picture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """What a number of whole episodes came to."""
 
-    returns: np.ndarray = field(repr=False)
+    returns: np.ndarray
     """Sum of rewards of each episode, ``(n,)``."""
-    lengths: np.ndarray = field(repr=False)
+    lengths: np.ndarray
     """Steps of each episode, ``(n,)``."""
-    successes: np.ndarray = field(repr=False)
+    successes: np.ndarray
     """1 or 0 for each episode, ``(n,)``: what the environment says, else whether the return reached the threshold; NaN
     where there is neither."""
 
@@ -98,6 +98,24 @@ class Evaluation:
             low, high = self.success_interval
             text = f"success {self.success_rate:.1%} (95 % interval {low:.1%} to {high:.1%}), {text}"
         return text
+
+    def __repr__(self) -> str:
+        return f"<Evaluation: {self}>"
+
+    def _repr_html_(self) -> str:
+        """Returns a table, which a notebook shows for the last expression of a cell."""
+        (low, high), rows = self.return_interval, []
+        if not math.isnan(self.success_rate):
+            least, most = self.success_interval
+            rows.append(("success", f"{self.success_rate:.1%}", f"{least:.1%} to {most:.1%}", ""))
+        rows += [
+            ("return", f"{self.mean_return:,.2f}", f"{low:,.2f} to {high:,.2f}", f"{self.std_return:,.2f}"),
+            ("length", f"{self.mean_length:,.1f}", "", f"{np.std(self.lengths):,.1f}"),
+        ]
+        head = (counted(len(self.returns), "episode"), "mean", "95 % interval of the mean", "standard deviation")
+        lines = ["".join(f"<th>{cell}</th>" for cell in head)]
+        lines += [f"<th>{row[0]}</th>" + "".join(f"<td>{cell}</td>" for cell in row[1:]) for row in rows]
+        return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
 def evaluate(

@@ -21,6 +21,8 @@ from rejeu.text import counted
 if TYPE_CHECKING:
     from rejeu.figures import Picture
 
+LAST_EPISODES = 20
+"""How many the representation sums up."""
 COLUMNS = ("step", "env", "return", "length", "success", "seconds")
 
 
@@ -48,6 +50,17 @@ class History:
         if column not in COLUMNS:
             raise KeyError(f"{column!r} is no column; there are {', '.join(COLUMNS)}")
         return np.array(self._values[COLUMNS.index(column) :: len(COLUMNS)], np.float64)
+
+    def __repr__(self) -> str:
+        n = min(len(self), LAST_EPISODES)
+        if not n:
+            return "<History: no episodes>"
+        means = {column: float(np.mean(self[column][-n:])) for column in ("return", "length", "success")}
+        text = f"return {means['return']:,.2f}, length {means['length']:,.1f}"
+        if math.isfinite(means["success"]):
+            text += f", success {means['success']:.0%}"
+        steps = int(self["step"][-1])
+        return f"<History: {counted(len(self), 'episode')} in {counted(steps, 'step')}; mean of the last {n}: {text}>"
 
     @property
     def episodes(self) -> list[Episode]:

@@ -181,6 +181,9 @@ class VectorEnv(ABC):
     def close(self) -> None:
         """Releases the environments."""
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.n_envs} x {self.env_id}, backend {self.backend!r}>"
+
 
 def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
     """Returns id, time limit and reward threshold of a Gymnasium environment or vector environment."""

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.errors import MissingExtra
+from rejeu.text import counted
 
 Indices = int | Iterable[int] | None
 """Which environments: one, several, or None for all."""
@@ -82,6 +83,10 @@ class VecEnv(ABC):
     @abstractmethod
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
         """Returns for each environment whether a wrapper of that class is around it."""
+
+    def __repr__(self) -> str:
+        spaces = f"observations {self.observation_space}, actions {self.action_space}"
+        return f"<{type(self).__name__}: {counted(self.num_envs, 'environment')}, {spaces}>"
 
     def step(self, actions: Any) -> StepResult:
         """Steps every environment and returns observations, rewards, dones and infos.
