@@ -13,8 +13,8 @@ class Picture(Figure):
     ``pyplot`` would draw into whatever backend is set, and keep every figure alive until it is closed.
     """
 
-    def _repr_png_(self) -> bytes:
-        """Returns the figure as a PNG file, which IPython shows for the last expression of a cell and for ``display``."""
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        """Returns the figure as a PNG file with its width in a page, 100 pixels an inch, as IPython asks for it."""
         buffer = io.BytesIO()
         self.savefig(buffer, format="png")
-        return buffer.getvalue()
+        return buffer.getvalue(), {"width": round(100 * self.get_figwidth())}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import secrets
 import socket
@@ -16,6 +17,7 @@ import numpy as np
 
 from rejeu import atomic
 from rejeu.errors import MissingExtra
+from rejeu.notebook import Display
 
 
 class Sink(Protocol):
@@ -29,12 +31,38 @@ class Sink(Protocol):
 
 
 class Console:
-    """Prints a table, grouped by the part of the name before the slash."""
+    """Shows metrics as a table, grouped by the part of the name before the slash.
+
+    In a notebook one table is kept up to date; elsewhere each is printed. Tables that come faster than ``seconds`` are left
+    out, except for the last, which :meth:`close` shows.
+
+    Args:
+        seconds: least time between two tables; 0 shows all.
+    """
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.seconds = seconds
+        self._display: Display | None = None
+        self._due = -math.inf
+        self._left_out: tuple[int, Mapping[str, float]] | None = None
 
     def __str__(self) -> str:
         return "the console"
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        now = time.monotonic()
+        if now < self._due:
+            self._left_out = step, metrics
+            return
+        self._due, self._left_out = now + self.seconds, None
+        self._show(step, metrics)
+
+    def close(self) -> None:
+        if self._left_out is not None:
+            self._show(*self._left_out)
+            self._left_out = None
+
+    def _show(self, step: int, metrics: Mapping[str, float]) -> None:
         from rich import box
         from rich.console import Console as RichConsole
         from rich.table import Table
@@ -49,10 +77,14 @@ class Console:
                 table.add_row(f"[bold]{head}[/bold]", "")
                 group = head
             table.add_row(f"  {tail}", f"{value:.4g}" if isinstance(value, float) else f"{value:,}")
-        RichConsole().print(table)
-
-    def close(self) -> None:
-        pass
+        console = RichConsole()
+        if not console.is_jupyter:
+            console.print(table)
+            return
+        text = io.StringIO()
+        RichConsole(file=text, force_jupyter=False, width=console.width).print(table)
+        self._display = self._display or Display()
+        self._display.show("\n".join(line.rstrip() for line in text.getvalue().strip().splitlines()))
 
 
 class CsvFile:

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from rejeu.agents.base import Agent, Callback
 
 
+TABLE_SECONDS = 2.0
+"""Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
+
+
 class Company(NamedTuple):
     """Who is called in the course of a ``learn``, turn by turn and in this order."""
 
@@ -167,7 +171,9 @@ def open_outputs(
     loggers = agent.logger.outputs
     outputs: list[Sink] = [*sinks, *loggers]
     if agent.verbose and not loggers:
-        outputs.append(Console())
+        console = Console(TABLE_SECONDS)
+        held.callback(console.close)
+        outputs.append(console)
     if agent.tensorboard_log is not None and not loggers:
         tensorboard = TensorBoard(next_folder(agent.tensorboard_log, tb_log_name or agent.name))
         held.callback(tensorboard.close)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import time
 from collections import deque
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rejeu.callbacks.due import step_before
 from rejeu.loops.host import Progress, time_shares
+from rejeu.notebook import Display
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,10 +19,16 @@ if TYPE_CHECKING:
 
 REFRESH_SECONDS = 0.125
 """Least time between two refreshes of the progress bar on a terminal."""
+NOTEBOOK_SECONDS = 0.5
+"""The same in a notebook, where each is a message to the browser."""
 LINE_SECONDS = 10.0
 """Least time between two lines of progress where the output is no terminal."""
 RATE_SECONDS = 10.0
 """Stretch over which the shown steps per second and shares of time are measured."""
+
+
+BAR_WIDTH = 40
+"""Characters of the bar in a notebook."""
 
 
 class _Mark(NamedTuple):
@@ -35,7 +41,7 @@ class _Mark(NamedTuple):
 
 
 class ProgressBar:
-    """Shows how far training has come; on a terminal as a bar, elsewhere as a line every ten seconds.
+    """Shows how far training has come; on a terminal and in a notebook as a bar, elsewhere as a line every ten seconds.
 
     Beneath the bar, or at the end of the line, stands what the time went into: the environment's steps and resets, the replay
     buffer, the update (off-policy: the time that the loop waited for the device) and everything else.
@@ -65,8 +71,11 @@ class ProgressBar:
 
         self.n_steps, self.seconds = n_steps, seconds
         self._console = Console() if console is None else console
-        widgets = self._console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
-        self._animated = widgets or (self._console.is_terminal and not self._console.is_dumb_terminal)
+        self._display = Display() if self._console.is_jupyter else None
+        self._animated = self._console.is_terminal and not self._console.is_dumb_terminal
+        self._period = (
+            NOTEBOOK_SECONDS if self._display is not None else REFRESH_SECONDS if self._animated else LINE_SECONDS
+        )
         columns = (BarColumn(bar_width=None), TaskProgressColumn(), TextColumn("{task.description}", markup=False))
         self._bar = RichProgress(*columns, console=self._console, auto_refresh=False, expand=True)
         self._task = self._bar.add_task("", total=1.0)
@@ -103,12 +112,12 @@ class ProgressBar:
         self._marks.append(_Mark(self._began, before, agent.seconds))
         if self._animated:
             self._bar.start()
-        else:
+        elif self._display is None:
             self._refresh_at = now + LINE_SECONDS
 
     def _refresh(self, agent: Agent, step: int, now: float) -> None:
         self._shown_step = step
-        self._refresh_at = now + (REFRESH_SECONDS if self._animated else LINE_SECONDS)
+        self._refresh_at = now + self._period
         self._marks.append(_Mark(now, step, agent.seconds))
         while len(self._marks) > 2 and self._marks[1].time <= now - RATE_SECONDS:
             self._marks.popleft()
@@ -131,10 +140,22 @@ class ProgressBar:
         if self._animated:
             self._bar.update(self._task, completed=share, description="\n".join(filter(None, (text, spent))))
             self._bar.refresh()
+        elif self._display is not None:
+            self._display.show("\n".join(filter(None, (bar(share), text, spent))))
         else:
             line = " · ".join(filter(None, (text, spent)))
             self._console.print(f"{share:4.0%}  {line}", soft_wrap=True, highlight=False, markup=False)
             self._console.file.flush()
+
+
+def bar(share: float) -> str:
+    """Returns a bar of text for a share in [0, 1].
+
+    >>> bar(0.25)
+    '██████████░░░░░░░░░░░░░░░░░░░░░░░░░░░░░░  25%'
+    """
+    full = round(share * BAR_WIDTH)
+    return f"{'█' * full}{'░' * (BAR_WIDTH - full)} {share:4.0%}"
 
 
 def status(
