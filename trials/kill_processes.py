@@ -104,7 +104,7 @@ def live(name: str, folder: str, kept: bool) -> None:
 
     case = CASES[name]
     agent_class = rejeu.AGENTS[case.algorithm]
-    callbacks = [Checkpoint(folder, every=case.every)] if kept else []
+    callbacks = [Checkpoint(folder, every=case.every), say_that_it_learns()] if kept else []
     env = vector(case)
     restore, seconds = env.restore, [0.0]
 
@@ -127,6 +127,21 @@ def live(name: str, folder: str, kept: bool) -> None:
         agent.learn(case.steps, callback=callbacks)
     say(digest=digest(agent), trained=agent.seconds["total"])
     env.close()
+
+
+def say_that_it_learns() -> Callable[[Any, Any], None]:
+    """Returns a callback that says once that this life has made updates, and so compiled everything."""
+    before: list[int] = []
+
+    def callback(agent: Any, turn: Any) -> None:
+        if len(before) == 2:
+            return
+        before[:] = before or [agent.n_updates]
+        if agent.n_updates > before[0] + 1:
+            before.append(agent.n_updates)
+            say(learning=agent.num_timesteps)
+
+    return callback
 
 
 def say(**what: Any) -> None:
@@ -191,9 +206,10 @@ def try_case(name: str, kills: int, rng: random.Random) -> dict[str, Any]:
             if done == kills:
                 end = finished(process)
                 break
-            time.sleep(rng.uniform(0.0, 1.4 * whole["trained"] / kills))  # random, once it has started
-            if process.poll() is not None:
-                end = finished(process)  # the run was over before its last kill
+            second = said(process)
+            time.sleep(rng.uniform(0.0, 1.4 * whole["trained"] / kills))  # random, once it learns
+            if process.poll() is not None or "digest" in second:
+                end = second if "digest" in second else finished(process)  # it was over before its last kill
                 break
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
