@@ -95,6 +95,20 @@ def test_a_log_is_full_by_steps_or_by_bytes():
     assert log.is_full
 
 
+def test_a_log_that_nobody_empties_takes_no_more_memory(monkeypatch):
+    monkeypatch.setattr("rejeu.envs.envpool.MOST_STEPS", 10)
+    with closing(make_vector("CartPole-v1", 2, "envpool", seed=3)) as env:
+        env.reset()
+        for _ in range(9):
+            env.step(np.zeros(2, int))
+        assert env.snapshot() is not None
+        env.step(np.zeros(2, int))
+        env.step(np.zeros(2, int))
+        assert env.snapshot() is None
+        env.reset()
+        assert env.snapshot()["n_operations"] == 1
+
+
 def test_a_full_log_begins_again_with_another_pool_whose_seed_follows(monkeypatch):
     monkeypatch.setattr("rejeu.envs.envpool.MOST_STEPS", 4)
     first = []

@@ -62,6 +62,11 @@ class ActionLog:
         """Whether so much was recorded that replaying it would take too long."""
         return self.n_steps >= self._most_steps
 
+    @property
+    def is_dropped(self) -> bool:
+        """Whether nothing is recorded any more, since the log was full long ago and nobody has reset the environments."""
+        return self.n_steps >= 2 * self._most_steps
+
     def step(self, action: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """Records a step and returns the actions in the form in which they are recorded, ``(k, ...)``.
 
@@ -80,6 +85,9 @@ class ActionLog:
         self._add(RESET if which is None else RESET_SOME, which, b"")
 
     def _add(self, kind: int, which: np.ndarray | None, action: bytes) -> None:
+        if self.is_dropped:
+            self._blocks, self._open = [], bytearray()
+            return
         self.n_operations += 1
         self._open.append(kind)
         if which is not None:

@@ -97,8 +97,8 @@ class EnvPool(VectorEnv):
         self._obs = replaced(self._obs, ended, fresh)
         return self._obs
 
-    def snapshot(self) -> dict[str, Any]:
-        return {"seed": self._seed, **self._log.to_plain()}
+    def snapshot(self) -> dict[str, Any] | None:
+        return None if self._log.is_dropped else {"seed": self._seed, **self._log.to_plain()}
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
         if not isinstance(saved, dict) or {*saved} != {"seed", "n_operations", "blocks"}:
