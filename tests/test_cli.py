@@ -264,6 +264,15 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "Pendulum-v1", "--steps", "5", "--minutes", "1"], "exclude each other"),
         (["train", "Pendulum-v1", "--steps", "0"], "--steps=0 must be"),
         (["train", "Pendulum-v1", "--seed", "-1"], "seed=-1 must be"),
+        (["trian", "Pendulum-v1"], "no command is called 'trian'; did you mean train?"),
+        (["train"], "rejeu train needs ENV"),
+        (["train", "Pendulum-v1", "CartPole-v1"], "does not expect 'CartPole-v1'"),
+        (["train", "Pendulum-v1", "--step", "5"], "no option --step; did you mean --steps?"),
+        (["train", "Pendulum-v1", "--steps"], "--steps needs a value"),
+        (["train", "Pendulum-v1", "--seed", "x"], "--seed 'x' must be a whole number"),
+        (["train", "Pendulum-v1", "--seed", "1.5"], "--seed 1.5 must be a whole number"),
+        (["train", "Pendulum-v1", "--minutes", "ten"], "--minutes 'ten' must be a number"),
+        (["evaluate", "run", "--which", "bets"], "--which 'bets' must be one of best, last"),
         (["train", "rejeu-test/Words-v0"], "which no algorithm here takes"),
         (["train", "rejeu-test/Switches-v0", "--algo", "SAC"], "MultiBinary(3)"),
         (["evaluate", "no-such-run"], "no run folder or model file no-such-run"),
@@ -364,6 +373,40 @@ def test_a_complete_run_can_be_trained_further(run, tmp_path, capsys):
     before = rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps
     assert main(["resume", str(tmp_path / "run"), "--steps", "50"]) == 0
     assert rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps == before + 50
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
+    """Pausing changes nothing about the run: it ends where the one that was never paused ended."""
+    argv = ["--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium"]
+    out = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        kill = lambda self, agent, turn: os.kill(os.getpid(), signal.SIGINT) if turn.step == 100 else None  # noqa: E731
+        patch.setattr(rejeu.callbacks.Evaluate, "__call__", kill)
+        arguments = ["train", "Pendulum-v1", "--steps", "850", "--out", str(out), "--evaluate-episodes", "2", *argv]
+        assert main([*arguments, "--set", *TINY]) == 130
+    assert main(["resume", str(out), "--steps", "1e2"]) == 0
+    text = capsys.readouterr().out
+    assert f"paused; everything is saved; rejeu resume {out} continues" in text
+    paused = rejeu.load(out / "agent.safetensors").num_timesteps
+    assert paused == 200
+    assert main(["resume", str(out)]) == 0
+    one, two = (rejeu.load(path / "agent.safetensors") for path in (run, out))
+    assert one.num_timesteps == two.num_timesteps == 850
+    weights = [agent.get_parameters() for agent in (one, two)]
+    assert all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_the_best_model_is_kept_when_a_complete_run_is_trained_further(tmp_path, capsys, monkeypatch):
+    """The last evaluation of the first part, at step 60, is the best by far and must be remembered."""
+    better = iter([10.0, 1.0])
+    evaluation = rejeu.Evaluation
+    fake = lambda *_, **__: evaluation(np.array([next(better)]), np.array([5]), np.array([np.nan]))  # noqa: E731
+    monkeypatch.setattr(rejeu.SAC, "evaluate", fake)
+    assert train(tmp_path / "run", "--evaluate-every", "1000", steps=60) == 0
+    assert main(["resume", str(tmp_path / "run"), "--steps", "20"]) == 0
+    assert [row["best"] for row in rows(tmp_path / "run" / "evaluations.csv")] == ["1", "0"]
+    assert rejeu.load(tmp_path / "run" / "best.safetensors").num_timesteps == 60
 
 
 def test_resume_explains_what_it_cannot_go_on_with(run, tmp_path, capsys):

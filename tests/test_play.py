@@ -512,7 +512,7 @@ def test_watch_can_be_paused_begun_anew_and_closed():
         (["play", "MountanCar-v0"], "did you mean MountainCar-v0"),
         (
             ["play", "rejeu-play-test/Dark-v0"],
-            "cannot be shown: it has the render modes ['ansi'], which lack 'rgb_array'",
+            "cannot be drawn: it has the render modes ['ansi'], which lack 'rgb_array'",
         ),
         (["play", "rejeu-play-test/Switches-v0"], "MultiBinary(3) cannot be played by hand"),
         (["play", LEVER, "--keys", "a"], "--keys 'a' must be keys=action"),

@@ -271,7 +271,7 @@ def test_environment_that_cannot_render_is_an_error(tmp_path):
 
     gym.register("Dark-v0", lambda: Dark())
     try:
-        with pytest.raises(ValueError, match=r"Dark-v0 cannot be recorded.*'ansi'.*lack 'rgb_array'"):
+        with pytest.raises(ValueError, match=r"Dark-v0 cannot be drawn.*'ansi'.*lack 'rgb_array'"):
             record_video(Still(), tmp_path / "v.mp4", "Dark-v0")
     finally:
         del gym.registry["Dark-v0"]

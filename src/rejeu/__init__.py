@@ -6,6 +6,10 @@
 100
 """
 
+from rejeu import interrupt
+
+interrupt.guard_imports()
+
 from rejeu import plots
 from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
 from rejeu.envs.checker import check_env

@@ -8,11 +8,11 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 import gymnasium as gym
@@ -144,14 +144,30 @@ def _make_rendering(source: str | gym.envs.registration.EnvSpec) -> gym.Env:
             return make_env(source, **kwargs)
         return gym.make(source, disable_env_checker=True, **kwargs)
 
-    plain = make(render_mode=None) if not isinstance(source, str) and "render_mode" in source.kwargs else make()
+    pinned = not isinstance(source, str) and "render_mode" in source.kwargs
+    return make_drawing(make, source if isinstance(source, str) else source.id, {"render_mode": None} if pinned else {})
+
+
+def make_drawing(
+    make: Callable[..., gym.Env], env_id: str, plainly: Mapping[str, Any] = MappingProxyType({})
+) -> gym.Env:
+    """Returns what ``make(render_mode="rgb_array")`` makes: an environment that draws to arrays.
+
+    Args:
+        make: makes environments.
+        env_id: for messages.
+        plainly: keyword arguments with which ``make`` makes one that draws nothing.
+
+    Raises:
+        ValueError: if it has no such render mode, of which ``gymnasium.make`` would only warn.
+    """
+    plain = make(**plainly)
     modes = plain.metadata.get("render_modes") or []
     plain.close()
     if "rgb_array" not in modes:
-        env_id = source if isinstance(source, str) else source.id
         raise ValueError(
-            f"{env_id} cannot be recorded: it has the render modes {list(modes)}, which lack 'rgb_array'; give env= "
-            "with an environment that has it"
+            f"{env_id} cannot be drawn: it has the render modes {list(modes)}, which lack 'rgb_array'; give env= with an "
+            "environment that has it"
         )
     return make(render_mode="rgb_array")
 

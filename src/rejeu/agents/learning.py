@@ -149,6 +149,7 @@ def carry_out(
         try:
             with Interrupt() as interrupt:
                 iterate(agent, call, Company(outputs, callbacks, hooks, savers), interrupt)
+            agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal  # after the last turn, too
             finite.settle(agent)
         except finite.Broken as broken:
             raise finite.reported(agent, broken) from None

@@ -5,6 +5,7 @@ What a command needs is imported when it runs, so that asking for help is quick.
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,7 +13,8 @@ from typing import Any, TextIO
 
 import tyro
 
-from rejeu.cli import check, evaluate, list as listing, play, record, resume, train, watch
+from rejeu import interrupt
+from rejeu.cli import arguments, check, evaluate, list as listing, play, record, resume, train, watch
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (train.Train, train.run),
@@ -48,14 +50,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"rejeu {__version__}")
         return 0
-    arguments = tyro.extras.subcommand_cli_from_dict(
-        {name: kind for name, (kind, _) in COMMANDS.items()}, prog="rejeu", description=DESCRIPTION, args=argv
-    )
-    run = next(function for kind, function in COMMANDS.values() if isinstance(arguments, kind))
+    with interrupt.leaving(), warnings.catch_warnings():
+        warnings.showwarning = show_warning
+        return carry_out(argv)
+
+
+def carry_out(argv: Sequence[str]) -> int:
+    """Reads a command line, runs what it says and returns the exit status."""
+    kinds: dict[str, Any] = {name: kind for name, (kind, _) in COMMANDS.items()}
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = show_warning
-            return run(arguments)
+        argv = arguments.checked(argv, kinds)
+        given = tyro.extras.subcommand_cli_from_dict(kinds, prog="rejeu", description=DESCRIPTION, args=argv)
+        run = next(function for kind, function in COMMANDS.values() if isinstance(given, kind))
+        return run(given)
     except KeyboardInterrupt:
         print("rejeu: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -74,7 +81,7 @@ def show_warning(
 ) -> None:
     """Prints a warning for the user on one line; others with the place in the code, as Python does."""
     if category is UserWarning:
-        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+        print(f"warning: {one_line(message)}", file=sys.stderr)
     else:
         print(warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr, end="")
 
@@ -90,10 +97,10 @@ def expected_errors() -> tuple[type[Exception], ...]:
     return ValueError, TypeError, ImportError, OSError, MemoryError, *own
 
 
-def one_line(error: Exception) -> str:
-    r"""Returns an error's message on one line, or its kind if it has none.
+def one_line(error: Exception | Warning | str) -> str:
+    r"""Returns an error's or a warning's message on one line and without colors, or its kind if it has none.
 
     >>> one_line(ValueError("two\n  lines")), one_line(MemoryError())
     ('two lines', 'MemoryError')
     """
-    return " ".join(str(error).split()) or type(error).__name__
+    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(error)).split()) or type(error).__name__

@@ -7,16 +7,18 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from rejeu.cli.environment import EnvironmentOptions, named
+
 
 @dataclass(frozen=True)
-class Check:
+class Check(EnvironmentOptions):
     """Plays an environment for a few seconds and prints what is wrong with it; exit status 1 after errors.
 
-    An environment of your own: rejeu check my_package.my_module:MyEnv-v0, where the module registers it.
+    An environment of your own: rejeu check my_env.py, or my_package.my_module:MyEnv-v0, where the module registers it.
     """
 
     env: Annotated[Positional[str], arg(metavar="ENV")]
-    """Id of an environment, such as parking-v0."""
+    """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
 
 
 def run(arguments: Check) -> int:
@@ -24,9 +26,8 @@ def run(arguments: Check) -> int:
     from contextlib import closing
 
     from rejeu.envs.checker import findings
-    from rejeu.envs.registry import make_env
 
-    with closing(make_env(arguments.env)) as env:
+    with closing(named(arguments.env, arguments).make()) as env:
         found = sorted(findings(env))
     for finding in found:
         print(f"{finding.level}: {finding.text}")

@@ -9,11 +9,12 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from rejeu.cli import run_folder
+from rejeu.cli.environment import RunOptions
 from rejeu.cli.run_folder import Which
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(RunOptions):
     """Plays whole episodes with a trained agent's deterministic policy and prints what they came to."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -34,15 +35,14 @@ def run(arguments: Evaluate) -> int:
     """Evaluates, prints one line, and returns the exit status."""
     from rejeu import load
     from rejeu.config import whole
-    from rejeu.envs.vector import make_vector
 
     episodes = whole("--episodes", arguments.episodes, least=1)
     model = run_folder.find_model(arguments.run, arguments.which)
-    env_id = run_folder.environment_of(model)
+    environment = run_folder.environment_of(model, arguments)
     agent = load(model)
-    env = make_vector(env_id, min(episodes, 16), arguments.backend, arguments.seed)  # type: ignore[arg-type]
+    env = environment.vector(min(episodes, 16), arguments.backend, arguments.seed)
     try:
-        print(f"{env_id} on {env.backend}, {model}", flush=True)
+        print(f"{environment} on {env.backend}, {model}", flush=True)
         print(agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold), flush=True)
     finally:
         env.close()

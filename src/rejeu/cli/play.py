@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, UseAppendAction, arg
 
 from rejeu.cli import run_folder, settings
+from rejeu.cli.environment import EnvironmentOptions, named
 from rejeu.cli.run_folder import Which
 from rejeu.text import counted
 
@@ -19,14 +20,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Play:
+class Play(EnvironmentOptions):
     """Opens a window in which you play an environment with a, s, d, w or the arrows.
 
     Any keys may be held together. The window says what each does; r begins anew, p pauses, q quits.
     """
 
     env: Annotated[Positional[str], arg(metavar="ENV")]
-    """Id of an environment with Discrete or Box actions, or Car, Mountain or Lunar."""
+    """Id of an environment with Discrete or Box actions, as for rejeu train; or Car, Mountain or Lunar."""
     keys: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEYS=ACTION ...")] = ()
     """Other keys: a=0 d=2 none=1 for Discrete actions, w=[1,0] a+w=[1,-1] for Box actions; none is nothing held."""
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -49,16 +50,16 @@ def run(arguments: Play) -> int:
     from rejeu.play import play
     from rejeu.play.known import full_name
 
-    env_id = full_name(arguments.env)
-    agent = None
+    environment = named(full_name(arguments.env), arguments)
+    env_id, agent = environment.env_id, None
     if arguments.against is not None:
         model = run_folder.find_model(arguments.against, arguments.which)
-        trained_on = run_folder.environment_of(model)
+        trained_on = run_folder.recorded_id(model)
         if trained_on != env_id:
             raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {env_id}")
         agent = load(model)
     game = play(
-        env_id,
+        environment.make,
         keys=assigned(chain.from_iterable(arguments.keys)),
         seed=arguments.seed,
         fps=arguments.fps,

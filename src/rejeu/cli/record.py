@@ -9,11 +9,12 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from rejeu.cli import run_folder
+from rejeu.cli.environment import RunOptions
 from rejeu.cli.run_folder import RunFolder, Which
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(RunOptions):
     """Films a few episodes of a trained agent in the environment's own package."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -39,6 +40,7 @@ def run(arguments: Record) -> int:
     model = run_folder.find_model(arguments.run, arguments.which)
     beside = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
     out = beside if arguments.out is None else arguments.out
-    path = record_video(load(model), out, env=run_folder.environment_of(model), episodes=episodes, seed=arguments.seed)
-    print(f"{path}: {counted(episodes, 'episode')} of {model}", flush=True)
+    environment = run_folder.environment_of(model, arguments)
+    path = record_video(load(model), out, env=environment.drawing, episodes=episodes, seed=arguments.seed)
+    print(f"{path}: {counted(episodes, 'episode')} of {model} in {environment}", flush=True)
     return 0

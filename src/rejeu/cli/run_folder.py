@@ -6,15 +6,23 @@ import json
 import platform
 import re
 import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
 from rejeu import atomic
+from rejeu.cli import environment
+from rejeu.cli.environment import Environment, RunOptions
 from rejeu.errors import CheckpointError
 
 Which = Literal["best", "last"]
+MOST_ENVS = 4096
+"""Most environments that a run steps at once."""
+MOST_EPISODES = 10_000
+"""Most episodes of an evaluation while training."""
+LONGEST_CONFIG = 2**20
+"""Most bytes of a ``config.json``."""
 KINDS: dict[str, Any] = {
     "str": str,
     "bool": bool,
@@ -22,6 +30,7 @@ KINDS: dict[str, Any] = {
     "int | None": int | None,
     "float | None": float | int | None,
     "dict[str, Any]": dict,
+    "tuple[str, ...]": tuple,
 }
 """What the annotations of :class:`RunConfig` allow."""
 
@@ -113,6 +122,12 @@ class RunConfig:
     evaluate_episodes: int
     checkpoint_minutes: float | None
     """Minutes between two checkpoints, None for none."""
+    env_argument: str = ""
+    """How the environment was named on the command line; for information, and for hints. No command imports it."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments that the environment was made with."""
+    wrappers: tuple[str, ...] = ()
+    """What it was wrapped in, innermost first; for information, and for hints."""
 
 
 def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
@@ -157,17 +172,49 @@ def read_config(folder: RunFolder) -> RunConfig:
         CheckpointError: if the file is damaged.
     """
     if not folder.config.is_file():
-        raise FileNotFoundError(f"{folder.path} is no run folder: it holds no {folder.config.name}")
+        raise FileNotFoundError(
+            f"{folder.path} is no run folder: it holds no {folder.config.name}{newest_inside(folder.path)}"
+        )
     try:
+        if folder.config.stat().st_size > LONGEST_CONFIG:
+            raise ValueError(f"larger than {LONGEST_CONFIG:,} bytes")
         content = json.loads(folder.config.read_text(encoding="utf-8"))
-        config = RunConfig(**{field.name: content[field.name] for field in fields(RunConfig)})
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        content["wrappers"] = tuple(content.get("wrappers", ()))
+        known = [one.name for one in fields(RunConfig) if one.name in content or one.name not in LATER]
+        config = RunConfig(**{name: content[name] for name in known})
+        for one in fields(RunConfig):
+            value = getattr(config, one.name)
+            if not isinstance(value, KINDS[str(one.type)]):
+                raise ValueError(f"{one.name} is {str(value)[:40]!r}, not {one.type}")
+        check_ranges(config)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{folder.config} is damaged: {type(error).__name__} {error}") from None
-    for field in fields(RunConfig):
-        value = getattr(config, field.name)
-        if not isinstance(value, KINDS[str(field.type)]):
-            raise CheckpointError(f"{folder.config} is damaged: {field.name} is {str(value)[:40]!r}, not {field.type}")
     return config
+
+
+LATER = ("env_argument", "env_kwargs", "wrappers")
+"""Fields that folders of earlier versions lack."""
+
+
+def check_ranges(config: RunConfig) -> None:
+    """Raises ``ValueError`` for numbers that no run can have, and for those that would take all of memory or time."""
+    from rejeu.agents import whole_seed
+    from rejeu.config import number, whole
+
+    whole_seed(config.seed)
+    whole("n_envs", config.n_envs, least=1, most=MOST_ENVS)
+    whole("evaluate_every", config.evaluate_every, least=1)
+    whole("evaluate_episodes", config.evaluate_episodes, least=1, most=MOST_EPISODES)
+    for name in ("steps", "film_every"):
+        if getattr(config, name) is not None:
+            whole(name, getattr(config, name), least=1)
+    for name in ("minutes", "checkpoint_minutes"):
+        if getattr(config, name) is not None:
+            number(name, getattr(config, name), above=0)
+    if config.success_threshold is not None:
+        number("success_threshold", config.success_threshold)
+    if not all(isinstance(name, str) for name in config.wrappers):
+        raise ValueError("wrappers are not names")
 
 
 def versions() -> dict[str, str | None]:
@@ -194,6 +241,9 @@ def find_model(run: Path, which: Which) -> Path:
     if not run.is_dir():
         raise FileNotFoundError(f"there is no run folder or model file {run}")
     if not model.is_file():
+        newest = newest_inside(run)
+        if newest:
+            raise FileNotFoundError(f"{run} is no run folder{newest}")
         other = "last" if which == "best" else "best"
         raise FileNotFoundError(
             f"{run} holds no {model.name}; is it a run folder? --which {other} takes the other model"
@@ -201,18 +251,45 @@ def find_model(run: Path, which: Which) -> Path:
     return model
 
 
-def environment_of(model: Path) -> str:
-    """Returns the id of the environment that a model file was trained on: of one that is registered here.
+def newest_inside(folder: Path) -> str:
+    """Returns a hint at the newest run in a folder of runs, for the end of a message; empty if it holds none."""
+    runs = [path.parent for path in folder.glob("*/config.json")] if folder.is_dir() else []
+    if not runs:
+        return ""
+    return (
+        f"; the newest of the {len(runs)} in it is {max(runs, key=lambda run: (run / 'config.json').stat().st_mtime)}"
+    )
 
-    Gymnasium imports the module before a colon in an id. No id that was saved holds one, and none is taken from a file: what
-    is imported must not be a file's choice.
+
+def environment_of(model: Path, given: RunOptions) -> Environment:
+    """Returns the environment to use a model file in: what is typed, else what the file and its run folder say.
 
     Raises:
-        CheckpointError: if the file does not say, or is no model.
+        CheckpointError: if they do not say, if what they say must be typed again, or if the file is no model.
+        ValueError: if there is no such environment.
+    """
+    if given.env is not None:
+        return environment.named(given.env, given)
+    env_id = recorded_id(model)
+    folder = RunFolder(model.parent)
+    if model in (folder.best, folder.agent) and folder.config.is_file():
+        config = read_config(folder)
+        if config.env == env_id:
+            return of_run(folder, config, given)
+    return environment.recorded(env_id, "", {}, (), model, given)
+
+
+def recorded_id(model: Path) -> Any:
+    """Returns the id of the environment that a model file says it was trained on, unchecked; None if it says none.
+
+    Raises:
+        CheckpointError: if the file is no model.
     """
     from rejeu import checkpoint
 
-    env_id = checkpoint.read_header(model, "agent").get("env_id")
-    if not isinstance(env_id, str) or not re.fullmatch(r"[\w./-]{1,200}", env_id):
-        raise CheckpointError(f"{model} does not say which environment it is for; load it in Python: rejeu.load(path)")
-    return env_id
+    return checkpoint.read_header(model, "agent").get("env_id")
+
+
+def of_run(folder: RunFolder, config: RunConfig, given: RunOptions) -> Environment:
+    """Returns the environment of a run: what is typed, else what its configuration says; see :func:`environment_of`."""
+    return environment.recorded(config.env, config.env_argument, config.env_kwargs, config.wrappers, folder.path, given)

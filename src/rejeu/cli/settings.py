@@ -1,4 +1,4 @@
-"""``--set name=value``: hyper-parameters from the command line."""
+"""``--set name=value`` and ``--env-kwargs name=value``: values from the command line."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 
-def apply(assignments: Iterable[str], hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns ``hyperparameters`` with the assignments made; a dotted name reaches into a nested mapping.
+def apply(assignments: Iterable[str], before: Mapping[str, Any], option: str = "--set") -> dict[str, Any]:
+    """Returns ``before`` with the assignments made; a dotted name reaches into a nested mapping.
+
+    Args:
+        assignments: as typed.
+        before: values by name.
+        option: what they were typed after, for messages.
 
     Raises:
         ValueError: for an assignment without ``=`` or without a name.
@@ -18,13 +23,14 @@ def apply(assignments: Iterable[str], hyperparameters: Mapping[str, Any]) -> dic
     >>> apply(["policy_kwargs.net_arch=[64,64]", "gamma=0.9"], {"policy_kwargs": {"layer_norm": True}})
     {'policy_kwargs': {'layer_norm': True, 'net_arch': [64, 64]}, 'gamma': 0.9}
     """
-    result = dict(hyperparameters)
+    result = dict(before)
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         path = name.strip().split(".")
         if not equals or not all(path):
-            raise ValueError(f"--set {assignment!r} must be name=value, such as learning_rate=1e-3")
-        result = _put(result, path, value(text), name)
+            example = "learning_rate=1e-3" if option == "--set" else "sigma=2"
+            raise ValueError(f"{option} {assignment!r} must be name=value, such as {example}")
+        result = _put(result, path, value(text), f"{option} {name}")
     return result
 
 
@@ -42,6 +48,15 @@ def value(text: str) -> Any:
     return text
 
 
+def written(what: Any) -> str:
+    """Returns the text that :func:`value` reads as this, where there is one.
+
+    >>> [value(written(one)) for one in (2, "8x8", True, [1, "a"], "2")]
+    [2, '8x8', True, [1, 'a'], '2']
+    """
+    return what if isinstance(what, str) and value(what) == what else json.dumps(what, default=str)
+
+
 def _put(mapping: Mapping[str, Any], path: list[str], new: Any, name: str) -> dict[str, Any]:
     head, *rest = path
     if not rest:
@@ -49,5 +64,5 @@ def _put(mapping: Mapping[str, Any], path: list[str], new: Any, name: str) -> di
     inner = mapping.get(head)
     inner = {} if inner is None else inner
     if not isinstance(inner, Mapping):
-        raise TypeError(f"--set {name}: {head}={inner!r} has no parts to set")
+        raise TypeError(f"{name}: {head}={inner!r} has no parts to set")
     return {**mapping, head: _put(inner, rest, new, name)}

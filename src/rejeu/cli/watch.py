@@ -9,11 +9,12 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from rejeu.cli import run_folder
+from rejeu.cli.environment import RunOptions
 from rejeu.cli.run_folder import Which
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(RunOptions):
     """Opens a window in which a trained agent plays, in the environment's own package.
 
     r begins the episode anew, p pauses, q quits.
@@ -38,7 +39,7 @@ def run(arguments: Watch) -> int:
     from rejeu.play import watch
 
     model = run_folder.find_model(arguments.run, arguments.which)
-    env_id = run_folder.environment_of(model)
-    game = watch(load(model), env_id, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
+    environment = run_folder.environment_of(model, arguments)
+    game = watch(load(model), environment.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
     print(scores(game), flush=True)
     return 0

@@ -6,8 +6,9 @@ listens, ``recording.py`` keeps it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from rejeu.agents import Agent
 from rejeu.config import number, whole
+from rejeu.envs.faults import id_of
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
 from rejeu.play.game import Act, Game, Pace, Player
@@ -23,7 +25,7 @@ from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for
 from rejeu.play.recording import Recording
 from rejeu.play.window import Window
-from rejeu.video import DEFAULT_FPS
+from rejeu.video import DEFAULT_FPS, make_drawing
 
 __all__ = ["Game", "Player", "play", "watch"]
 
@@ -32,7 +34,7 @@ REST_SECONDS = 1.5
 
 
 def play(
-    env: str,
+    env: str | Callable[..., gym.Env],
     *,
     keys: Mapping[str, Any] | None = None,
     seed: int | None = None,
@@ -44,7 +46,7 @@ def play(
     """Opens a window in which a person plays, and returns the game as it stood when the window was closed.
 
     Args:
-        env: an id, or Car, Mountain or Lunar.
+        env: an id, or Car, Mountain or Lunar; or a function that takes ``render_mode`` and makes an environment.
         keys: actions by keys, on top of those known for the environment; see :mod:`rejeu.play.keys`.
         seed: of the first start; each further one has the next seed. None draws one.
         fps: steps a second; None: the environment's own, 30 if it declares none.
@@ -57,17 +59,17 @@ def play(
         ValueError: for an unknown environment, one without pictures, or actions that cannot be played by hand.
         OSError: if there is no screen.
     """
-    env_id = full_name(env)
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing = make_drawing(env_id)
+        playing = drawing(env)
         stack.callback(playing.close)
+        env_id = id_of(playing)
         keys_of_env = keys_for(env_id, playing.action_space, keys)
         fps = natural_fps(playing) if fps is None else fps
         by_hand = Player("you", playing, lambda obs, held, step: keys_of_env.action(held, step))
         players = [by_hand]
         if against is not None:
-            rival = shown_to(against, make_drawing(env_id))
+            rival = shown_to(against, drawing(env))
             stack.callback(rival.close)
             players.append(Player(_name(against), rival, _policy(against)))
         if record is not None:
@@ -80,7 +82,7 @@ def play(
 
 def watch(
     agent: Any,
-    env: str,
+    env: str | Callable[..., gym.Env],
     *,
     seed: int | None = None,
     fps: float | None = None,
@@ -90,7 +92,7 @@ def watch(
 
     Args:
         agent: anything with ``predict(obs, state, deterministic=True)``.
-        env: an id, or Car, Mountain or Lunar.
+        env: an id, or Car, Mountain or Lunar; or a function that takes ``render_mode`` and makes an environment.
         seed: of the first episode; each further one has the next seed. None draws one.
         fps: steps a second; None: the environment's own, 30 if it declares none.
         episodes: close after so many; None leaves that to who watches.
@@ -100,15 +102,14 @@ def watch(
         ValueError: for an unknown environment or one without pictures.
         OSError: if there is no screen.
     """
-    env_id = full_name(env)
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing = shown_to(agent, make_drawing(env_id))
+        playing = shown_to(agent, drawing(env))
         stack.callback(playing.close)
         fps = natural_fps(playing) if fps is None else fps
         player = Player(_name(agent), playing, _policy(agent))
         game = Game([player], seed, episodes=episodes, rest=round(REST_SECONDS * fps))
-        _run(Window(f"rejeu watch {env_id}"), game, None, fps)
+        _run(Window(f"rejeu watch {id_of(playing)}"), game, None, fps)
     return game
 
 
@@ -127,19 +128,17 @@ def turn(window: Window, game: Game) -> None:
     window.draw(game)
 
 
-def make_drawing(env_id: str) -> gym.Env:
-    """Makes an environment that draws to arrays.
+def drawing(env: str | Callable[..., gym.Env]) -> gym.Env:
+    """Returns an environment that draws to arrays, of an id or a short name, or made by a function.
 
     Raises:
         ValueError: if none is called so, or it cannot draw.
         MissingExtra: if a package that it needs is not installed.
     """
-    plain = make_env(env_id)  # first, because gymnasium.make only warns of a render mode that an environment lacks
-    modes = plain.metadata.get("render_modes") or []
-    plain.close()
-    if "rgb_array" not in modes:
-        raise ValueError(f"{env_id} cannot be shown: it has the render modes {[*modes]}, which lack 'rgb_array'")
-    return make_env(env_id, render_mode="rgb_array")
+    if not isinstance(env, str):
+        return make_drawing(env, "the environment")
+    env_id = full_name(env)
+    return make_drawing(partial(make_env, env_id), env_id)
 
 
 def natural_fps(env: gym.Env) -> float:

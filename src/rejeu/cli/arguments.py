@@ -1,0 +1,123 @@
+"""Looks over a command line before it is parsed, so that what is wrong is one line that names the fix."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+from tyro.conf import Positional, arg
+
+
+class Option(NamedTuple):
+    """What a command takes after ``--name``, or in a place of its own."""
+
+    name: str
+    """With its dashes; in capitals for a place."""
+    kinds: tuple[Any, ...]
+    """Types that its value may have."""
+    choices: tuple[str, ...]
+    """The only values that it may have, where there are such."""
+    takes_many: bool
+    """Whether it takes all words up to the next option."""
+    is_place: bool
+    """Whether it is given by its place and not by its name."""
+    is_required: bool
+
+
+def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
+    """Returns a command line as the parser takes it: whole numbers such as ``1e4`` are written out.
+
+    Raises:
+        ValueError: for an unknown command or option, with the nearest; a value that is missing, is no number where one is
+            expected, or is none of the choices; a place that is not filled, or one too many.
+    """
+    if not argv or argv[0] in ("-h", "--help") or {"-h", "--help"} & {*argv[1:]}:
+        return [*argv]
+    command, *words = argv
+    if command not in commands:
+        raise ValueError(f"no command is called {command!r}; {nearest(command, commands)}")
+    known = options(commands[command])
+    places = [one for one in known if one.is_place]
+    by_name = {one.name: one for one in known if not one.is_place}
+    result, filled, i = [command], 0, 0
+    while i < len(words):
+        word = words[i]
+        i += 1
+        if word.startswith("--"):
+            name, equals, text = word.partition("=")
+            name = name.replace("_", "-")
+            if name not in by_name:
+                raise ValueError(f"rejeu {command} has no option {name}; {nearest(name, by_name)}")
+            option = by_name[name]
+            end = i
+            while (
+                not equals and end < len(words) and not words[end].startswith("--") and (option.takes_many or end == i)
+            ):
+                end += 1
+            values = [text] if equals else words[i:end]
+            if not values:
+                raise ValueError(f"{name} needs a value")
+            result += [name, *(read(option, value) for value in values)]
+            i = end
+        elif filled == len(places):
+            raise ValueError(f"rejeu {command} does not expect {word!r}; rejeu {command} --help shows what it takes")
+        else:
+            result.append(read(places[filled], word))
+            filled += 1
+    if missing := [one.name for one in places[filled:] if one.is_required]:
+        raise ValueError(f"rejeu {command} needs {' and '.join(missing)}; rejeu {command} --help shows what it takes")
+    return result
+
+
+def read(option: Option, text: str) -> str:
+    """Returns a value as the parser takes it.
+
+    Raises:
+        ValueError: if it is of the wrong kind.
+    """
+    if option.choices and text not in option.choices:
+        raise ValueError(f"{option.name} {text!r} must be one of {', '.join(option.choices)}")
+    if not {int, float} & {*option.kinds}:
+        return text
+    what = "whole number" if int in option.kinds else "number"
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{option.name} {text!r} must be a {what}") from None
+    if int not in option.kinds:
+        return repr(value)
+    try:
+        return str(int(text))
+    except ValueError:
+        if not value.is_integer():
+            raise ValueError(f"{option.name} {text} must be a whole number") from None
+        return str(int(value))
+
+
+def nearest(name: str, known: Mapping[str, Any]) -> str:
+    """Returns which known name was probably meant, or which there are."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+
+
+def options(kind: type) -> list[Option]:
+    """Returns what the arguments of a command declare."""
+    hints = get_type_hints(kind, include_extras=True)
+    return [_option(one, hints[one.name]) for one in dataclasses.fields(kind)]
+
+
+def _option(field: dataclasses.Field[Any], hint: Any) -> Option:
+    hint, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    said: Any = next((mark for mark in marks if isinstance(mark, type(arg()))), arg())
+    is_place = any(mark is Positional for mark in marks)
+    return Option(
+        name=str(said.metavar) if is_place else f"--{said.name or field.name}".replace("_", "-"),
+        kinds=get_args(hint) if isinstance(hint, UnionType) else (hint,),
+        choices=get_args(hint) if get_origin(hint) is Literal else (),
+        takes_many=get_origin(hint) is tuple and get_origin(get_args(hint)[0]) is tuple,
+        is_place=is_place,
+        is_required=field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING,
+    )

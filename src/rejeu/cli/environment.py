@@ -1,0 +1,215 @@
+"""The environment of a command: named on the command line, or recorded in a run folder.
+
+What is typed may import code: ``my_env:Walk-v0``, ``my_env.py``, ``--wrapper my_env:Shaped``. What a file says may not: of
+a run folder only ids that are registered here are taken, with keyword arguments that are plain numbers, truth values and
+words. Everything else the user must type again, and the error says what.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import UseAppendAction, arg
+
+from rejeu.cli import settings
+from rejeu.cli.importing import find_id, find_wrapper, imports
+from rejeu.errors import CheckpointError
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from rejeu.envs.vector import VectorEnv
+
+PLAIN_WORD = re.compile(r"[\w-]{0,60}")
+"""Texts that are neither a path nor an id of anything to import."""
+LARGEST = 1e6
+"""Largest number that a file may hand to an environment: larger ones could ask for any amount of memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentOptions:
+    """How an environment is made; abstract, a part of the arguments of commands that name one."""
+
+    env_kwargs: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="NAME=VALUE ...")] = ()
+    """Keyword arguments of the environment: sigma=2 map_name=8x8."""
+    wrapper: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE:CLASS")] = ()
+    """Wrap it in this gymnasium.Wrapper, such as gymnasium.wrappers:FlattenObservation; repeat for several, inner first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(EnvironmentOptions):
+    """The same where a run names the environment; abstract."""
+
+    env: Annotated[str | None, arg(metavar="ENV", help_behavior_hint="")] = None
+    """Environment, as for rejeu train; by default the run's. One that is imported must be named again."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """An environment that was found, and how it is made."""
+
+    env_id: str
+    """Id in Gymnasium's registry, or one that only EnvPool knows."""
+    typed: str
+    """How it was named."""
+    kwargs: Mapping[str, Any]
+    """Keyword arguments of the environment."""
+    wrapper_names: tuple[str, ...]
+    """As typed, innermost first."""
+    wrappers: tuple[Callable[[Any], Any], ...]
+    """The same, imported."""
+
+    def make(self, **more: Any) -> gym.Env:
+        """Returns a new one; ``more`` are further keyword arguments, such as ``render_mode``."""
+        from rejeu.envs.registry import maker
+
+        return Wrapped(maker(self.env_id, **{**self.kwargs, **more}), self.wrappers)()
+
+    def vector(self, n_envs: int, backend: str, seed: int | None, restart_workers: int = 0) -> VectorEnv:
+        """Returns ``n_envs`` of them; the arguments are those of :func:`rejeu.make_vector`.
+
+        Raises:
+            ValueError: for ``envpool`` with wrappers or keyword arguments, which it does not take.
+        """
+        from rejeu.envs.registry import maker
+        from rejeu.envs.vector import make_vector
+
+        if not self.wrappers:
+            return make_vector(
+                self.env_id, n_envs, backend, seed, restart_workers=restart_workers, **self.kwargs  # type: ignore[arg-type]
+            )  # fmt: skip
+        if backend == "envpool":
+            raise ValueError("the envpool backend takes no wrappers; use --backend gymnasium")
+        make = Wrapped(maker(self.env_id, **self.kwargs), self.wrappers)
+        return make_vector(make, n_envs, backend, seed, restart_workers=restart_workers)  # type: ignore[arg-type]
+
+    def drawing(self) -> gym.Env:
+        """Returns a new one that draws to arrays.
+
+        Raises:
+            ValueError: if it cannot.
+        """
+        from rejeu.video import make_drawing
+
+        return make_drawing(self.make, self.env_id)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is an id and nothing else, so that EnvPool may step it."""
+        return not self.kwargs and not self.wrappers
+
+    def is_registered(self) -> bool:
+        """Returns whether Gymnasium knows it, and not EnvPool alone."""
+        from rejeu.envs.registry import register
+
+        return register(self.env_id)
+
+    def options(self) -> str:
+        """Returns what ``rejeu evaluate RUN`` and the like need to make it again; empty if the id is enough.
+
+        >>> Environment("Walk-v0", "my_env:Walk-v0", {"g": 9.8}, (), ()).options()
+        ' --env my_env:Walk-v0 --env-kwargs g=9.8'
+        """
+        recorded = not imports(self.typed) and not self.wrapper_names and all(map(is_plain, self.kwargs.values()))
+        return "" if recorded else options(self.typed, self.kwargs, self.wrapper_names)
+
+    def __str__(self) -> str:
+        parts = [f"{key}={value!r}" for key, value in self.kwargs.items()]
+        text = self.env_id + (f" ({', '.join(parts)})" if parts else "")
+        return text + "".join(f", {name}" for name in self.wrapper_names)
+
+
+@dataclass(frozen=True)
+class Wrapped:
+    """Makes an environment and wraps it; it can be sent to a worker process."""
+
+    make: Callable[[], Any]
+    wrappers: tuple[Callable[[Any], Any], ...]
+
+    def __call__(self) -> Any:
+        env = self.make()
+        for wrapper in self.wrappers:
+            env = wrapper(env)
+        return env
+
+
+def options(typed: str, kwargs: Mapping[str, Any], wrapper_names: Iterable[str]) -> str:
+    """Returns an environment as options of a command line, with a space before each."""
+    words = ["--env", typed]
+    if kwargs:
+        words += ["--env-kwargs", *(f"{key}={settings.written(value)}" for key, value in kwargs.items())]
+    words += chain.from_iterable(("--wrapper", name) for name in wrapper_names)
+    return "".join(f" {shlex.quote(word)}" for word in words)
+
+
+def is_plain(value: Any) -> bool:
+    """Returns whether a keyword argument may come from a file: a truth value, a number of moderate size or a word."""
+    if isinstance(value, str):
+        return PLAIN_WORD.fullmatch(value) is not None
+    return isinstance(value, bool | int | float) and math.isfinite(value) and abs(value) <= LARGEST
+
+
+def named(env: str, given: EnvironmentOptions) -> Environment:
+    """Returns the environment that was named on the command line; imports what it names.
+
+    Raises:
+        ValueError: if there is none, with the nearest; or for what is no wrapper or no keyword argument.
+        ImportError: if a module cannot be imported.
+    """
+    kwargs = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
+    wrappers = tuple(find_wrapper(name) for name in given.wrapper)
+    return Environment(find_id(env), env, kwargs, given.wrapper, wrappers)
+
+
+def recorded(
+    env_id: Any,
+    env_argument: str,
+    kwargs: Mapping[str, Any],
+    wrapper_names: Iterable[str],
+    run: Path,
+    given: RunOptions,
+) -> Environment:
+    """Returns the environment of a run: what is typed, and where that is silent what the run folder says.
+
+    Args:
+        env_id: as the folder or the model has it.
+        env_argument: how it was named when the run began.
+        kwargs: it was made with.
+        wrapper_names: it was wrapped in.
+        run: the folder or file, for messages.
+        given: what is typed now; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
+
+    Raises:
+        CheckpointError: if something must be typed again, with the options to type.
+        ValueError: as for :func:`named`.
+    """
+    if given.env is not None:
+        return named(given.env, given)
+    if not isinstance(env_id, str) or imports(env_id):
+        raise CheckpointError(
+            f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "
+            "--env ID"
+        )
+    own = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
+    kept = {key: value for key, value in kwargs.items() if key not in own}
+    wrapper_names = tuple(given.wrapper or wrapper_names)
+    if (
+        imports(env_argument or env_id)
+        or (wrapper_names and not given.wrapper)
+        or not all(map(is_plain, kept.values()))
+        or not all(key.isidentifier() and len(key) <= 60 for key in kept)
+    ):
+        again = options(env_argument or env_id, {**kept, **own}, wrapper_names)
+        raise CheckpointError(
+            f"{run} was trained on an environment that is imported or made with more than numbers, which no file may ask "
+            f"for; if you trust it, name it again:{again if len(again) < 500 and again.isprintable() else ' --env ENV'}"
+        )
+    wrappers = tuple(find_wrapper(name) for name in given.wrapper)
+    return Environment(env_id, env_id, {**kept, **own}, given.wrapper, wrappers)

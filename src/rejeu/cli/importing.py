@@ -1,0 +1,111 @@
+"""What a user names on the command line and Python then imports: modules of environments and of wrappers.
+
+Nothing here is given a name from a file: :mod:`rejeu.cli.environment` sees to that.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+PLAIN_ID = re.compile(r"[\w./-]{1,200}")
+"""Ids that are looked up and import nothing."""
+
+
+def imports(typed: str) -> bool:
+    """Returns whether naming an environment like this imports code."""
+    return PLAIN_ID.fullmatch(typed) is None or typed.endswith(".py")
+
+
+def find_id(name: str) -> str:
+    """Returns the id of an environment that was named on the command line; imports the module before a colon, or a file.
+
+    Raises:
+        ValueError: if the module does not register it.
+        ImportError: if there is no such module.
+    """
+    if not imports(name):
+        return name
+    import gymnasium as gym
+
+    before = set(gym.registry)
+    if ".py" in name and (name.endswith(".py") or ".py:" in name):
+        stem, _, env_id = name.partition(".py")
+        env_id, source = env_id.removeprefix(":"), f"{stem}.py"
+        module = import_file(Path(source))
+    else:
+        source, _, env_id = name.partition(":")
+        module = import_here(source)
+    new = set(gym.registry) - before
+    new |= {key for key, spec in gym.registry.items() if str(spec.entry_point).partition(":")[0] == module.__name__}
+    if env_id in gym.registry:
+        return env_id
+    found = " and ".join(sorted(new))
+    if not env_id and len(new) == 1:
+        return found
+    if not new:
+        raise ValueError(
+            f"{source} registers no environment; add gymnasium.register('Walk-v0', '{module.__name__}:Walk', "
+            "max_episode_steps=...) to it, with the name of your class"
+        )
+    if not env_id:
+        raise ValueError(f"{source} registers {found}; name one of them: {source}:{min(new)}")
+    raise ValueError(f"{source} registers {found}, not {env_id!r}")
+
+
+def find_wrapper(name: str) -> Callable[[Any], Any]:
+    """Returns the wrapper ``module:Class`` or ``file.py:Class``: anything that takes an environment.
+
+    Raises:
+        ValueError: if there is none.
+        ImportError: if there is no such module.
+    """
+    source, colon, attribute = name.rpartition(":")
+    if not colon or not source or not attribute:
+        raise ValueError(f"--wrapper {name!r} must be MODULE:CLASS, such as gymnasium.wrappers:FlattenObservation")
+    module = import_file(Path(source)) if source.endswith(".py") else import_here(source)
+    wrapper = getattr(module, attribute, None)
+    if not callable(wrapper):
+        raise ValueError(f"--wrapper {name!r}: {source} has no class or function {attribute!r}")
+    return wrapper
+
+
+def import_here(name: str) -> Any:
+    """Returns a module, of the current folder too; what is installed comes first.
+
+    Raises:
+        ImportError: if there is none.
+    """
+    if os.getcwd() not in sys.path and "" not in sys.path:
+        sys.path.append(os.getcwd())
+    importlib.invalidate_caches()
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise
+        raise ModuleNotFoundError(f"there is no module {name!r} in {os.getcwd()} or among what is installed") from None
+
+
+def import_file(path: Path) -> Any:
+    """Returns the module of a Python file, under the file's name, so that worker processes can import it as well.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ImportError: if another module has its name.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    importlib.invalidate_caches()
+    module = importlib.import_module(path.stem)
+    if Path(getattr(module, "__file__", None) or "").resolve() != path.resolve():
+        raise ImportError(f"another module is called {path.stem}; rename {path}")
+    return module
