@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import Any
 
 import gymnasium as gym
 
@@ -44,19 +43,10 @@ HYPERPARAMETERS = {
 }
 
 
-class LimitTerminates(gym.Wrapper):
-    """Reports the time limit as a terminal state."""
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        """Returns the environment's step, truncated ones as terminated."""
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        return obs, reward, terminated or truncated, False, info
-
-
 def run(seed: int, bootstrap: bool) -> dict[str, float]:
     """Returns what one run of training and 50 greedy episodes gave."""
     env = gym.make("MountainCar-v0")
-    agent = rejeu.DQN("MlpPolicy", env if bootstrap else LimitTerminates(env), seed=seed, **HYPERPARAMETERS)
+    agent = rejeu.DQN("MlpPolicy", env if bootstrap else rejeu.TimeLimitTerminates(env), seed=seed, **HYPERPARAMETERS)
     began = time.perf_counter()
     agent.learn(episodes=EPISODES)
     seconds = time.perf_counter() - began

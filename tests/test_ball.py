@@ -263,3 +263,10 @@ def test_several_balls_make_one_vector_environment():
     assert obs.shape == (3, 2)
     assert len(np.unique(obs)) == 6
     vector.close()
+
+
+def test_an_action_out_of_range_is_clipped():
+    pushed = placed(0.0, 0.0)
+    position, reward, *_ = pushed.step(np.array([3.0, -np.inf]))
+    np.testing.assert_array_equal(position, [2.0, -2.0])
+    assert reward == 1.0

@@ -56,6 +56,7 @@ CASES = {
     "schedule": ("SAC", vector("Pendulum-v1", 1), {**OFF, "learning_rate": rejeu.Linear(1e-2, 0.0)}),
     **{f"{n} noise": ("DDPG", vector("Pendulum-v1", 2), {**OFF, "action_noise": x}) for n, x in NOISES.items()},
     "EnvPool": ("SAC", vector("Pendulum-v1", 2, "envpool"), OFF),
+    "EnvPool, a seed each": ("SAC", lambda: rejeu.make_vector("Pendulum-v1", 2, "envpool", seed=[9, 4]), OFF),
     "EnvPool, PPO": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "EnvPool, whole episodes": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
     "worker processes": ("SAC", vector("Pendulum-v1", 2, "gymnasium-async"), OFF),

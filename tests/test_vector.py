@@ -13,6 +13,7 @@ from rejeu.envs.registry import make_env
 from rejeu.envs.vector import EnvPool, GymnasiumVector, InProcess, make_vector
 from rejeu.errors import MissingExtra
 from tests.environments import Counter, Reach, Sampled
+from tests.helpers import small_sac
 
 LENGTHS = (2, 4), (3, 1)
 """Of the episodes of two environments, over and over."""
@@ -384,3 +385,65 @@ def test_a_dependency_that_gymnasium_misses_is_named_likewise(monkeypatch):
     monkeypatch.setattr(gym, "make", make)
     with pytest.raises(MissingExtra, match=r"pip install 'rejeu\[box2d\]'"):
         make_env("LunarLander-v3")
+
+
+# One seed for each environment.
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async", "envpool"])
+def test_each_environment_begins_with_the_seed_that_is_given_for_it(backend):
+    """What a single environment shows with that seed: two of the seeds are equal, and so are their episodes."""
+    seeds = [7, 3, 7]
+    vector = make_vector("Pendulum-v1", 3, backend, seed=seeds)
+    obs = np.array(vector.reset())
+    for row, seed in zip(obs, seeds, strict=True):
+        one = make_vector("Pendulum-v1", 1, backend.removesuffix("-async"), seed=seed)
+        np.testing.assert_array_equal(row, one.reset()[0])
+        one.close()
+    again = np.array(vector.reset([3, 3, 7]))
+    np.testing.assert_array_equal(again, obs[[1, 1, 0]])
+    vector.close()
+
+
+def test_a_gymnasium_vector_environment_takes_one_seed_for_each_environment():
+    make = lambda: gym.make("Pendulum-v1")  # noqa: E731
+    vector = make_vector(gym.vector.SyncVectorEnv([make, make]), seed=[5, 2])
+    expected = [make().reset(seed=seed)[0] for seed in (5, 2)]
+    np.testing.assert_array_equal(vector.reset(), expected)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_training_begins_with_the_seeds_given_for_each_environment_and_not_with_the_agents(backend):
+    def first(agent_seed, seeds):
+        env = make_vector("Pendulum-v1", 2, backend, seed=seeds)
+        agent = small_sac(env, seed=agent_seed)
+        seen = []
+        agent.learn(2, lambda agent, turn: seen.append(agent._run.replay.arrays()["obs.array"][:, 0]))
+        return seen[0]
+
+    expected = np.array(make_vector("Pendulum-v1", 2, backend, seed=[4, 9]).reset())
+    np.testing.assert_array_equal(first(0, [4, 9]), expected)
+    np.testing.assert_array_equal(first(1, [4, 9]), expected)
+    assert (first(0, 4) != first(1, 4)).any()  # one number is the agent's to choose
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        ([1, 2], r"seed=\[1, 2\] must be a number, or a sequence of 3 numbers, one for each environment"),
+        ([1, 2, -3], "must have whole numbers from 0 to 2"),
+        ([1, 2, 2.5], "must have whole numbers from 0 to 2"),
+        ([1, 2, 2**31], "must have whole numbers from 0 to 2"),
+    ],
+)
+def test_seeds_that_are_not_one_for_each_environment_are_refused(seed, message):
+    with pytest.raises(ValueError, match=message):
+        make_vector("Pendulum-v1", 3, "gymnasium", seed=seed)
+
+
+def test_a_vector_that_seeds_its_environments_itself_takes_one_number():
+    from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor
+
+    venv = VecMonitor(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
+    with pytest.raises(ValueError, match="VecMonitor takes one number and seeds its environments itself"):
+        make_vector(venv, seed=[1, 2])

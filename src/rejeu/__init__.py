@@ -14,6 +14,7 @@ from rejeu import plots
 from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
 from rejeu.envs.checker import check_env
 from rejeu.envs.monitor import Monitor
+from rejeu.envs.time_limit import TimeLimitTerminates
 from rejeu.envs.vector import make_vector
 from rejeu.errors import BadEnvironmentError, CheckpointError, MissingExtra, WorkerError
 from rejeu.evaluation import Evaluation, evaluate_policy
@@ -52,6 +53,7 @@ __all__ = [
     "ParameterNoise",
     "RecurrentPPO",
     "ReplayBuffer",
+    "TimeLimitTerminates",
     "WorkerError",
     "check_env",
     "evaluate_policy",

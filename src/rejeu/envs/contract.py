@@ -16,6 +16,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
@@ -87,9 +88,17 @@ class VectorEnv(ABC):
     _obs: Any
     """The observations last returned."""
 
+    seeds: Seed = None
+    """One seed for each environment, with which a run begins in place of its own; None where there are none."""
+
     @abstractmethod
-    def reset(self, seed: int | None = None) -> Any:
-        """Starts an episode in every environment and returns the observations ``(n_envs, ...)``."""
+    def reset(self, seed: Seed = None) -> Any:
+        """Starts an episode in every environment and returns the observations ``(n_envs, ...)``.
+
+        Args:
+            seed: a number, after which environment i takes the i-th, or a sequence of one number for each. None lets the
+                random numbers go on, at first from the seed that the environments were made with.
+        """
 
     def step(self, action: np.ndarray, active: np.ndarray | None = None) -> Step:
         """Steps every environment, or only the ``active`` ones.

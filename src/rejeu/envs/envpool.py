@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
 from rejeu.envs.contract import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
 from rejeu.envs.registry import make_env, provider, register, unknown_environment
+from rejeu.envs.seeds import END, Seed, checked
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, leaves
 
@@ -31,7 +33,7 @@ class EnvPool(VectorEnv):
 
     backend = "envpool"
 
-    def __init__(self, env_id: str, n_envs: int, seed: int | None = None) -> None:
+    def __init__(self, env_id: str, n_envs: int, seed: Seed = None) -> None:
         self.env_id = env_id
         self.n_envs = n_envs
         self._pool = self._make(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
@@ -43,14 +45,15 @@ class EnvPool(VectorEnv):
         self._leaves = leaves(self.observation_space)
         self._log = self._new_log()
 
-    def _make(self, seed: int) -> Any:
+    def _make(self, seed: int | Sequence[int]) -> Any:
         import envpool
 
         self._seed = seed
+        # Of a number environment i gets the i-th after it, which EnvPool takes as int32.
+        taken = seed % (2**31 - self.n_envs) if isinstance(seed, int) else list(seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
-            # Environment i gets the seed + i, which EnvPool takes as int32.
-            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seed % (2**31 - self.n_envs))
+            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=taken)
             pool.observation_space, pool.action_space  # noqa: B018 - made when first asked for, and kept
         return pool
 
@@ -62,9 +65,9 @@ class EnvPool(VectorEnv):
     def must_reset(self) -> bool:
         return self._log.is_full
 
-    def reset(self, seed: int | None = None) -> Any:
+    def reset(self, seed: Seed = None) -> Any:
         if seed is None and self.must_reset:
-            seed = int(np.random.SeedSequence([self._seed, 1]).generate_state(1)[0])
+            seed = following(self._seed)
         if seed is not None:
             self._pool, self._log = self._make(seed), self._new_log()
         self._log.reset()
@@ -98,13 +101,16 @@ class EnvPool(VectorEnv):
         return self._obs
 
     def snapshot(self) -> dict[str, Any] | None:
-        return None if self._log.is_dropped else {"seed": self._seed, **self._log.to_plain()}
+        if self._log.is_dropped:
+            return None
+        seed = self._seed if isinstance(self._seed, int) else list(self._seed)
+        return {"seed": seed, **self._log.to_plain()}
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
         if not isinstance(saved, dict) or {*saved} != {"seed", "n_operations", "blocks"}:
             raise ValueError("the record of actions is not one of EnvPool")
         self._pool.close()
-        self._pool, self._log = self._make(whole("seed", saved["seed"], least=0)), self._new_log()
+        self._pool, self._log = self._make(_saved_seed(saved["seed"], self.n_envs)), self._new_log()
         for which, action in replay(self._log, saved, self.env_id):
             active = np.isin(np.arange(self.n_envs), which) if which is not None else None
             if action is None:
@@ -133,6 +139,23 @@ class EnvPool(VectorEnv):
 
     def close(self) -> None:
         self._pool.close()
+
+
+def following(seed: int | Sequence[int]) -> int | Sequence[int]:
+    """Returns the seed of the pool that is made after the one of ``seed``."""
+    if isinstance(seed, int):
+        return int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
+    return tuple(int(np.random.SeedSequence([one, 1]).generate_state(1)[0]) % END for one in seed)
+
+
+def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
+    """Returns the seed of a pool as a file has it.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    several = checked(seed, n_envs) if isinstance(seed, list) else None
+    return whole("seed", seed, least=0) if several is None else several
 
 
 def check_envpool_knows(env_id: str) -> None:

@@ -13,6 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.contract import SUCCESS_KEYS, Description, Step, VectorEnv, describe_spec, replaced
+from rejeu.envs.seeds import Seed, for_each
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import leaves, plain
@@ -24,7 +25,7 @@ class GymnasiumVector(VectorEnv):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        seed: int | None = None,
+        seed: Seed = None,
         make_one: Callable[[], gym.Env] | None = None,
         description: Description | None = None,
     ) -> None:
@@ -60,10 +61,10 @@ class GymnasiumVector(VectorEnv):
         self.n_steps = 0
         """How often the vector was stepped."""
 
-    def reset(self, seed: int | None = None) -> Any:
+    def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        self._obs = self._after_reset = self._reset(seed=seed)
+        self._obs = self._after_reset = self._reset(seed=seed if seed is None else for_each(seed, self.n_envs))
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         self._strayed = np.zeros(self.n_envs, bool)
         return self._obs

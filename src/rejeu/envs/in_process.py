@@ -14,6 +14,7 @@ from numpy import ndarray
 from rejeu.envs import answers, faults, goals as goals_module, state
 from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.conversions import FLAGS, flag_of, reward_of
+from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError
 from rejeu.replay.hindsight import GoalFunctions
@@ -29,7 +30,7 @@ class InProcess(VectorEnv):
 
     backend = "gymnasium"
 
-    def __init__(self, envs: Sequence[gym.Env], seed: int | None = None, venv: VecEnv | None = None) -> None:
+    def __init__(self, envs: Sequence[gym.Env], seed: Seed = None, venv: VecEnv | None = None) -> None:
         if len({id(env) for env in envs}) < len(envs):
             raise ValueError(
                 "the same environment was given more than once; the function must make a new one each time"
@@ -52,20 +53,22 @@ class InProcess(VectorEnv):
         """What every step needs, in one place; ``only`` is the store of observations that are one array."""
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
 
-    def handed_on(self, wrap: Callable[[gym.Env], gym.Env], seed: int | None = None) -> InProcess:
+    def handed_on(self, wrap: Callable[[gym.Env], gym.Env], seed: Seed = None) -> InProcess:
         """Returns the same environments wrapped, as another vector that is to be used in place of this one.
 
         It takes over the seed of the first reset if that is still to come; ``seed`` is for where there is none.
         """
         seed, self._seed = seed if self._seed is None else self._seed, None
-        return InProcess([wrap(env) for env in self.envs], seed)
+        wrapped = InProcess([wrap(env) for env in self.envs], seed)
+        wrapped.seeds = self.seeds
+        return wrapped
 
-    def reset(self, seed: int | None = None) -> Any:
+    def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        for i, env in enumerate(self.envs):
+        for i, (env, own_seed) in enumerate(zip(self.envs, for_each(seed, self.n_envs), strict=True)):
             try:
-                self._put(i, answers.reset(env, None if seed is None else seed + i)[0])
+                self._put(i, answers.reset(env, own_seed)[0])
             except BadEnvironmentError as error:
                 raise self._bad(i, str(error), error) from error.__cause__
         return self._obs

@@ -12,6 +12,7 @@ import numpy as np
 
 from rejeu.envs import faults, goals as goals_module, state, worker_process
 from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
+from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.worker_process import Failure
 from rejeu.envs.workers import RESTARTED, TIMEOUT, Restarted, Workers
 from rejeu.errors import BadEnvironmentError, WorkerError
@@ -44,7 +45,7 @@ class InWorkers(VectorEnv):
         self,
         make_one: Callable[[], gym.Env],
         n_envs: int,
-        seed: int | None = None,
+        seed: Seed = None,
         worker_timeout: float | None = TIMEOUT,
         restart_workers: int = 0,
     ) -> None:
@@ -79,10 +80,10 @@ class InWorkers(VectorEnv):
         self._rows = worker_process.rows(self.observation_space, buffers, self.n_envs)
         return buffers, self.n_envs
 
-    def reset(self, seed: int | None = None) -> Any:
+    def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        return self._reset({i: None if seed is None else seed + i for i in range(self.n_envs)})
+        return self._reset(dict(enumerate(for_each(seed, self.n_envs))))
 
     def reset_done(self, done: np.ndarray) -> Any:
         return self._reset(dict.fromkeys(np.flatnonzero(done).tolist()))

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from rejeu.core import Masked
 from rejeu.envs.mask_wrapper import MASK, OBSERVATION, MaskInObservation, n_choices
 from rejeu.envs.registry import maker
+from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vector import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
 from rejeu.envs.workers import TIMEOUT
@@ -40,10 +41,11 @@ class MaskedVector(VectorEnv):
         assert isinstance(space, spaces.Dict)
         self.inner = inner
         self.n_envs, self.backend, self.env_id = inner.n_envs, inner.backend, inner.env_id
+        self.seeds = inner.seeds
         self.observation_space, self.action_space = space[OBSERVATION], inner.action_space
         self.max_episode_steps, self.reward_threshold = inner.max_episode_steps, inner.reward_threshold
 
-    def reset(self, seed: int | None = None) -> Masked:
+    def reset(self, seed: Seed = None) -> Masked:
         return masked(self.inner.reset(seed))
 
     def _step_all(self, action: np.ndarray) -> Step:
@@ -100,7 +102,7 @@ def make_masked(
     env: Any,
     n_envs: int = 1,
     backend: Backend = "auto",
-    seed: int | None = None,
+    seed: Seed = None,
     *,
     worker_timeout: float | None = TIMEOUT,
     restart_workers: int = 0,

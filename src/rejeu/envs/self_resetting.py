@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.auto_reset import AutoResetView, DummyVecEnv
 from rejeu.envs.contract import Step, VectorEnv, success_of
 from rejeu.envs.in_process import InProcess
+from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv, is_vecenv_wrapped
 from rejeu.envs.vec_normalize import VecNormalize
 from rejeu.errors import BadEnvironmentError
@@ -23,7 +25,7 @@ TIME_LIMIT = "TimeLimit.truncated"
 """Where an info says whether a time limit alone ended the episode."""
 
 
-def without_resets(venv: VecEnv, seed: int | None = None) -> VectorEnv:
+def without_resets(venv: VecEnv, seed: Seed = None) -> VectorEnv:
     """Returns the environments of a vector that resets itself.
 
     Those of a :class:`DummyVecEnv` itself are stepped directly, which costs least; wrappers, other classes and classes
@@ -41,7 +43,7 @@ class SelfResetting(VectorEnv):
 
     venv: VecEnv
 
-    def __init__(self, venv: VecEnv, seed: int | None = None) -> None:
+    def __init__(self, venv: VecEnv, seed: Seed = None) -> None:
         self.venv = venv
         self.n_envs = venv.num_envs
         self.observation_space, self.action_space = venv.observation_space, venv.action_space
@@ -52,21 +54,34 @@ class SelfResetting(VectorEnv):
             self.reward_threshold = spec.reward_threshold
         self.n_steps = 0
         """How often the vector was stepped."""
-        self._seed = seed
+        self._seed = None if seed is None else self._one(seed)
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
         """The observations that the last step showed, new episodes' first ones included."""
         self._strayed = np.zeros(self.n_envs, bool)
         """Which have moved on unseen and were not reset since."""
 
-    def reset(self, seed: int | None = None) -> Any:
+    def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
         if seed is not None:
-            self.venv.seed(seed)
+            self.venv.seed(self._one(seed))
         self._strayed = np.zeros(self.n_envs, bool)
         self._obs = self._after_reset = self._cast(self.venv.reset())
         return self._obs
+
+    def _one(self, seed: int | Sequence[int]) -> int:
+        """Returns a seed that is one number.
+
+        Raises:
+            ValueError: if it is several.
+        """
+        if isinstance(seed, int):
+            return seed
+        raise ValueError(
+            f"seed={seed}: {type(self.venv).__name__} takes one number and seeds its environments itself; give one number, "
+            "or make the environments by rejeu.make_vector, which takes a seed for each"
+        )
 
     def _step_all(self, action: np.ndarray) -> Step:
         self.n_steps += 1

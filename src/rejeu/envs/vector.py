@@ -12,13 +12,14 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
-from rejeu.envs import measuring
+from rejeu.envs import measuring, seeds
 from rejeu.envs.contract import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.in_workers import InWorkers
 from rejeu.envs.registry import maker
+from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.workers import TIMEOUT, check_options
 
@@ -32,7 +33,7 @@ def make_vector(
     env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv | VecEnv | VectorEnv,
     n_envs: int = 1,
     backend: Backend = "auto",
-    seed: int | None = None,
+    seed: Seed = None,
     *,
     worker_timeout: float | None = TIMEOUT,
     restart_workers: int = 0,
@@ -48,7 +49,9 @@ def make_vector(
             each), or ``"auto"``: for an id the fastest, as measured when it was first asked for on this machine (see
             :mod:`rejeu.envs.measuring`); for a function, this process. The result's ``backend`` says which it is, its
             ``measured`` what it was chosen by.
-        seed: seeds the environments, each differently, at their first reset. None draws one.
+        seed: seeds the environments at their first reset: a number, from which environment i takes the i-th after it, or a
+            sequence of one number for each environment. An agent that trains in them begins with its own seed instead of a
+            number, and keeps a sequence. None draws one.
         worker_timeout: seconds that worker processes have for a step or a reset before they count as hung; None: for
             ever. Of no meaning on other backends.
         restart_workers: how many worker processes that crashed or hung are started anew, with a warning, and their
@@ -57,7 +60,7 @@ def make_vector(
         env_kwargs: handed to ``gymnasium.make``.
 
     Raises:
-        ValueError: for an unknown id or backend, with the nearest known.
+        ValueError: for an unknown id or backend, with the nearest known; for seeds that are not one for each environment.
         MissingExtra: if a package is not installed.
         TypeError: if ``env`` is none of the above, or a function that cannot be sent to a worker process.
         WorkerError: if a worker process cannot be started.
@@ -70,6 +73,25 @@ def make_vector(
     if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
     check_workers(env, backend, worker_timeout, restart_workers)
+    if isinstance(env, VectorEnv | gym.vector.VectorEnv | VecEnv):
+        n_envs = env.n_envs if isinstance(env, VectorEnv) else env.num_envs
+    seed = seeds.checked(seed, n_envs)
+    vector = _made(env, n_envs, backend, seed, worker_timeout, restart_workers, env_kwargs)
+    if isinstance(seed, tuple):
+        vector.seeds = seed
+    return vector
+
+
+def _made(
+    env: Any,
+    n_envs: int,
+    backend: Backend,
+    seed: Seed,
+    worker_timeout: float | None,
+    restart_workers: int,
+    env_kwargs: dict[str, Any],
+) -> VectorEnv:
+    """Returns what :func:`make_vector` does, for arguments that were checked."""
     if isinstance(env, VectorEnv):
         return env
     if isinstance(env, VecEnv):

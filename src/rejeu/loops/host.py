@@ -133,7 +133,7 @@ def time_shares(seconds: Mapping[str, float]) -> dict[str, float]:
 def restart(run: Run) -> None:
     """Resets every environment; their running episodes are given up."""
     n_envs = run.env.n_envs
-    run.obs = run.env.reset(run.seed)
+    run.obs = run.env.reset(run.seed if run.seed is None or run.env.seeds is None else run.env.seeds)
     check_obs(run, run.obs, run.step, "reset returned")
     run.seed = None
     run.ended = np.ones(n_envs, bool)

@@ -1,0 +1,42 @@
+"""Seeds of many environments: one number for all of them, or one for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+Seed = int | Sequence[int] | None
+"""A number, from which environment i takes the i-th after it; one number for each environment; or None."""
+END = 2**31 - 1
+"""Seeds for single environments are below it: EnvPool takes 31 bits."""
+
+
+def checked(seed: Any, n_envs: int) -> Seed:
+    """Returns a seed for ``n_envs`` environments, several as a tuple of ints.
+
+    Raises:
+        ValueError: for a sequence that has not one whole number from 0 to 2**31 - 2 for each environment.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, int | np.integer):
+        return int(seed)
+    seeds = np.asarray(seed)
+    if seeds.shape != (n_envs,):
+        raise ValueError(f"seed={seed!r} must be a number, or a sequence of {n_envs} numbers, one for each environment")
+    if seeds.dtype.kind not in "iu" or seeds.min() < 0 or seeds.max() >= END:
+        raise ValueError(f"seed={seed!r} must have whole numbers from 0 to 2**31 - 2")
+    return tuple(seeds.tolist())
+
+
+def for_each(seed: Seed, n_envs: int) -> list[int | None]:
+    """Returns the seed of every environment.
+
+    >>> for_each(5, 3), for_each((7, 7, 1), 3), for_each(None, 2)
+    ([5, 6, 7], [7, 7, 1], [None, None])
+    """
+    if seed is None:
+        return [None] * n_envs
+    return [seed + i for i in range(n_envs)] if isinstance(seed, int) else list(seed)
