@@ -289,7 +289,7 @@ def test_films_fall_due_by_steps_and_training_goes_on_as_if_nothing_was_filmed(t
     filmed, other = small_sac(Counter((5,))), small_sac(Counter((5,)))
     filmed.learn(45, film)
     other.learn(45)
-    assert [path.name for path in film.paths] == ["step_20.mp4", "step_40.mp4"]
+    assert [path.name for path in film.paths] == ["step_000000020.mp4", "step_000000040.mp4"]
     assert all(path.stat().st_size > 0 for path in film.paths)
     for name, array in other.get_parameters().items():
         np.testing.assert_array_equal(array, filmed.get_parameters()[name])
@@ -298,7 +298,7 @@ def test_films_fall_due_by_steps_and_training_goes_on_as_if_nothing_was_filmed(t
 def test_films_fall_due_by_episodes(tmp_path):
     film = Film(tmp_path, every_episodes=3, env=lambda: Pictured(Counter((5,))))
     small_sac(Counter((5,))).learn(40, film)  # 8 episodes of 5 steps
-    assert [path.name for path in film.paths] == ["step_15.mp4", "step_30.mp4"]
+    assert [path.name for path in film.paths] == ["step_000000015.mp4", "step_000000030.mp4"]
 
 
 @pytest.mark.parametrize("settings", [{}, {"every": 5, "every_episodes": 2}])

@@ -325,12 +325,24 @@ def test_missing_ffmpeg_names_the_extra(lamp, tmp_path, monkeypatch):
         record_video(Still(), tmp_path / "v.mp4", lamp)
 
 
+def test_training_episodes_are_filmed_by_gymnasiums_wrapper(tmp_path):
+    pytest.importorskip("moviepy")
+    env = gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=10)
+    env = gym.wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda episode: episode % 2 == 0)
+    rejeu.SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0).learn(30)
+    env.close()
+    assert {path.name for path in (tmp_path / "videos").iterdir()} == {
+        "rl-video-episode-0.mp4",
+        "rl-video-episode-2.mp4",
+    }
+
+
 def test_show_videos_embeds_the_files_in_order(tmp_path, capsys):
-    for name in ("b-2", "a-1", "b-1", ".b-3.partial"):
+    for name in ("b-10", "b-2", "a-1", "b-1", ".b-3.partial"):
         (tmp_path / f"{name}.mp4").write_bytes(name.encode())
     shown = show_videos(tmp_path, prefix="b")
     found = re.findall(r"data:video/mp4;base64,([^']+)'", shown.data)
-    assert [base64.b64decode(text) for text in found] == [b"b-1", b"b-2"]
+    assert [base64.b64decode(text) for text in found] == [b"b-1", b"b-2", b"b-10"]
     assert type(shown).__module__.startswith("IPython")
     assert capsys.readouterr() == ("", "")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -385,8 +386,8 @@ class Html:
 def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
     """Returns the mp4 files of a folder as one piece of HTML that a notebook shows; it prints nothing.
 
-    The videos themselves are in the text, so they stay in the notebook when the files are gone. If there is none, the
-    text says so. Outside a notebook the text is in ``.data``.
+    They are in the order of the numbers in their names. The videos themselves are in the text, so they stay in the
+    notebook when the files are gone. If there is none, the text says so. Outside a notebook the text is in ``.data``.
 
     Args:
         folder: where to look, not below it.
@@ -395,7 +396,8 @@ def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
     >>> show_videos("no-such-folder").data
     '<p>No mp4 file in no-such-folder.</p>'
     """
-    files = sorted(path for path in Path(folder).glob("*.mp4") if path.name.startswith(prefix) and path.name[0] != ".")
+    files = [path for path in Path(folder).glob("*.mp4") if path.name.startswith(prefix) and path.name[0] != "."]
+    files.sort(key=lambda path: by_number(path.name))
     text = "\n".join(_player(path) for path in files)
     if not files:
         named = f" whose name begins with {prefix}" if prefix else ""
@@ -405,6 +407,15 @@ def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
     except ImportError:
         return Html(text)
     return HTML(text)
+
+
+def by_number(name: str) -> list[tuple[int, int, str]]:
+    """Returns a key that sorts the numbers in names by their values.
+
+    >>> sorted(["episode-10.mp4", "episode-9.mp4", "a.mp4"], key=by_number)
+    ['a.mp4', 'episode-9.mp4', 'episode-10.mp4']
+    """
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _player(path: Path) -> str:

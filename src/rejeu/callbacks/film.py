@@ -16,13 +16,16 @@ from rejeu.loops.host import Progress
 if TYPE_CHECKING:
     from rejeu.agents import Agent
 
+DIGITS = 9
+"""Of the step in the name of a film."""
+
 
 class Film:
     """Films the deterministic policy while it learns, every so many steps or training episodes.
 
-    Each film is ``folder/step_<step>.mp4``, an episode or more in an environment of its own, so that training goes on as if
-    nothing had been filmed, on any backend. To film the training episodes themselves, give the agent an environment in
-    ``gymnasium.wrappers.RecordVideo``.
+    Each film is ``folder/step_<step>.mp4``, with the step in nine digits, so that names sort by time. It shows an episode
+    or more in an environment of its own: training continues as if nothing had been filmed, on any backend. To film the
+    training episodes themselves, give the agent an environment in ``gymnasium.wrappers.RecordVideo``.
     """
 
     def __init__(
@@ -76,7 +79,7 @@ class Film:
         if due:
             from rejeu.video import record_video
 
-            path = self.folder / f"step_{progress.step}.mp4"
+            path = self.folder / f"step_{progress.step:0{DIGITS}}.mp4"
             film = partial(record_video, agent, path, self.env, self.episodes, self.max_steps, self.seed)
             if agent.failed_writes.attempt(f"film {path}", film, retry=False):
                 self.paths.append(path)
