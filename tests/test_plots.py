@@ -125,7 +125,6 @@ def test_an_unknown_axis_is_an_error():
 
 def test_without_matplotlib_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.delitem(sys.modules, "rejeu.figures", raising=False)
     with pytest.raises(MissingExtra, match=r"rejeu\[plot\]"):
         learning_curve(history())
 

@@ -27,6 +27,8 @@ def blank(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
         MissingExtra: if matplotlib is not installed; ``what`` says for what it is needed.
     """
     try:
+        import matplotlib.figure  # noqa: F401 - also where our own module was imported before
+
         from rejeu.figures import Picture
     except ImportError:
         raise MissingExtra(what, "matplotlib", "plot") from None
