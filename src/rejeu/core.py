@@ -127,6 +127,13 @@ class Algorithm(NamedTuple):
     recall: Callable[[PyTree, PyTree, PyTree, Array], tuple[Array, PyTree]] | None = None
     """``recall(carry, actor, obs, ended) -> (action, carry)``: the deterministic policy where it has a memory, with the
     carry of ``explorer``. None where the present observation is all that it needs."""
+    action_values: Callable[[PyTree, PyTree, Array | None], Array] | None = None
+    """``action_values(state, obs, action)``: what each critic says of actions ``(batch, action_dim)`` in [-1, 1],
+    ``(n_critics, batch)``; of Discrete actions what each says of all of them, ``(n_critics, batch, n_actions)``, and
+    ``action`` is None. None for algorithms without such critics."""
+    state_value: Callable[[PyTree, PyTree, PyTree, Array], Array] | None = None
+    """``state_value(carry, actor, obs, ended) -> (batch,)``: what the critic says of observations, with the carry of
+    ``explorer`` where the policy has a memory and ``()`` elsewhere. None for algorithms without such a critic."""
     observe: Callable[[PyTree, PyTree, Array], PyTree] | None = None
     """``observe(state, obs, running_return) -> state``: takes in observations ``(batch, ...)`` and discounted sums of
     rewards ``(batch,)`` as they come, for statistics. None where the state needs no more than ``update``."""

@@ -251,6 +251,24 @@ def normalised(
         assert algorithm.recall is not None
         return algorithm.recall(carry, actor[0], scaled(actor[1], obs), ended)
 
+    def action_values(state: State, obs: PyTree, action: Array | None) -> Array:
+        assert algorithm.action_values is not None
+        return algorithm.action_values(state.learner, scaled(state.statistics, obs), action)
+
+    def state_value(carry: PyTree, actor: tuple[PyTree, Statistics], obs: PyTree, ended: Array) -> Array:
+        assert algorithm.state_value is not None
+        return algorithm.state_value(carry, actor[0], scaled(actor[1], obs), ended)
+
     outer = Explorer(lambda actor, n_envs: explorer.init(actor[0], n_envs), act)
-    own_recall = None if algorithm.recall is None else recall
-    return Algorithm(init, actor, explore, exploit, update, outer, own_recall, observe)
+    return Algorithm(
+        init,
+        actor,
+        explore,
+        exploit,
+        update,
+        outer,
+        recall=None if algorithm.recall is None else recall,
+        action_values=None if algorithm.action_values is None else action_values,
+        state_value=None if algorithm.state_value is None else state_value,
+        observe=observe,
+    )

@@ -230,6 +230,26 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
     raise TypeError(f"cannot scale actions of {space}")
 
 
+def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
+    """Returns actions as an algorithm gives them from ones in the environment's own range: undoes :func:`scale_action`.
+
+    ``space`` is a Box or Discrete, ``action`` ``(batch, *shape)``. Of a Box, what lies beyond its bounds lies beyond
+    [-1, 1]; where both bounds are equal, 0.
+
+    >>> unscale_action(spaces.Box(0.0, 4.0, (1,)), np.array([[3.0]])).tolist()
+    [[0.5]]
+    """
+    if isinstance(space, spaces.Discrete):
+        return (action - space.start).astype(np.int32)
+    assert isinstance(space, spaces.Box)
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    half = np.where(bounded, 0.5 * (high - low), 1.0)
+    middle = np.where(bounded, low + half, 0.0)
+    scaled = (action - middle) / np.where(half > 0, half, 1.0)
+    return scaled.astype(np.float32).reshape(len(action), -1)
+
+
 def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.ndarray:
     """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`)."""
     if isinstance(space, spaces.Box):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from rejeu import checkpoint, spaces
-from rejeu.agents import loading
+from rejeu.agents import loading, predicting
 from rejeu.agents.base import Agent
 from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
@@ -67,6 +67,36 @@ class OffPolicyAgent(Agent):
         self._run.learn_from = self.config.learning_starts
         self._run.td_errors = []  # of steps that are gone
         self._give_up_episodes()
+
+    def q_values(
+        self, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
+    ) -> np.ndarray:
+        """Returns what the critics say of actions: the discounted return that they expect from then on, as ``float32``.
+
+        Observations are scaled as in training with ``normalize``, which may scale rewards too: the values are then sums of
+        scaled rewards. SAC's, TQC's and CrossQ's include the entropy that is to come. The networks are those that learn,
+        not their targets.
+
+        Args:
+            observation: one of the environment's space, or a batch of them with a leading axis.
+            action: in the environment's own range, one for each observation. None, for Discrete actions: all of them.
+            critics: where there are several, ``"min"`` of their values, as targets take it, their ``"mean"``, or ``"all"``.
+                Each of TQC's and QR-DQN's is the mean of its quantiles.
+
+        Returns:
+            ``(batch,)``, without ``action`` ``(batch, n_actions)``. There is no batch axis if the observation has none, and
+            with ``"all"`` the first axis is that of the critics.
+
+        Raises:
+            ValueError: if observations or actions are not of their spaces, or actions are missing.
+
+        >>> import gymnasium as gym, rejeu
+        >>> agent = rejeu.DDPG("MlpPolicy", gym.make("Pendulum-v1"), seed=0)
+        >>> obs = np.zeros((50, 3), np.float32)
+        >>> agent.q_values(obs, np.ones((50, 1))).shape, agent.q_values(obs[0], [1.0]).shape
+        ((50,), ())
+        """
+        return predicting.q_values(self, observation, action, critics)
 
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return make_vector(env, n_envs, backend, seed)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from rejeu import spaces
+from rejeu.agents import predicting
 from rejeu.agents.base import Agent
 from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
@@ -27,6 +28,31 @@ class OnPolicyAgent(Agent):
     """What the agents share that learn from rollouts of their present policy. Abstract."""
 
     config: OnPolicyConfig
+
+    def value(self, observation: Any, state: Any = None, episode_start: Any = None) -> np.ndarray:
+        """Returns what the critic says of observations: the discounted return that it expects from then on, as ``float32``.
+
+        Observations are scaled as in training with ``normalize``, which may scale rewards too: the values are then sums of
+        scaled rewards.
+
+        Args:
+            observation: one of the environment's space, or a batch of them with a leading axis.
+            state: what ``predict`` returned before these observations, for a policy with a memory; None where episodes
+                begin.
+            episode_start: where an episode begins with this observation, ``bool (batch,)``; None for nowhere.
+
+        Returns:
+            ``(batch,)``, or one number if the observation has no batch axis.
+
+        Raises:
+            ValueError: if the observation is not of the space, or ``state`` not of the policy's memory.
+
+        >>> import gymnasium as gym, rejeu
+        >>> agent = rejeu.PPO("MlpPolicy", gym.make("CartPole-v1"), seed=0)
+        >>> agent.value(np.zeros((50, 4), np.float32)).shape
+        (50,)
+        """
+        return predicting.value(self, observation, state, episode_start)
 
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -10,11 +10,19 @@ import jax
 import numpy as np
 
 from rejeu import finite, spaces
+from rejeu.envs.masks import split
 from rejeu.loops import host
 from rejeu.spaces import Leaf
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
+
+CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "min": lambda values: values.min(axis=0),
+    "mean": lambda values: values.mean(axis=0),
+    "all": lambda values: values,
+}
+"""What :func:`q_values` returns of the critics' values, whose first axis is that of the critics."""
 
 
 def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
@@ -79,6 +87,63 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
     agent._n_predictions += 1
     action, memory = compiled.sample(run.state, memory, obs, ended, run.key, clock)
     return np.asarray(action), memory if has_memory else None
+
+
+def q_values(agent: Agent, observation: Any, action: Any, critics: str) -> np.ndarray:
+    """Returns what the critics say of actions; see :meth:`OffPolicyAgent.q_values`."""
+    if critics not in CRITICS:
+        raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
+    obs, single = as_batch(observation, agent.observation_space, agent._obs_leaves)
+    n = len(jax.tree.leaves(obs)[0])
+    space = agent.action_space
+    is_discrete = isinstance(space, gym.spaces.Discrete)
+    if action is None and not is_discrete:
+        raise ValueError(f"q_values needs actions of {space}: only of Discrete actions all can be rated at once")
+    given = None if action is None else _actions(space, action, single, n)
+    finite.settle(agent)
+    values = np.asarray(agent._compiled.action_values(agent._run.state, obs, None if is_discrete else given))
+    if is_discrete and given is not None:
+        values = values[:, np.arange(n), given]
+    if single:
+        values = values[:, 0]
+    return CRITICS[critics](values)
+
+
+def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
+    """Returns actions of a Box or Discrete space as algorithms take them, with a leading axis.
+
+    Raises:
+        ValueError: if there are not as many as observations, or if they are not of the space's shape or choices.
+    """
+    array = np.asarray(action)
+    expected = space.shape if single else (n, *(space.shape or ()))
+    if array.shape != expected:
+        raise ValueError(f"the actions have the shape {array.shape}, expected {expected}: one for each observation")
+    array = array[None] if single else array
+    if isinstance(space, gym.spaces.Discrete):
+        spaces.check_env_actions(space, array, "q_values")
+    elif not np.isfinite(array).all():
+        raise ValueError("q_values has actions that are not finite")
+    return spaces.unscale_action(space, array)
+
+
+def value(agent: Agent, observation: Any, memory: Any, episode_start: Any) -> np.ndarray:
+    """Returns what the critic says of observations; see :meth:`OnPolicyAgent.value`."""
+    if agent.takes_masks:
+        observation, _ = split(observation, None)
+    obs, single = as_batch(observation, agent.observation_space, agent._obs_leaves)
+    n = len(jax.tree.leaves(obs)[0])
+    compiled = agent._compiled
+    finite.settle(agent)
+    if compiled.algorithm.recall is None:
+        memory = ()
+    elif memory is None:
+        memory = compiled.initial_carry(n)
+    else:
+        check_memory(agent, memory, n)
+    ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
+    values = np.asarray(compiled.state_value(agent._run.state, memory, obs, ended))
+    return values[0] if single else values
 
 
 def check_memory(agent: Agent, memory: Any, n: int) -> None:

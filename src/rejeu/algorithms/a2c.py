@@ -134,7 +134,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             metrics["std"] = jnp.mean(jnp.exp(network.log_std))
         return State(network, optimizer_state, state.n_updates + 1), metrics
 
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer_of(config, kind))
+    def value(carry: PyTree, network: ActorCritic, obs: PyTree, ended: Array) -> Array:
+        return network.value(obs)
+
+    explorer = explorer_of(config, kind)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
 
 
 def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:

@@ -203,7 +203,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return state, metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update)
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        return jax.vmap(lambda critic: critic(obs, action)[:, 0])(state.critics)
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 
 def check_shape(shape: PolicyConfig) -> None:

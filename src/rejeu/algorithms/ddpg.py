@@ -138,7 +138,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return state, metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, policy, update)
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        assert action is not None
+        return action_value(state.critic, obs, action)[None]
+
+    return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values)
 
 
 def policy(actor: Actor, obs: PyTree) -> Array:

@@ -113,7 +113,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         }
         return state, metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update)
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        return state.critic(obs)[None]
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 
 @outlined

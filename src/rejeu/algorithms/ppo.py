@@ -171,7 +171,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer_of(config, kind))
+    def value(carry: PyTree, network: ActorCritic, obs: PyTree, ended: Array) -> Array:
+        return network.value(obs)
+
+    explorer = explorer_of(config, kind)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
 
 
 def metrics_of(

@@ -152,7 +152,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return state, metrics
 
-    return Algorithm(init, lambda state: state.network, explore, exploit, update)
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        return state.network(obs)[None]
+
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, action_values=values)
 
 
 class QuantileNetwork(eqx.Module):

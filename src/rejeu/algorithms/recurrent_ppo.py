@@ -317,9 +317,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = State(network, optimizer_state, state.key, state.n_updates + n_taken, state.n_rollouts + 1)
         return state, ppo.metrics_of(network, n_taken, losses, data.value, data.target, data.valid, config, clock)
 
-    return Algorithm(
-        init, lambda state: state.network, explore, exploit, update, Explorer(RecurrentActorCritic.empty, act), recall
-    )
+    def value(memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array) -> Array:
+        return actor.value(actor.remember(memory, obs, ended))
+
+    explorer = Explorer(RecurrentActorCritic.empty, act)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, recall, state_value=value)
 
 
 def samples(network: RecurrentActorCritic, rollout: Rollout, gae_lambda: float) -> tuple[Samples, Array]:

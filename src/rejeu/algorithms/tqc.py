@@ -167,7 +167,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return state, metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update)
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        assert action is not None
+        return jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 
 def action_quantiles(critics: Critic, obs: PyTree, action: Array) -> Array:

@@ -74,6 +74,16 @@ class Compiled:
             assert algorithm.observe is not None
             return packing.pack(algorithm.observe(packing.unpack(state), *plan.unpack(vectors)))
 
+        @jax.jit
+        def action_values(state: PackedState, obs: PyTree, action: Array | None) -> Array:
+            assert algorithm.action_values is not None
+            return algorithm.action_values(packing.unpack(state), obs, action)
+
+        @jax.jit
+        def state_value(state: PackedState, carry: PyTree, obs: PyTree, ended: Array) -> Array:
+            assert algorithm.state_value is not None
+            return algorithm.state_value(carry, algorithm.actor(packing.unpack(state)), obs, ended)
+
         def is_sound(after: PackedState, metrics: Metrics) -> Array:
             return finite.all_finite(packing.without(after, passed_over), metrics)
 
@@ -123,6 +133,9 @@ class Compiled:
         self.observe = None if algorithm.observe is None else self._observe_packed
         """``observe(state, obs, running_return) -> state``, packed, whose predecessor is donated; None where the algorithm
         has no use for it (see :class:`rejeu.core.Algorithm`)."""
+        self.action_values, self.state_value = action_values, state_value
+        """``action_values(state, obs, action)`` and ``state_value(state, carry, obs, ended)`` over a packed state; see
+        :class:`rejeu.core.Algorithm`."""
         self._exploit, self._recall, self._observe, self._update = exploit, recall, observe, update
         self._act = self._sample = acting(explorer)
         if algorithm.recall is None and (noise is not None or algorithm.explorer is not None):
