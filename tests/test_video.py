@@ -329,8 +329,11 @@ def test_training_episodes_are_filmed_by_gymnasiums_wrapper(tmp_path):
     pytest.importorskip("moviepy")
     env = gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=10)
     env = gym.wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda episode: episode % 2 == 0)
-    rejeu.SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0).learn(30)
+    agent = rejeu.SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0).learn(30)
     env.close()
+    record_video(
+        agent, tmp_path / "after.mp4", episodes=1, max_steps=5
+    )  # in an environment that records nothing itself
     assert {path.name for path in (tmp_path / "videos").iterdir()} == {
         "rl-video-episode-0.mp4",
         "rl-video-episode-2.mp4",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import html
 import os
 import re
@@ -30,6 +31,8 @@ DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
 PLEASANT_FPS = {"parking-v0": 15.0}
 """Environments whose own figure is too slow to watch: 5 decisions a second, declared as 10 frames per second."""
+RECORDER = "gymnasium.wrappers.rendering:RecordVideo"
+"""Entry point of the wrapper that records training episodes."""
 HOLD_SECONDS = 0.5
 """How long the last frame of an episode stays before the next episode begins, so that its outcome can be seen."""
 
@@ -127,7 +130,7 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
             "env=, made with render_mode='rgb_array'"
         )
     try:
-        return _make_rendering(vector.env_id if spec is None else spec)
+        return _make_rendering(vector.env_id if spec is None else _without_recorder(spec))
     except ValueError as error:
         if "RecordConstructorArgs" not in str(error):
             raise
@@ -135,6 +138,12 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
             f"the wrappers of the agent's own environment {vector.env_id} cannot be made a second time ({error}); give "
             "env=, made with render_mode='rgb_array' and wrapped alike"
         ) from None
+
+
+def _without_recorder(spec: gym.envs.registration.EnvSpec) -> gym.envs.registration.EnvSpec:
+    """Returns a spec without ``RecordVideo``, which would write its own videos again, over those of the first environment."""
+    wrappers = tuple(one for one in spec.additional_wrappers if one.entry_point != RECORDER)
+    return dataclasses.replace(spec, additional_wrappers=wrappers)
 
 
 def _make_rendering(source: str | gym.envs.registration.EnvSpec) -> gym.Env:
