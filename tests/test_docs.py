@@ -1,0 +1,162 @@
+"""The examples of README and docs run as they are written, page by page, each page's blocks in one namespace.
+
+Only their length is cut: ``learn`` takes at most ``STEPS`` steps or ``EPISODES`` episodes, an evaluation plays two episodes,
+and a window is closed after a few turns. What a page takes from the reader, it gets from ``PREPARATIONS``.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+import warnings
+from functools import wraps
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import pytest
+
+import rejeu
+from rejeu import cli
+from rejeu.agents import Agent
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+STEPS, EPISODES = 64, 25
+"""Restoring the best weights takes 20 finished episodes."""
+TURNS = 5
+"""After which a window is closed."""
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    language: str
+    line: int
+    """Where its text begins."""
+    text: str
+
+
+def blocks(page):
+    """Returns a page's fenced blocks, in order."""
+    found, opened = [], None
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+        fence = re.fullmatch(r"\s*```(\w*)", line)
+        if fence and opened is None:
+            opened = Block(fence[1], number + 1, "")
+        elif fence:
+            found.append(opened)
+            opened = None
+        elif opened is not None:
+            opened = opened._replace(text=f"{opened.text}{line}\n")
+    assert opened is None, f"{page}: a block of line {opened.line} has no end"
+    return found
+
+
+def commands(page):
+    """Returns the arguments of each ``rejeu`` command in a page's blocks."""
+    texts = [block.text for block in blocks(page) if block.language in ("", "bash", "console")]
+    lines = [line.removeprefix("$ ") for text in texts for line in text.replace("\\\n", " ").splitlines()]
+    parts = [part.strip() for line in lines for part in line.split("&&")]
+    return [shlex.split(part, comments=True)[1:] for part in parts if part.startswith("rejeu ")]
+
+
+PYTHON_PAGES = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+COMMANDS = [(page, arguments) for page in PAGES for arguments in commands(page)]
+
+
+def name(value):
+    return str(value.relative_to(ROOT)) if isinstance(value, Path) else " ".join(value)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Cuts the length of everything that an example does."""
+    learn, evaluate = Agent.learn, Agent.evaluate
+
+    @wraps(learn)
+    def learn_shortly(self, total_timesteps=None, *args, episodes=None, minutes=None, **settings):
+        if minutes is not None or total_timesteps is not None:
+            total_timesteps = min(total_timesteps or STEPS, STEPS)
+        episodes = None if episodes is None else min(episodes, EPISODES)
+        return learn(self, total_timesteps, *args, episodes=episodes, **settings)
+
+    @wraps(evaluate)
+    def evaluate_shortly(self, episodes=None, *args, minutes=None, **settings):
+        return evaluate(self, 2, *args, **settings)
+
+    monkeypatch.setattr(Agent, "learn", learn_shortly)
+    monkeypatch.setattr(Agent, "evaluate", evaluate_shortly)
+
+
+def play_a_recording():
+    """Does what the page on playing says before it opens a recording, and trains the agent that it shows."""
+    from tests.playing import down, perform
+
+    def script(window, game):
+        down("d")
+        yield from range(400)
+
+    assert (
+        perform(script, cli.main, ["play", "CartPole-v1", "--record", "played", "--episodes", "1", "--seed", "0"]) == 0
+    )
+    kwargs = {"replay_buffer_class": rejeu.HerReplayBuffer, "policy_kwargs": {"net_arch": [8]}}
+    rejeu.SAC("MultiInputPolicy", "parking-v0", seed=0, **kwargs).save("parking")
+
+
+def import_box2d():
+    """Imports Box2D without warnings as errors, which crash it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pytest.importorskip("Box2D")
+
+
+PREPARATIONS = {"docs/play.md": play_a_recording, "docs/networks.md": import_box2d}
+
+
+@pytest.fixture
+def windows_close(monkeypatch):
+    """Closes each window after some turns."""
+    pygame = pytest.importorskip("pygame")
+    from rejeu import play as package
+    from rejeu.play.game import Pace
+
+    real, count = package.turn, [0]
+
+    def turn(window, game):
+        count[0] += 1
+        if count[0] % TURNS == 0:
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+        real(window, game)
+
+    monkeypatch.setattr(package, "turn", turn)
+    monkeypatch.setattr(Pace, "wait", lambda self: None)
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=name)
+def test_the_examples_of_a_page_run(page, short, request, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if prepare := PREPARATIONS.get(page.relative_to(ROOT).as_posix()):
+        prepare()
+        request.getfixturevalue("windows_close")
+    module = ModuleType("example")  # where classes and functions of the page are found again
+    monkeypatch.setitem(sys.modules, "example", module)
+    for block in blocks(page):
+        if block.language == "python":
+            lines = "\n" * (block.line - 1)
+            exec(compile(lines + block.text, str(page), "exec"), module.__dict__)
+
+
+@pytest.mark.parametrize(("page", "arguments"), COMMANDS, ids=name)
+def test_the_commands_of_a_page_are_understood(page, arguments, monkeypatch, capsys):
+    given = []
+    quiet = {command: (kind, lambda known: given.append(known) or 0) for command, (kind, _) in cli.COMMANDS.items()}
+    monkeypatch.setattr(cli, "COMMANDS", quiet)
+    assert cli.main(arguments) == 0, capsys.readouterr().err
+    assert len(given) == 1
+
+
+def test_blocks_are_found_in_the_pages():
+    assert sum(block.language == "python" for page in PAGES for block in blocks(page)) > 20
+    assert len(COMMANDS) > 10
