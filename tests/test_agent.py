@@ -8,6 +8,7 @@ import pytest
 
 import rejeu
 from rejeu import callbacks
+from rejeu.agents import files
 from rejeu.envs.vector import InProcess
 from rejeu.errors import CheckpointError
 from tests.environments import Counter, Reach, Sampled
@@ -610,3 +611,52 @@ def test_action_noise_is_added_and_clipped():
 
 def test_the_representation_names_environment_and_progress(agent):
     assert repr(agent) == "<rejeu.SAC on Counter, 20 steps, 12 updates>"
+
+
+def test_predict_takes_lists_of_numbers(agent):
+    one = [0.5, -0.5, 0.25]
+    expected, _ = agent.predict(np.array(one, np.float32), deterministic=True)
+    assert np.array_equal(agent.predict(one, deterministic=True)[0], expected)
+    assert np.array_equal(agent.predict([one, one], deterministic=True)[0], np.stack([expected] * 2))
+    with pytest.raises(ValueError, match=r"has shape \(2,\), expected \(3,\)"):
+        agent.predict([0.0, 0.0])
+    with pytest.raises(ValueError, match="has the structure list, expected Box"):
+        agent.predict([[0.0], [0.0, 1.0]])
+
+
+def test_a_loaded_agent_evaluates_where_it_was_trained(tmp_path):
+    """Spaces of three dimensions show that the keyword argument was kept: the usual ball has two."""
+    env = rejeu.make_vector("rejeu/Ball-v0", 2, "gymnasium", seed=0, dimension=3)
+    small_sac(env).save(tmp_path / "best")
+    agent = rejeu.load(tmp_path)
+    assert agent.env is None
+    assert agent.observation_space.shape == (3,)
+    assert len(agent.evaluate(2, seed=0).returns) == 2
+    agent.save(tmp_path / "again")
+    assert len(rejeu.load(tmp_path / "again").evaluate(1, seed=0).returns) == 1
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        None,
+        3,
+        {"env_id": "evil:Pendulum-v1", "env_kwargs": {}},
+        {"env_id": "Pendulum-v1", "env_kwargs": {"g": "evil:x"}},
+        {"env_id": "Pendulum-v1", "env_kwargs": {"g": 1e9}},
+        {"env_id": "Pendulum-v1"},
+    ],
+)
+def test_a_file_names_no_environment_that_is_imported(said):
+    assert files.trained_on({"made_from": said}) is None
+
+
+def test_an_agent_of_an_environment_that_was_given_has_none_after_loading(tmp_path):
+    path = small_sac(gym.make("Pendulum-v1")).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match="has no environment; give one"):
+        rejeu.load(path).evaluate(1)
+
+
+def test_a_folder_without_a_model_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is a folder without a model"):
+        rejeu.load(tmp_path)

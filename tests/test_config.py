@@ -15,6 +15,19 @@ from rejeu.replay.hindsight import HindsightConfig
 from rejeu.schedules import Linear
 
 
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("lr", "the step size is called learning_rate"),
+        ("use_sde", r"is for PPO and A2C"),
+        ("features_extractor_class", r"policy_kwargs=dict\(torso"),
+    ],
+)
+def test_a_setting_of_another_name_elsewhere_is_explained(name, hint):
+    with pytest.raises(TypeError, match=f"SAC has no setting '{name}'; .*{hint}"):
+        rejeu.SAC("MlpPolicy", "Pendulum-v1", **{name: 1})
+
+
 def test_the_defaults_are_those_of_stable_baselines3():
     """The signature of ``stable_baselines3.SAC.__init__`` in version 2.9.2, where we have the parameter."""
     theirs = {
@@ -133,7 +146,7 @@ def test_an_impossible_value_is_named_with_what_is_possible(settings, words):
             "no setting 'n_sampled_goals'; did you mean n_sampled_goal",
         ),
         ({"learning_rate": lambda progress: 1e-3}, "learning_rate=.*a function cannot be saved with the model"),
-        ({"action_noise": 0.1}, "action_noise=0.1 must be None or one of NormalActionNoise"),
+        ({"action_noise": [0.1]}, r"action_noise=\[0.1\] must be None, a standard deviation .* NormalActionNoise"),
     ],
 )
 def test_a_nested_mistake_is_named_with_its_place(settings, words):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from gymnasium import spaces
 
 import rejeu
+from rejeu import config as configs
 from rejeu.core import Algorithm, Clock
 from rejeu.exploration import explorer
 from rejeu.exploration.noise import (
@@ -18,6 +21,7 @@ from rejeu.exploration.noise import (
     barrier,
     barrier_slope,
     check_fits,
+    for_actions,
     parse,
     to_json,
 )
@@ -338,3 +342,53 @@ def test_parameter_noise_of_dqn_is_not_predicted_with():
     )
     obs = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
     np.testing.assert_array_equal(agent.predict(obs)[0], agent.predict(obs, deterministic=True)[0])
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (0.1, NormalActionNoise([0.0, 0.0], [0.1, 0.1])),
+        (1, NormalActionNoise([0.0, 0.0], [1.0, 1.0])),
+        ("normal(0.3)", NormalActionNoise([0.0, 0.0], [0.3, 0.3])),
+        ("OU(0.2)", OrnsteinUhlenbeckActionNoise([0.0, 0.0], [0.2, 0.2])),
+        ("ou(0.2, theta=0.3, dt = 1)", OrnsteinUhlenbeckActionNoise([0.0, 0.0], [0.2, 0.2], theta=0.3, dt=1.0)),
+        ("parameter(0.4)", ParameterNoise(0.4)),
+    ],
+)
+def test_noise_may_be_given_as_a_number_or_a_text(given, expected):
+    """Pendulum has one action, so the two dimensions show that the noise is fitted to the actions."""
+    config = rejeu.TD3.algorithm.Config(action_noise=given)
+    assert for_actions(config.action_noise, spaces.Box(-1, 1, (2,))) == expected
+    assert rejeu.TD3.algorithm.Config(**configs.to_json(config)) == config  # as a file has it
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("ou", "must be None, a standard deviation"),
+        ("uniform(1)", "must be one of normal"),
+        ("ou(x)", "'x' is no number"),
+        ("ou(0.2, 0.3)", "has no setting '0.3'"),
+        ("ou(0.2, omega=1)", "has no setting 'omega=1'; ou has sigma, theta"),
+        (-0.1, "must not be negative"),
+        (True, "must be None"),
+        (float("nan"), "must be finite"),
+    ],
+)
+def test_noise_that_is_written_wrongly_is_refused(given, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        rejeu.DDPG.algorithm.Config(action_noise=given)
+
+
+@pytest.mark.parametrize("agent", [rejeu.DDPG, rejeu.TD3])
+def test_a_deterministic_policy_without_noise_is_warned_of_once(agent):
+    small = {"policy_kwargs": {"net_arch": [4]}, "batch_size": 4, "learning_starts": 5, "buffer_size": 100, "seed": 0}
+    without = agent("MlpPolicy", "Pendulum-v1", **small)
+    with pytest.warns(UserWarning, match=f"{agent.__name__} trains without exploration noise") as seen:
+        without.learn(2)
+    assert len(seen) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        without.learn(2, reset_num_timesteps=False)
+        for noise in (0.1, ParameterNoise()):
+            agent("MlpPolicy", "Pendulum-v1", action_noise=noise, **small).learn(1)

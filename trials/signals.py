@@ -29,8 +29,21 @@ from typing import Any
 
 RESULT = Path(__file__).parent / "results" / "signals.json"
 SETTINGS = ["policy_kwargs.net_arch=[32,32]", "batch_size=32", "buffer_size=5000", "learning_starts=50"]
-TRAIN = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "3000", "--seed", "0", "--evaluate-every", "1000"]
-TRAIN += ["--evaluate-episodes", "5", "--checkpoint-minutes", "0.01"]
+TRAIN = [
+    "train",
+    "rejeu/Ball-v0",
+    "--algo",
+    "SAC",
+    "--steps",
+    "3000",
+    "--envs",
+    "1",
+    "--seed",
+    "0",
+    "--evaluate-every",
+    "1000",
+]
+TRAIN += ["--evaluate-every", "1000", "--evaluate-episodes", "5", "--checkpoint-minutes", "0.01"]
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 PHASES = ("before rejeu", "imports and compiling", "training", "evaluation, curve and video")
 

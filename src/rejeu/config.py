@@ -56,8 +56,9 @@ class OffPolicyConfig:
     environments together, whatever their number."""
     gradient_steps: int = 1
     """Gradient steps each time; -1 means as many as environment steps were taken since the last time."""
-    action_noise: action_noises.Noise | None = None
-    """Noise added to the actions of the training policy, such as ``NormalActionNoise(mean, sigma)``. None for none."""
+    action_noise: action_noises.Noise | float | str | None = None
+    """Noise added to the actions of the training policy: a standard deviation for actions in [-1, 1] such as 0.1,
+    ``"ou(0.2)"``, or an object such as ``NormalActionNoise(mean, sigma)``. None for none."""
     replay_buffer_class: str = "ReplayBuffer"
     """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not."""
     replay_buffer_kwargs: HindsightConfig | None = None
@@ -231,8 +232,25 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
     return build(kind, merged)
 
 
+ELSEWHERE = {
+    "lr": "the step size is called learning_rate",
+    "hidden_sizes": "the widths of the layers are policy_kwargs=dict(net_arch=[64, 64])",
+    "net_arch": "it is in policy_kwargs: policy_kwargs=dict(net_arch=[64, 64]), or --set policy_kwargs.net_arch=[64,64]",
+    "use_sde": "state-dependent exploration (use_sde) is for PPO and A2C with continuous actions",
+    "features_extractor_class": "networks of your own are given as policy_kwargs=dict(torso=...)",
+    "features_extractor_kwargs": "networks of your own are given as policy_kwargs=dict(torso=...)",
+    "optimizer_class": "the optimizer is Adam; its step size is learning_rate",
+    "optimize_memory_usage": "observations are stored once anyway",
+    "n_envs": "give make_vector(id, n_envs=...) as env, or --envs",
+    "total_timesteps": "it is an argument of learn(), or --steps",
+}
+"""Where to find what goes by another name elsewhere; only asked for names that are unknown."""
+
+
 def unknown_name(key: str, names: Iterable[str], owner: str) -> str:
     """Returns the sentence for a misspelt name, with the nearest known one."""
+    if key in ELSEWHERE:
+        return f"{owner} has no setting {key!r}; {ELSEWHERE[key]}"
     near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
     return f"{owner} has no setting {key!r}; {hint}"

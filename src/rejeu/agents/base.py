@@ -147,6 +147,8 @@ class Agent(ABC):
         self._n_predictions = 0
         self._memory_form: Any = None
         """The form of what the policy remembers of one episode, once somebody has given it."""
+        self._trained_on: tuple[str, Mapping[str, Any]] | None = None
+        """Id and keyword arguments of the environments that a loaded agent was trained on, where its file says."""
         self._own_env = False
         """Whether the environment was given by its id."""
         compilation.enable_cache()
@@ -506,14 +508,16 @@ class Agent(ABC):
         """Returns the agent of a model file. Runs nothing that the file holds; it supplies numbers only.
 
         Args:
-            path: as given to :meth:`save`.
-            env: where it goes on learning; None for an agent that only predicts.
+            path: as given to :meth:`save`, or a run folder, whose best model is taken.
+            env: where it continues to learn; None for an agent that only predicts. Such an agent still evaluates in
+                environments like those that it was trained on, where they were made from a registered id.
             changes: constructor arguments or hyper-parameters to set otherwise than they were saved.
 
         Raises:
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged, of another algorithm, environment, schema or shape; it says which.
         """
+        path = files.find(path)
         header, arrays = checkpoint.read(path, "agent")
         agent = files.load(
             cls,

@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import predicting
 from rejeu.config import number, whole
 from rejeu.envs.auto_reset import identities
+from rejeu.envs.envpool import envpool_knows
+from rejeu.envs.registry import maker, register
 from rejeu.envs.vec_normalize import unwrap_vec_normalize
 from rejeu.envs.vector import VectorEnv
 from rejeu.evaluation import Evaluation, evaluate
@@ -41,8 +44,6 @@ def play(
     """
     threshold = agent.success_threshold if success_threshold is None else success_threshold
     run = agent._run
-    if env is None and run.env is None:
-        raise ValueError("this agent has no environment; give one: evaluate(env=...)")
     if episodes is None and minutes is None:
         episodes = USUAL_EPISODES
     episodes = None if episodes is None else whole("episodes", episodes, least=1)
@@ -51,6 +52,9 @@ def play(
     made_here = isinstance(env, str) or callable(env)
     if env is not None:
         vector = agent._vector(env, n_envs if isinstance(env, str) else 1, seed=seed)
+    elif run.env is None:
+        vector = agent._vector(trained_on(agent), n_envs, seed=seed)
+        made_here = True
     elif agent._own_env:
         vector = agent._vector(run.env.env_id, n_envs, run.env.backend, seed)
         made_here = True
@@ -65,6 +69,23 @@ def play(
     finally:
         if made_here:
             vector.close()
+
+
+def trained_on(agent: Agent) -> str | Callable[[], gym.Env]:
+    """Returns what a loaded agent was trained on, as ``make_vector`` takes it.
+
+    Raises:
+        ValueError: if its file does not say, or if that is not registered here.
+    """
+    if agent._trained_on is None:
+        raise ValueError("this agent has no environment; give one: evaluate(env=...)")
+    env_id, env_kwargs = agent._trained_on
+    if not register(env_id) and not envpool_knows(env_id):
+        raise ValueError(
+            f"this agent was trained on {env_id}, which is not registered here; import the module that registers it, or give "
+            "an environment: evaluate(env=...)"
+        )
+    return maker(env_id, **env_kwargs) if env_kwargs else env_id
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import numpy as np
 
 from rejeu import checkpoint, compilation, config as configs, spaces
 from rejeu.agents import loading
+from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ def header(agent: Agent) -> dict[str, Any]:
         "policy": agent.policy,
         "observation_space": spaces.describe(agent.observation_space),
         "action_space": spaces.describe(agent.action_space),
-        "env_id": run.env.env_id if run.env is not None else None,
+        "env_id": run.env.env_id if run.env is not None else agent._trained_on and agent._trained_on[0],
+        "made_from": made_from(agent),
         "seed": agent.seed,
         "stats_window_size": agent.stats_window_size,
         "success_threshold": agent.success_threshold,
@@ -58,6 +60,39 @@ def header(agent: Agent) -> dict[str, Any]:
         },
         "rng": run.rng.bit_generator.state["state"],
     }
+
+
+def made_from(agent: Agent) -> dict[str, Any] | None:
+    """Returns id and keyword arguments of an agent's environments for a header, None where a file may not hold them."""
+    source = agent._trained_on if agent._run.env is None else agent._run.env.made_from
+    if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
+        return None
+    return {"env_id": source[0], "env_kwargs": dict(source[1])}
+
+
+def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+    """Returns what :func:`made_from` wrote, None where there is none or where it is more than a file may say."""
+    said = header.get("made_from")
+    if not isinstance(said, dict) or not is_plain_id(said.get("env_id")) or not are_plain(said.get("env_kwargs")):
+        return None
+    return said["env_id"], said["env_kwargs"]
+
+
+def find(path: str | Path) -> str | Path:
+    """Returns the model of a run folder, the best one if there is one, or the path itself if it is no folder.
+
+    Raises:
+        FileNotFoundError: if a folder holds no model.
+    """
+    folder = Path(path)
+    if not folder.is_dir() or (folder.name and checkpoint.resolve(path).is_file()):
+        return path
+    for name in ("best", "agent"):
+        if (folder / f"{name}.safetensors").is_file():
+            return folder / f"{name}.safetensors"
+    raise FileNotFoundError(
+        f"{path} is a folder without a model; a run folder holds best.safetensors or agent.safetensors"
+    )
 
 
 def load(
@@ -105,6 +140,7 @@ def load(
     except loading.WRONG as error:
         raise CheckpointError(f"{path}: {loading.brief(error)}") from None
     state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
+    agent._trained_on = trained_on(header)
     vector = make_env(agent)
     if vector is not None:
         agent._check_spaces(vector, "the given environment")

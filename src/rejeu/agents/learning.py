@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 
 from rejeu import config as configs, finite
 from rejeu.agents import resuming, statistics
@@ -25,6 +27,10 @@ if TYPE_CHECKING:
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
+
+
+DETERMINISTIC = ("DDPG", "TD3")
+"""Algorithms whose policy for continuous actions does not explore by itself."""
 
 
 class Company(NamedTuple):
@@ -119,6 +125,7 @@ def carry_out(
         sinks: see there.
         arguments: of ``learn``, that callbacks with hooks are told.
     """
+    warn_without_noise(agent)
     hooks, callbacks = told_apart(callback)
     savers = [one for one in callbacks if isinstance(one, Checkpoint)]
     callbacks = [one for one in callbacks if not isinstance(one, Checkpoint)]
@@ -163,6 +170,19 @@ def carry_out(
         for saver in savers:
             saver.attempt(agent)
         agent.failed_writes.retry()
+
+
+def warn_without_noise(agent: Agent) -> None:
+    """Warns, at the beginning of a run, if its policy is deterministic and nothing makes it try other actions."""
+    deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
+    if deterministic and agent._noise() is None and agent._run.step == 0:
+        warnings.warn(
+            f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
+            f"learning_starts={agent.config.learning_starts} it tries nothing new; set action_noise=0.1 (--set "
+            "action_noise=0.1), 'ou(0.2)' or ParameterNoise()",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def open_outputs(

@@ -17,7 +17,7 @@ from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.config import OffPolicyConfig
 from rejeu.envs.vector import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
-from rejeu.exploration.noise import Noise
+from rejeu.exploration.noise import Noise, for_actions
 from rejeu.loops.host import Progress
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer, counters
@@ -106,7 +106,7 @@ class OffPolicyAgent(Agent):
         return obs
 
     def _noise(self) -> Noise | None:
-        return self.config.action_noise
+        return for_actions(self.config.action_noise, self.action_space)
 
     def _batch_size(self, n_envs: int) -> int:
         return self.config.batch_size

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -29,7 +29,7 @@ def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tupl
     """Returns observations as a batch of arrays of the right types, and whether a single one was given.
 
     Args:
-        observation: one of ``space``, or several with a leading axis.
+        observation: one of ``space``, or several with a leading axis; arrays, or lists of numbers.
         space: of observations.
         leaves: of ``space``.
 
@@ -38,12 +38,13 @@ def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tupl
     """
     expected = spaces.structure(space)
     try:
-        parts, tree = jax.tree.flatten(spaces.plain(space, observation))
-    except (KeyError, IndexError, TypeError, ValueError):
-        parts, tree = jax.tree.flatten(observation)
-    if tree != expected:
-        raise ValueError(f"the observation has the structure {tree}, expected {expected} of {space}")
-    arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(parts, leaves, strict=True)]
+        nested = spaces.plain(space, observation)
+        arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(expected.flatten_up_to(nested), leaves, strict=True)]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"the observation has the structure {described(observation)}, expected {space}, or a batch of it: "
+            f"{' '.join(str(error).split())[:200]}"
+        ) from None
     single = arrays[0].ndim == len(leaves[0].shape)
     if not single and len({array.shape[:1] for array in arrays}) > 1:
         raise ValueError(
@@ -53,7 +54,20 @@ def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tupl
         if (array.shape if single else array.shape[1:]) != leaf.shape:
             where = f" of {leaf.path!r}" if leaf.path else ""
             raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
-    return jax.tree.unflatten(tree, [array[None] if single else array for array in arrays]), single
+    return jax.tree.unflatten(expected, [array[None] if single else array for array in arrays]), single
+
+
+def described(observation: Any) -> str:
+    """Returns the structure of what was given as an observation, in words.
+
+    >>> described({"goal": [0.0], "place": None}), described((1, 2))
+    ('dict(goal: list, place: NoneType)', 'tuple(int, int)')
+    """
+    if isinstance(observation, Mapping):
+        return f"dict({', '.join(f'{key}: {type(part).__name__}' for key, part in observation.items())})"
+    if isinstance(observation, tuple):
+        return f"tuple({', '.join(type(part).__name__ for part in observation)})"
+    return type(observation).__name__
 
 
 def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:

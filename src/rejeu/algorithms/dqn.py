@@ -348,7 +348,7 @@ def check_steps(config: Any) -> None:
     Raises:
         ValueError: if one is out of its range, or there is noise to be added to actions, which are indices here.
     """
-    if isinstance(config.action_noise, ActionNoise):
+    if isinstance(config.action_noise, ActionNoise | str):
         raise ValueError(
             f"action_noise={config.action_noise} has no meaning for Discrete actions; explore by exploration_final_eps, "
             "or by action_noise=ParameterNoise()"

@@ -7,8 +7,6 @@ words. Everything else the user must type again, and the error says what.
 
 from __future__ import annotations
 
-import math
-import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -20,17 +18,13 @@ from tyro.conf import UseAppendAction, arg
 
 from rejeu.cli import settings
 from rejeu.cli.importing import find_id, find_wrapper, imports
+from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
     from rejeu.envs.vector import VectorEnv
-
-PLAIN_WORD = re.compile(r"[\w-]{0,60}")
-"""Texts that are neither a path nor an id of anything to import."""
-LARGEST = 1e6
-"""Largest number that a file may hand to an environment: larger ones could ask for any amount of memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +111,7 @@ class Environment:
         >>> Environment("Walk-v0", "my_env:Walk-v0", {"g": 9.8}, (), ()).options()
         ' --env my_env:Walk-v0 --env-kwargs g=9.8'
         """
-        recorded = not imports(self.typed) and not self.wrapper_names and all(map(is_plain, self.kwargs.values()))
+        recorded = not imports(self.typed) and not self.wrapper_names and are_plain(dict(self.kwargs))
         return "" if recorded else options(self.typed, self.kwargs, self.wrapper_names)
 
     def __str__(self) -> str:
@@ -147,13 +141,6 @@ def options(typed: str, kwargs: Mapping[str, Any], wrapper_names: Iterable[str])
         words += ["--env-kwargs", *(f"{key}={settings.written(value)}" for key, value in kwargs.items())]
     words += chain.from_iterable(("--wrapper", name) for name in wrapper_names)
     return "".join(f" {shlex.quote(word)}" for word in words)
-
-
-def is_plain(value: Any) -> bool:
-    """Returns whether a keyword argument may come from a file: a truth value, a number of moderate size or a word."""
-    if isinstance(value, str):
-        return PLAIN_WORD.fullmatch(value) is not None
-    return isinstance(value, bool | int | float) and math.isfinite(value) and abs(value) <= LARGEST
 
 
 def named(env: str, given: EnvironmentOptions) -> Environment:
@@ -192,7 +179,7 @@ def recorded(
     """
     if given.env is not None:
         return named(given.env, given)
-    if not isinstance(env_id, str) or imports(env_id):
+    if not isinstance(env_id, str) or not is_plain_id(env_id):
         raise CheckpointError(
             f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "
             "--env ID"
@@ -200,12 +187,7 @@ def recorded(
     own = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
     kept = {key: value for key, value in kwargs.items() if key not in own}
     wrapper_names = tuple(given.wrapper or wrapper_names)
-    if (
-        imports(env_argument or env_id)
-        or (wrapper_names and not given.wrapper)
-        or not all(map(is_plain, kept.values()))
-        or not all(key.isidentifier() and len(key) <= 60 for key in kept)
-    ):
+    if imports(env_argument or env_id) or (wrapper_names and not given.wrapper) or not are_plain(kept):
         again = options(env_argument or env_id, {**kept, **own}, wrapper_names)
         raise CheckpointError(
             f"{run} was trained on an environment that is imported or made with more than numbers, which no file may ask "

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-PLAIN_ID = re.compile(r"[\w./-]{1,200}")
-"""Ids that are looked up and import nothing."""
+from rejeu.envs.registry import is_plain_id
 
 
 def imports(typed: str) -> bool:
     """Returns whether naming an environment like this imports code."""
-    return PLAIN_ID.fullmatch(typed) is None or typed.endswith(".py")
+    return not is_plain_id(typed) or typed.endswith(".py")
 
 
 def find_id(name: str) -> str:

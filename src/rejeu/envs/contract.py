@@ -79,6 +79,8 @@ class VectorEnv(ABC):
     """Why ``"auto"`` could not measure a backend."""
     env_id: str
     """The id they are registered under, or the class name of what was given."""
+    made_from: tuple[str, Mapping[str, Any]] | None = None
+    """The id and the keyword arguments that :func:`make_vector` made these of; None for what was given otherwise."""
     max_episode_steps: int | None = None
     """The time limit, where it is known."""
     reward_threshold: float | None = None

@@ -125,6 +125,7 @@ def make_masked(
             f"the masks of {type(env).__name__} cannot be reached; give the id, the environment, or a function that makes "
             "one, or rejeu.make_vector(function, n_envs, 'gymnasium')"
         )
+    made_from: tuple[str, dict[str, Any]] | None = (env, {}) if isinstance(env, str) else None
     if isinstance(env, str):
         env = maker(env)
     if isinstance(env, gym.Env):
@@ -135,4 +136,6 @@ def make_masked(
     vector = make_vector(
         MaskedMaker(env), n_envs, chosen, seed, worker_timeout=worker_timeout, restart_workers=restart_workers
     )
-    return MaskedVector(vector)
+    masked = MaskedVector(vector)
+    masked.made_from = made_from
+    return masked

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,6 +15,15 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu.errors import MissingExtra
+
+PLAIN_ID = re.compile(r"[\w./-]{1,200}")
+"""Ids that are looked up; one with a colon makes Gymnasium import a module."""
+PLAIN_WORD = re.compile(r"[\w-]{0,60}")
+"""Texts that are neither a path nor an id of anything to import."""
+LARGEST = 1e6
+"""Largest number that a file may hand to an environment: larger ones could ask for any amount of memory."""
+MOST_KWARGS = 100
+"""Most keyword arguments of an environment that are taken from a file."""
 
 
 class Provider(NamedTuple):
@@ -56,6 +67,33 @@ def register(env_id: str) -> bool:
         if source.module == "gymnasium_robotics":
             gym.register_envs(module)
     return env_id in gym.registry or ":" in env_id
+
+
+def is_plain_id(env_id: object) -> bool:
+    """Returns whether this is an id that imports nothing, which a file may name."""
+    return isinstance(env_id, str) and PLAIN_ID.fullmatch(env_id) is not None
+
+
+def are_plain(env_kwargs: object) -> bool:
+    """Returns whether these are keyword arguments that a file may hand to an environment.
+
+    Truth values, words, and numbers up to a million: no paths, and nothing to import.
+
+    >>> are_plain({"sigma": 2.0, "map_name": "8x8"}), are_plain({"xml_file": "/tmp/evil.xml"}), are_plain({"n": 10**9})
+    (True, False, False)
+    """
+    return (
+        isinstance(env_kwargs, dict)
+        and len(env_kwargs) <= MOST_KWARGS
+        and all(isinstance(key, str) and key.isidentifier() and len(key) <= 60 for key in env_kwargs)
+        and all(_is_plain(value) for value in env_kwargs.values())
+    )
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, str):
+        return PLAIN_WORD.fullmatch(value) is not None
+    return isinstance(value, bool | int | float) and math.isfinite(value) and abs(value) <= LARGEST
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:

@@ -115,6 +115,20 @@ def _made(
             f"env must be an id, a Gymnasium environment, a function that makes one or a vector environment, got "
             f"{type(env).__name__}"
         )
+    vector = _of_id(env, n_envs, backend, seed, worker_timeout, restart_workers, env_kwargs)
+    vector.made_from = env, env_kwargs
+    return vector
+
+
+def _of_id(
+    env: str,
+    n_envs: int,
+    backend: Backend,
+    seed: int | None,
+    worker_timeout: float | None,
+    restart_workers: int,
+    env_kwargs: dict[str, Any],
+) -> VectorEnv:
     if backend == "auto":
         choice = measuring.choose(
             lambda backend, n: make_vector(env, n, backend, 0, **env_kwargs),  # type: ignore[arg-type]

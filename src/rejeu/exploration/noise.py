@@ -8,7 +8,9 @@ stay.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, InitVar, asdict, dataclass
@@ -213,21 +215,81 @@ NOISES: dict[str, type[NormalActionNoise] | type[OrnsteinUhlenbeckActionNoise] |
 }
 
 
-def parse(value: Any) -> Noise | None:
-    """Returns noise settings from themselves, from None, or from their JSON form ``{"noise": "normal", ...}``.
+WRITTEN = re.compile(r"([a-z-]+)\s*\(([^()]*)\)")
+"""Noise as a text, such as ``ou(0.2)``."""
+
+
+def parse(value: Any) -> Noise | str | None:
+    """Returns noise settings from themselves, from None, from a number or a text, or from their JSON form.
+
+    A number is the standard deviation of Gaussian noise; a text is ``"normal(0.1)"``, ``"ou(0.2)"``, ``"ou(0.2, theta=0.3)"``
+    or ``"parameter(0.1)"``. How many dimensions the actions have is not known here, so noise on actions stays a text until
+    :func:`for_actions`. The JSON form is ``{"noise": "normal", ...}``.
 
     Raises:
         TypeError: for anything else.
+        ValueError: for settings that are out of range.
+
+    >>> parse(0.1), parse("parameter(0.2)").initial_sigma
+    ('normal(0.1)', 0.2)
     """
     if value is None or isinstance(value, Noise):
         return value
     if isinstance(value, Mapping) and value.get("noise") in NOISES:
         fields = {key: setting for key, setting in value.items() if key != "noise"}
         return NOISES[value["noise"]](**fields)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        value = f"normal({float(value)!r})"
+    if isinstance(value, str) and WRITTEN.fullmatch(value.strip().lower()):
+        text = value.strip().lower()
+        noise = read(text, 1)
+        return noise if isinstance(noise, ParameterNoise) else text
     raise TypeError(
-        f"action_noise={value!r} must be None or one of {', '.join(kind.__name__ for kind in NOISES.values())}, "
-        "such as NormalActionNoise(mean=[0, 0], sigma=[0.1, 0.1])"
+        f"action_noise={value!r} must be None, a standard deviation such as 0.1, a text such as 'ou(0.2)', or one of "
+        f"{', '.join(kind.__name__ for kind in NOISES.values())}, such as NormalActionNoise(mean=[0, 0], sigma=[0.1, 0.1])"
     )
+
+
+def read(text: str, n: int) -> Noise:
+    """Returns what a text stands for, for actions of ``n`` dimensions.
+
+    Raises:
+        TypeError: for an unknown kind or setting.
+        ValueError: for what is no number or out of range.
+
+    >>> read("ou(0.2, theta=0.3)", 2).theta
+    0.3
+    """
+    found = WRITTEN.fullmatch(text)
+    kinds = {**NOISES, "ou": OrnsteinUhlenbeckActionNoise}
+    if found is None or found[1] not in kinds:
+        raise TypeError(f"action_noise={text!r} must be one of {', '.join(f'{name}(0.1)' for name in kinds)}")
+    kind = kinds[found[1]]
+    first = "initial_sigma" if kind is ParameterNoise else "sigma"
+    settings: dict[str, Any] = {} if kind is ParameterNoise else {"mean": [0.0] * n, first: 0.1}
+    known = [field.name for field in dataclasses.fields(kind) if field.name != "mean"]
+    for i, part in enumerate(filter(None, (part.strip() for part in found[2].split(",")))):
+        name, equals, number = part.partition("=")
+        name, number = (name.strip(), number) if equals else (first, name)
+        if name not in known or (not equals and i > 0):
+            raise TypeError(f"action_noise={text!r} has no setting {part!r}; {found[1]} has {', '.join(known)}")
+        try:
+            settings[name] = float(number)
+        except ValueError:
+            raise ValueError(f"action_noise={text!r}: {number.strip()!r} is no number") from None
+        if name == "adaptation_interval":
+            settings[name] = int(settings[name])
+    return kind(**settings)
+
+
+def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -> Noise | None:
+    """Returns noise for these actions: what :func:`parse` left a text gets as many dimensions as they have.
+
+    >>> for_actions("normal(0.1)", spaces.Box(-1, 1, (2,)))
+    NormalActionNoise(mean=(0.0, 0.0), sigma=(0.1, 0.1))
+    """
+    assert not isinstance(noise, float | int)  # parse has made a text of it
+    return read(noise, math.prod(action_space.shape or (1,))) if isinstance(noise, str) else noise
 
 
 def to_json(noise: Noise) -> dict[str, Any]:
