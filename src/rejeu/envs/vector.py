@@ -124,7 +124,7 @@ def _of_id(
     env: str,
     n_envs: int,
     backend: Backend,
-    seed: int | None,
+    seed: Seed,
     worker_timeout: float | None,
     restart_workers: int,
     env_kwargs: dict[str, Any],
