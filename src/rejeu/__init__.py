@@ -21,6 +21,7 @@ from rejeu.evaluation import Evaluation, evaluate_policy
 from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.replay.hindsight import GoalSelectionStrategy, HerReplayBuffer
+from rejeu.replay.memory import ReplayMemory
 from rejeu.replay.uniform import ReplayBuffer
 from rejeu.schedules import Exponential, Linear
 from rejeu.video import record_video, show_videos
@@ -53,6 +54,7 @@ __all__ = [
     "ParameterNoise",
     "RecurrentPPO",
     "ReplayBuffer",
+    "ReplayMemory",
     "TimeLimitTerminates",
     "WorkerError",
     "check_env",

@@ -451,12 +451,15 @@ def is_stack(leaf: Leaf, frame_stack: int | None) -> bool:
     return leaf.dtype == "uint8" and len(leaf.shape) >= 3 and leaf.shape[0] == frame_stack and not is_goal
 
 
-def check_memory(nbytes: int, capacity: int) -> None:
-    """Raises ``MemoryError``, with the numbers, if ``nbytes`` exceed the machine's physical memory."""
+def check_memory(nbytes: int, capacity: int, name: str = "buffer_size") -> None:
+    """Raises ``MemoryError``, with the numbers, if ``nbytes`` exceed the machine's physical memory.
+
+    ``name`` is that of the setting with which the user chose ``capacity``.
+    """
     memory = physical_memory()
     if memory is not None and nbytes > memory:
         fits = int(capacity * 0.5 * memory / nbytes)
         raise MemoryError(
-            f"buffer_size={capacity} takes {nbytes / 2**30:.1f} GiB for this environment and the machine has "
-            f"{memory / 2**30:.1f} GiB; try buffer_size={fits}"
+            f"{name}={capacity} takes {nbytes / 2**30:.1f} GiB for this environment and the machine has "
+            f"{memory / 2**30:.1f} GiB; try {name}={fits}"
         )
