@@ -181,6 +181,13 @@ def test_evaluate_prints_the_result_and_writes_nothing(run, capsys):
     assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == before
 
 
+def test_evaluate_for_minutes_plays_at_least_an_episode_in_each_environment(run, capsys):
+    assert main(["evaluate", str(run), "--minutes", "1e-6", "--backend", "gymnasium"]) == 0
+    assert "16 episodes" in capsys.readouterr().out
+    assert main(["evaluate", str(run), "--minutes", "0"]) == 2
+    assert "--minutes=0.0 must be a finite number, above 0" in capsys.readouterr().err
+
+
 def test_evaluate_with_a_seed_repeats_itself(run, capsys):
     for _ in range(2):
         assert main(["evaluate", str(run), "--episodes", "2", "--seed", "5"]) == 0

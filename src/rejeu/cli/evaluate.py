@@ -19,8 +19,10 @@ class Evaluate(RunOptions):
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of a run, or a .safetensors file."""
-    episodes: Annotated[int, arg(metavar="N")] = 100
-    """How many."""
+    episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """How many; 100, or with --minutes as many as there is time for."""
+    minutes: Annotated[float | None, arg(metavar="X", help_behavior_hint="")] = None
+    """Wall time after which no further episode begins; those under way are played to their end."""
     backend: Annotated[str, arg(metavar="NAME")] = "auto"
     """auto, envpool, gymnasium or gymnasium-async; gymnasium is the environment's own package."""
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -34,16 +36,21 @@ class Evaluate(RunOptions):
 def run(arguments: Evaluate) -> int:
     """Evaluates, prints one line, and returns the exit status."""
     from rejeu import load
-    from rejeu.config import whole
+    from rejeu.config import number, whole
 
-    episodes = whole("--episodes", arguments.episodes, least=1)
+    episodes, minutes = arguments.episodes, arguments.minutes
+    if minutes is not None:
+        number("--minutes", minutes, above=0)
+    if episodes is not None or minutes is None:
+        episodes = whole("--episodes", 100 if episodes is None else episodes, least=1)
     model = run_folder.find_model(arguments.run, arguments.which)
     environment = run_folder.environment_of(model, arguments)
     agent = load(model)
-    env = environment.vector(min(episodes, 16), arguments.backend, arguments.seed)
+    env = environment.vector(16 if episodes is None else min(episodes, 16), arguments.backend, arguments.seed)
     try:
         print(f"{environment} on {env.backend}, {model}", flush=True)
-        print(agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold), flush=True)
+        threshold = arguments.success_threshold
+        print(agent.evaluate(episodes, env=env, success_threshold=threshold, minutes=minutes), flush=True)
     finally:
         env.close()
     return 0
