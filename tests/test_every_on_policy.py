@@ -59,14 +59,15 @@ def test_everything_moves_and_stays_finite(kind):
     assert row["rollout/ep_len_mean"] == 5.0
 
 
-@pytest.mark.parametrize(("n_envs", "total"), [(1, 45), (3, 50)])
+@pytest.mark.parametrize(("n_envs", "total"), [(1, 45), (3, 50), (3, 67)])
 @both_algorithms
 def test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe(kind, n_envs, total):
-    """Of a rollout that is not full only the steps that there are count: 16 a gradient step, each learnt from 4 times."""
+    """16 steps a gradient step, each learned from 4 times; a last rollout of fewer than 16, or of A2C's, has to wait."""
     agent = start(kind, n_envs).learn(total)
     assert agent.num_timesteps == total
     size = agent.config.n_steps * n_envs
-    sizes = [size] * (total // size) + [total % size] * (total % size > 0)
+    rest = total % size
+    sizes = [size] * (total // size) + [rest] * (kind.name == "PPO" and rest >= 16)
     expected = sum(4 * -(-n // 16) for n in sizes) if kind.name == "PPO" else len(sizes)
     assert agent.n_updates == int(agent.state.n_updates) == expected
     assert sum(agent.history["length"]) <= total
@@ -111,13 +112,50 @@ def test_learning_in_parts_of_whole_rollouts_is_learning_at_once(kind, n_envs):
 
 @both_algorithms
 def test_a_run_stopped_within_a_rollout_goes_on_with_it(kind):
-    """A callback's False, unlike the end of the steps asked for, leaves what was collected for later."""
+    """A callback's False leaves what was collected for later, however much it is."""
     size = kind.settings["n_steps"]
     whole, parts = start(kind).learn(3 * size), start(kind)
     parts.learn(3 * size, callback=lambda agent, progress: progress.step < size + 2)
     assert parts.num_timesteps == size + 2
     parts.learn(2 * size - 2, reset_num_timesteps=False)
     assert_same_parameters(whole, parts)
+
+
+@both_algorithms
+def test_a_last_rollout_smaller_than_a_minibatch_waits_for_the_next_learn(kind):
+    size = kind.settings["n_steps"]
+    whole, parts = start(kind).learn(3 * size), start(kind)
+    before = parts.get_parameters()
+    parts.learn(size - 1)
+    assert parts.n_updates == 0
+    for name, array in parts.get_parameters().items():
+        np.testing.assert_array_equal(array, before[name])
+    for n in (1, size, size - 1, 1):
+        parts.learn(n, reset_num_timesteps=False)
+    assert_same_parameters(whole, parts)
+    np.testing.assert_array_equal(whole.history["return"], parts.history["return"])
+
+
+@both_algorithms
+@pytest.mark.parametrize("change", ["set_parameters", "restore_best", "set_env"])
+def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_from(kind, change):
+    """The log-probabilities of its actions are computed later, by the policy that learns from it."""
+    size = kind.settings["n_steps"]
+    agent = start(kind).learn(size)
+    agent.remember_best(1.0)
+    agent.learn(size - 1, reset_num_timesteps=False)
+    assert agent._run.replay.size() == size - 1
+    if change == "set_parameters":
+        agent.set_parameters(agent.get_parameters())
+    elif change == "restore_best":
+        agent.restore_best()
+    else:
+        agent.set_env(wanderers(kind))
+    n_updates = agent.n_updates
+    agent.learn(size - 1, reset_num_timesteps=False)
+    assert (agent.n_updates, agent._run.replay.size()) == (n_updates, size - 1)
+    agent.learn(1, reset_num_timesteps=False)
+    assert agent.n_updates > n_updates
 
 
 @both_algorithms

@@ -192,10 +192,10 @@ def test_worker_options_without_meaning_are_refused_for_masks_too(given, message
 @pytest.mark.parametrize("normalize", [True, {"norm_reward": False}])
 def test_masks_and_normalisation_go_together(normalize):
     env = vector("discrete")
-    agent = small(env, normalize=normalize).learn(400)
+    agent = small(env, normalize=normalize).learn(384)
     statistics = agent.state.statistics
     assert [m.mean.shape for m in statistics.obs] == [(2,)]
-    assert float(statistics.obs[0].n_seen) == 400
+    assert float(statistics.obs[0].n_seen) == 384
     agent.evaluate(20, env=vector("discrete"))
 
 

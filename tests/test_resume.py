@@ -606,3 +606,18 @@ def test_an_environment_that_a_file_names_is_not_imported(tmp_path):
     with pytest.raises(CheckpointError, match="give it again"):
         rejeu.SAC.resume(tmp_path)
     assert "antigravity" not in sys.modules
+
+
+@pytest.mark.parametrize("name", ["PPO", "RecurrentPPO"])
+def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, tmp_path):
+    """Two environments, 16 steps each a rollout: 13 more steps end within a turn, and are fewer than a minibatch."""
+    make_env = vector("rejeu/CartPoleNoVelocity-v0", 2)
+    make = lambda: rejeu.AGENTS[name]("MlpPolicy", make_env(), n_steps=16, batch_size=16, **SMALL)  # noqa: E731
+    with compiled_once():
+        whole = make().learn(45).learn(50, reset_num_timesteps=False)
+        cut_off = make().learn(45, Checkpoint(tmp_path))
+        assert cut_off._run.replay.size() == 13
+        again = rejeu.AGENTS[name].resume(tmp_path, make_env())
+        assert_same(facts(again), facts(cut_off))
+        again.learn(50, reset_num_timesteps=False)
+    assert_same(facts(again), facts(whole))

@@ -408,17 +408,21 @@ def test_a_rollout_says_where_it_began_within_an_episode():
 
 @pytest.mark.parametrize(("n_envs", "total"), [(1, 10), (3, 32), (8, 45), (8, 3)])
 def test_as_many_steps_are_learnt_from_as_are_asked_for(n_envs, total):
-    """Of the last turn only as many environments count as steps remain, the first ones."""
+    """Of the last turn only as many environments count as steps remain, the first ones; the next call continues there."""
     rollouts, agent = recorded(n_envs, total, (5,), "truncated")
-    valid = np.concatenate([r.valid for r in rollouts]).ravel()
-    assert valid.sum() == total == agent.num_timesteps
-    assert valid[:total].all(), "what is missing is at the end"
-    assert len(rollouts) == -(-total // (4 * n_envs)) == agent.n_updates
-    again = agent.learn(2 * n_envs, reset_num_timesteps=False)
-    assert again.num_timesteps == total + 2 * n_envs
-    # Environments whose last step did not count began anew; the others went on.
-    active = n_envs if total % n_envs == 0 else total % n_envs
     turns = -(-total // n_envs)
+    assert len(rollouts) == agent.n_updates == turns // 4
+    assert agent.num_timesteps == total
+    agent.learn((8 - turns % 4) * n_envs, reset_num_timesteps=False)
+    assert len(rollouts) == turns // 4 + 2
+    kept = lambda name: np.concatenate([getattr(r, name) for r in rollouts])  # noqa: E731
+    obs, valid, ended = np.concatenate([r.obs for r in rollouts]), kept("valid"), kept("ended")
+    active = n_envs if total % n_envs == 0 else total % n_envs
+    expected = np.ones_like(valid)
+    expected[turns - 1, active:] = False
+    np.testing.assert_array_equal(valid, expected)
+    # Environments whose last step did not count began again, and their episodes are cut there; the others went on.
     times = [turns % 5] * active + [0] * (n_envs - active)
-    np.testing.assert_array_equal(rollouts[-1].obs[0, :, 1], times)
-    np.testing.assert_array_equal(rollouts[-1].started, [time == 0 for time in times])
+    np.testing.assert_array_equal(obs[turns, :, 1], times)
+    np.testing.assert_array_equal(ended[turns - 1], [time == 0 for time in times])
+    np.testing.assert_array_equal(obs[1:, :, 1] == 0, ended[:-1])

@@ -107,12 +107,18 @@ def test_with_lambda_1_advantages_are_returns_to_go_minus_the_value(ends):
             at += length
 
 
-def test_the_steps_asked_for_are_taken_exactly_and_the_rest_is_learnt_from():
-    env = counters()
-    agent = small(env, n_episodes=1, n_steps=7)
-    seen = rollouts_of(agent, 11)  # 2 + 4 + 7 would be 13; all take 2 steps, two take 2 more, and one is left
+def test_the_steps_asked_for_are_taken_exactly_and_an_incomplete_rollout_waits():
+    agent = small(counters(), n_episodes=1, n_steps=7)
+    assert rollouts_of(agent, 11) == []  # 2 + 4 + 7 would be 13; all take 2 steps, two take 2 more, and one is left
     assert agent.num_timesteps == 11
-    assert [rollout.valid.sum() for _, rollout in seen] == [11]
+    seen = rollouts_of(agent, 2, reset_num_timesteps=False)
+    assert [rollout.valid.sum(axis=0).tolist() for _, rollout in seen] == [[2, 4, 7]]
+    assert agent.history["length"].tolist() == [2, 4, 7]
+
+
+def test_an_incomplete_rollout_of_a_minibatch_is_learnt_from():
+    agent = small(counters(), rejeu.PPO, n_episodes=1, n_steps=7, batch_size=8)
+    assert [rollout.valid.sum() for _, rollout in rollouts_of(agent, 11)] == [11]
 
 
 def test_episodes_that_an_update_cut_off_do_not_run_on_in_the_history():
@@ -125,10 +131,20 @@ def test_episodes_that_an_update_cut_off_do_not_run_on_in_the_history():
     assert second == [(2, 100.0 + 101.0)]
 
 
-def test_a_run_that_stopped_within_an_episode_begins_a_new_one():
+def test_a_run_that_stopped_within_an_episode_goes_on_with_it():
     env = counters(((6,), (6,)))
-    agent = small(env, n_episodes=1, n_steps=6).learn(4).learn(12)
-    assert [(e.length, e.episode_return) for e in agent.history.episodes] == [(6, 615.0)] * 2
+    agent = small(env, n_episodes=1, n_steps=6).learn(4).learn(8)
+    assert [(e.length, e.episode_return) for e in agent.history.episodes] == [(6, 15.0)] * 2
+    assert agent.n_updates == 1
+
+
+def test_a_rollout_of_whole_episodes_begins_again_where_new_episodes_must_begin():
+    env = counters(((6,), (6,)))
+    agent = small(env, n_episodes=1, n_steps=6).learn(4)
+    agent.evaluate(1)  # in the same environments
+    (_, rollout), *_ = rollouts_of(agent, 12)
+    assert rollout.valid.sum(axis=0).tolist() == [6, 6]
+    assert rollout.ended[:, 0].tolist() == [False] * 5 + [True]
 
 
 def test_learning_may_be_measured_in_episodes():

@@ -199,6 +199,10 @@ class Agent(ABC):
         """Prepares the buffer for a new environment of the same number and spaces."""
 
     @abstractmethod
+    def _drop_rollout(self) -> None:
+        """Forgets experience that only the policy may learn from that collected it."""
+
+    @abstractmethod
     def _learn_from(self, step: int) -> int:
         """Returns the step from which on a run that begins at ``step`` takes gradients."""
 
@@ -484,6 +488,7 @@ class Agent(ABC):
             arrays = self.get_parameters() | arrays
         state = checkpoint.arrays_to_tree(self._compiled.shapes, arrays, "set_parameters: the source")
         self._run.state = self._compiled.pack(state)
+        self._drop_rollout()
 
     def save(self, path: str | Path) -> Path:
         """Writes the model to one safetensors file and returns its path; the replay buffer is not part of it.

@@ -63,3 +63,4 @@ def restore(agent: Agent) -> None:
             "ended, and at every evaluation by rejeu.callbacks.Evaluate"
         )
     agent._run.state = agent._compiled.copy(agent.best.state)
+    agent._drop_rollout()

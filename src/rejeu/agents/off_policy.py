@@ -140,6 +140,9 @@ class OffPolicyAgent(Agent):
             return ReplayBuffer(ring, config.gamma, config.n_steps, priorities)
         return HerReplayBuffer(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, priorities)
 
+    def _drop_rollout(self) -> None:
+        """Nothing: learners with a replay buffer use the experience of any policy."""
+
     def _keep_buffer(self, env: VectorEnv) -> None:
         if isinstance(self._run.replay, HerReplayBuffer):
             self._run.replay.goals = self._goals(env)

@@ -95,7 +95,15 @@ class OnPolicyAgent(Agent):
         return RolloutBuffer(n_steps, env.n_envs, obs_leaves, structure, action.shape[1:], action.dtype, config.gamma)
 
     def _keep_buffer(self, env: VectorEnv) -> None:
-        """Nothing is kept: what was collected elsewhere is forgotten when the next rollout begins."""
+        """Forgets the rollout under way, which is of another environment."""
+        self._drop_rollout()
+
+    def _drop_rollout(self) -> None:
+        """Forgets the rollout under way; another begins with new episodes."""
+        run = self._run
+        if run.replay is not None and run.replay.length:
+            run.replay.length = 0
+            run.obs = run.action = None
 
 
 class PPO(OnPolicyAgent):

@@ -95,6 +95,10 @@ class Config(OnPolicyConfig):
         """Returns how many steps of ``n_envs`` environments one gradient is taken on."""
         return min(self.batch_size, self.n_steps * n_envs)
 
+    def learns_from_part(self, n: int, n_envs: int) -> bool:
+        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends: from a minibatch on."""
+        return n >= self.batch_size
+
     def gradient_steps(self, n: int) -> int:
         """Returns how many gradient steps a rollout of ``n`` steps is worth, if nothing stops them early."""
         return self.n_epochs * -(-n // self.batch_size)

@@ -41,7 +41,8 @@ def on_policy(
 ) -> Iterator[Progress]:
     """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
 
-    What a last rollout holds that is not full is learnt from as well.
+    A rollout that is not complete after the last step is learned from if ``config.learns_from_part`` says that it holds
+    enough. Otherwise it stays in the buffer, and the next call adds to it.
 
     Args:
         run: mutated; consistent whenever the generator has yielded. ``run.replay`` is a rollout buffer.
@@ -79,9 +80,11 @@ def on_policy(
         run.step += n_envs if counts is None else int(counts.sum())
         run.seconds["total"] = t2 - began
         episodes = book(run, step, counts, stepped)
+        rollout.cut(run.ended)
         if config.n_episodes is not None:
             run.playing -= run.ended
-        is_done = rollout.full or run.step == last or (config.n_episodes is not None and not run.playing.any())
+        is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
+        is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
         t3 = time.perf_counter()
         last_obs = last_of(run, step)
         run.obs = renewed(run, step, config, is_done)

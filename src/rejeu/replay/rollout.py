@@ -103,9 +103,12 @@ class RolloutBuffer:
         self.running_return[t] = running_return
         self.length += 1
 
-    def cut(self) -> None:
-        """Ends the episodes that run where they stand, without a terminal state: they cannot be gone on with."""
-        self.ended[self.length - 1] = True
+    def cut(self, envs: np.ndarray | bool = True) -> None:
+        """Ends the episodes of ``envs``, ``bool (n_envs,)``, with the newest step: they cannot be continued.
+
+        Nothing is terminal by that: the value of the last observation stands for what would have followed.
+        """
+        self.ended[self.length - 1] |= envs
 
     def rollout(self) -> Rollout:
         """Returns what is kept, padded to all that was reserved; views, so use them before adding."""

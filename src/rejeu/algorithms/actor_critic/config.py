@@ -163,6 +163,13 @@ class OnPolicyConfig:
         """Returns how many gradient steps a rollout of ``n`` steps is worth, if nothing stops them early."""
         return 1
 
+    def learns_from_part(self, n: int, n_envs: int) -> bool:
+        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends.
+
+        Only where no gradient step is then taken on less than a minibatch. Where a rollout is one minibatch it is not.
+        """
+        return False
+
     @property
     def stops_early(self) -> bool:
         """Whether something may stop them; an update then says under ``gradient_steps`` how many it took."""
