@@ -67,7 +67,7 @@ def learning_curve(
     _records(panels[0], x, returns, history.record_rows)
     _line(panels[0], x, history.moving_average("return", window), window)
     _points(panels[0], at, means, [evaluation.return_interval for _, evaluation in evaluations])
-    _fit(panels[0], returns, means)
+    _fit(panels[0], returns, [*means, history.best_return])
     panels[0].set_ylabel("return")
     panels[0].yaxis.set_major_formatter(style.thousands)
     if has_success:
@@ -140,9 +140,9 @@ def _points(panel: Axes, x: np.ndarray, y: list[float], intervals: list[tuple[fl
     panel.plot(x, y, "o", markersize=5, label="evaluation, 95 % interval", clip_on=False, **form)
 
 
-def _fit(panel: Axes, returns: np.ndarray, evaluated: list[float]) -> None:
-    """Fits the height to all but the most extreme half percent of returns on either side, and to all evaluations."""
-    shown = np.concatenate([np.quantile(returns, [0.005, 0.995]) if len(returns) else [], evaluated])
+def _fit(panel: Axes, returns: np.ndarray, further: list[float]) -> None:
+    """Fits the height to all but the lowest half percent of returns, and to what else is to be seen."""
+    shown = np.concatenate([np.quantile(returns, [0.005, 0.995]) if len(returns) else [], further])
     shown = shown[np.isfinite(shown)]
     if len(shown):
         margin = 0.05 * (np.ptp(shown) or 1.0)
