@@ -89,6 +89,14 @@ def test_records_are_marked():
     assert list(zip(marks.get_xdata(), marks.get_ydata(), strict=True)) == [(0, 3.0), (30, 5.0)]
 
 
+def test_the_best_return_is_seen_however_rare_it_is():
+    returns = [0.0] * 500 + [45.0] + [0.0] * 500
+    record = History([Episode(10 * i, 0, value, 10, float("nan"), i) for i, value in enumerate(returns)])
+    low, high = learning_curve(record).axes[0].get_ylim()
+    assert low < 0.0
+    assert 45.0 < high < 50.0
+
+
 def test_evaluations_are_drawn_at_their_steps():
     figure = learning_curve(history(), evaluations=[evaluated(50_000), evaluated(100_000)])
     points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))

@@ -35,7 +35,10 @@ def evaluation(evaluation: Evaluation, path: str | Path | None = None, title: st
     if math.isfinite(low):
         panel.axhspan(low, high, color=style.LINE_COLOR, alpha=0.15, linewidth=0, label="95 % interval")
     panel.axhline(
-        evaluation.mean_return, label=f"mean {style.thousands(round(evaluation.mean_return, 2))}", **style.LINE
+        evaluation.mean_return,
+        label=f"mean {style.thousands(round(evaluation.mean_return, 2))}",
+        zorder=3,
+        **style.LINE,
     )
     for chosen, marker, color, label in (
         (np.isnan(successes), "o", style.DOT_COLOR, "episodes"),
