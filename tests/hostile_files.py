@@ -286,6 +286,12 @@ def bad_texts(content: bytes) -> Iterator[Variant]:
         yield Variant("header text", f"{i}: {text[:20]!r}", put_together(parts, text))
 
 
+LARGE_SPACES = (
+    {"Box": {"low": 0, "high": 1, "shape": [10**9], "dtype": "float32"}},
+    {"Discrete": {"n": 10**12, "start": 0}},
+    {"MultiBinary": {"shape": [10**5, 10**5]}},
+)
+"""Spaces that would exhaust the memory."""
 CODE = (
     "os.system",
     "__import__('os').system('true')",
@@ -467,6 +473,11 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
         return Variant("buffer", name, changed(content, change))
 
     arrays = take_apart(content).arrays
+    for kind in ("observation_space", "action_space"):
+        for i, value in enumerate((None, [], {}, 3, "x", {"Box": {}}, {"Box": None}, {"Text": 3}, *LARGE_SPACES)):
+            yield of(f"{kind} {i}", lambda h, a, k=kind, v=value: h.update({k: v}))
+        yield of(f"{kind} gone", lambda h, a, k=kind: h.pop(k))
+        yield of(f"{kind} of another", lambda h, a, k=kind: h.update({k: {"MultiBinary": {"shape": [7]}}}))
     # Where a full ring begins is for its file to say: with the newest row elsewhere it is another ring, and whole.
     is_full = (arrays["head"] >= arrays["kind"].shape[1]).all()
     for name in ("head", "n_steps"):
@@ -489,6 +500,69 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
     for name in arrays:
         yield of(f"{name} gone", lambda h, a, n=name: a.pop(n))
         yield of(f"{name} shorter", lambda h, a, n=name: a.update({n: a[n][:, :-1] if a[n].ndim > 1 else a[n][:-1]}))
+
+
+def bad_runs(content: bytes) -> Iterator[Variant]:
+    """Yields files of a run, or of its rows, whose header has other values than it should, or none."""
+    parts = take_apart(content)
+    values = (
+        None,
+        True,
+        0,
+        -1,
+        2**62,
+        0.5,
+        "x",
+        "../x",
+        [],
+        ["x"],
+        [None],
+        {},
+        {"dict": {}},
+        {"array": "nothing"},
+        [[[]]],
+    )
+    for name in parts.header:
+        if name not in ("schema", "kind"):
+            yield Variant("run header", f"{name} gone", changed(content, lambda h, a, n=name: h.pop(n)))
+            for value in values:
+                put = lambda h, a, n=name, v=value: h.update({n: v})  # noqa: E731
+                yield Variant("run header", f"{name} {value!r}", changed(content, put))
+    for name in parts.header.get("run", {}).get("dict", {}):
+        yield Variant("run", f"{name} gone", changed(content, lambda h, a, n=name: h["run"]["dict"].pop(n)))
+        for value in (*values, {"array": max(parts.arrays)}, {"scalar": max(parts.arrays)}, {"float": "nan"}):
+            put = lambda h, a, n=name, v=value: h["run"]["dict"].update({n: v})  # noqa: E731
+            yield Variant("run", f"{name} {value!r}", changed(content, put))
+    for name in parts.header.get("rows", []):
+        for value in (f"../{name}", name.upper(), name + "\0", "/dev/zero", f"{name}/{name}"):
+            yield Variant("rows", value, changed(content, lambda h, a, v=value: h.update(rows=[v])))
+        yield Variant("rows", "twice", changed(content, lambda h, a, n=name: h.update(rows=[n, n, *h["rows"]][:-1])))
+
+
+class Sparse(NamedTuple):
+    """The beginning of a file, the rest of which is a hole."""
+
+    name: str
+    content: bytes
+    size: int
+    """Of the whole file, in bytes."""
+
+
+def sparse(content: bytes, size: int = 6 * 2**30) -> Iterator[Sparse]:
+    """Yields files in which one array has some 6 GiB, all of them in a hole: a few KiB on disk."""
+    parts = take_apart(content)
+    rows = {name: array for name, array in parts.arrays.items() if array.ndim}
+    for name in ("a", min(rows), max(rows), max(rows, key=lambda name: rows[name].nbytes)):
+        one = rows.get(name, np.zeros(1, np.float32))
+        others = {key: array for key, array in parts.arrays.items() if key != name}
+        table, begin = table_of({}, others), sum(array.nbytes for array in others.values())
+        shape = [size // max(one[:1].nbytes, 1), *one.shape[1:]]
+        end = begin + math.prod(shape) * one.itemsize
+        sums = {**{key: checksum(array) for key, array in others.items()}, name: 0}
+        table["__metadata__"] = table_of({}, {}, json.dumps({**parts.header, "checksums": sums}))["__metadata__"]
+        table[name] = {"dtype": NAMES[one.dtype.name], "shape": shape, "data_offsets": [begin, end]}
+        start = join(table, b"".join(array.tobytes() for array in others.values()))
+        yield Sparse(name, start, len(start) - begin + end)
 
 
 def counters(arrays: dict) -> dict[str, np.ndarray]:

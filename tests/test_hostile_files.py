@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import time
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import rejeu
-from rejeu import checkpoint
+from rejeu import checkpoint, tensors
 from rejeu.errors import CheckpointError
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
@@ -204,6 +205,65 @@ def test_a_file_larger_than_the_memory_is_refused_before_it_is_read(tmp_path, mo
     monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**31)
     with pytest.raises(CheckpointError, match=r"has 4\.0 GiB and the machine 2\.0 GiB"):
         checkpoint.read(path, "agent")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")
+@pytest.mark.parametrize("kind", FILES)
+def test_no_array_is_read_that_the_model_does_not_have(kind, loaders, tmp_path, monkeypatch):
+    """Six GiB in a hole of a few KiB are refused at once, by names and shapes."""
+    path, load = tmp_path / "sparse.safetensors", loaders[0][kind]
+    sizes, read_array = [], tensors.read_array
+    monkeypatch.setattr(tensors, "read_array", lambda file, entry: sizes.append(entry.end) or read_array(file, entry))
+    monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**40)
+    for one in hostile_files.sparse(CONTENTS[kind]):
+        path.write_bytes(one.content)
+        os.truncate(path, one.size)
+        began = time.perf_counter()
+        assert attempt(load, path) == "refused", one.name
+        assert time.perf_counter() - began < SECONDS, one.name
+    assert not sizes
+
+
+@pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")
+def test_a_hole_makes_no_room_for_a_space_or_a_network(tmp_path):
+    """A header may ask for as much as the file has bytes, and a hole has none."""
+    path = tmp_path / "sparse.safetensors"
+    large, many = hostile_files.LARGE_SPACES[0], 10**9
+    for change in (
+        lambda header, arrays: header.update(observation_space=large),
+        lambda header, arrays: header["config"].update(n_critics=many),
+    ):
+        one = next(hostile_files.sparse(hostile_files.changed(CONTENTS["agent"], change)))
+        path.write_bytes(one.content)
+        os.truncate(path, one.size)
+        with pytest.raises(CheckpointError, match=r"1000000000 (numbers|is larger)"):
+            rejeu.load(path)
+
+
+@pytest.mark.parametrize("path", ["", ".", "..", "/", "a/..", Path()])
+def test_a_path_that_names_no_file_is_refused_on_one_line(path, tmp_path, monkeypatch):
+    agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")
+    monkeypatch.chdir(tmp_path)
+    words = r"^'.*' is (a folder without a model; a run|not the path of a file; give one, such as).*$"
+    for load in (rejeu.load, rejeu.SAC.load):
+        with pytest.raises((CheckpointError, FileNotFoundError), match=words):
+            load(path)
+    with pytest.raises(CheckpointError, match="is not the path of a file"):
+        agent.set_parameters(path)
+    with pytest.raises(ValueError, match="is not the path of a file"):
+        agent.save(path)
+
+
+def test_a_path_that_is_too_long_is_refused_in_a_few_words(tmp_path):
+    agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")
+    for path in (tmp_path / ("a" * 5000), "b/" * 5000 + "c"):
+        for call in (rejeu.load, agent.set_parameters):
+            with pytest.raises(CheckpointError, match=r"cannot be read: .*long") as caught:
+                call(path)
+            assert len(str(caught.value)) < 500
+        with pytest.raises(OSError, match=r"could not be written: .*long") as failed:
+            agent.save(path)
+        assert len(str(failed.value)) < 600
 
 
 @pytest.mark.parametrize("env_id", ["evil:Env-v0", "os:system", "../x:y", "", "a" * 1000, "a b", 3, None])

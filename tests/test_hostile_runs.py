@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import os
 import shutil
+import warnings
 from unittest import mock
 
 import gymnasium as gym
@@ -11,11 +13,12 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import checkpoint
+from rejeu import checkpoint, tensors
 from rejeu.agents.checkpoints import run_files
 from rejeu.agents.resuming import like, restore_buffer
 from rejeu.callbacks import Checkpoint
 from rejeu.errors import CheckpointError
+from tests import hostile_files
 from tests.test_resume import BALL, OFF, SMALL, compiled_once, vector
 
 CASES = {
@@ -153,6 +156,60 @@ def test_a_rollout_that_is_full_is_refused(run, tmp_path):
 
     with pytest.raises(CheckpointError, match="the rollout has 16 steps"):
         resumed(run, tmp_path, fill)
+
+
+def files_of(folder):
+    """The files of a run with one checkpoint: the run itself, and its newest rows if it has any."""
+    return [run_files(folder)[0], *sorted(folder.glob("rows_*"))[-1:]]
+
+
+def replaced(run, folder, path, content, size=None):
+    """What becomes of a run one of whose files is replaced; ``size`` is more than the content has where a hole follows."""
+    kind, whole, compiled = run
+    shutil.copytree(whole, folder, dirs_exist_ok=True)
+    (folder / path.name).write_bytes(content)
+    if size is not None:
+        os.truncate(folder / path.name, size)
+    try:
+        shared = mock.patch.object(rejeu.agents.base, "Compiled", return_value=copy.copy(compiled))
+        with shared, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that it is not exact
+            kind.resume(folder).env.close()
+    except CheckpointError as error:
+        text = str(error)
+        return "refused" if "\n" not in text and len(text) < 1000 else f"refused at length: {text[:300]}"
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:300]}"
+    return "read"
+
+
+@pytest.mark.parametrize("run", ["replay", "rollout"], indirect=True)
+def test_a_hostile_file_of_a_run_is_refused_by_our_own_error_alone(run, tmp_path):
+    """A sample of the corpus; ``trials/hostile.py`` tries all of it."""
+    for path in files_of(run[1]):
+        content = path.read_bytes()
+        variants = [*hostile_files.variants(content), *hostile_files.bad_runs(content)]
+        outcomes = [replaced(run, tmp_path / "run", path, one.content) for one in variants[::20]]
+        assert {*outcomes} <= {"refused", "read"}
+        assert outcomes.count("refused") > 0.8 * len(outcomes)  # some values may be others, or missing
+
+
+@pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")
+@pytest.mark.parametrize("run", ["replay", "rollout"], indirect=True)
+def test_no_array_is_read_that_the_run_does_not_have(run, tmp_path, monkeypatch):
+    """Six GiB in a hole of a few KiB are refused at once, by names, shapes and sizes."""
+    sizes, read_array = [], tensors.read_array
+
+    def read(file, entry):
+        sizes.append(entry.end - entry.begin)
+        return read_array(file, entry)
+
+    monkeypatch.setattr(tensors, "read_array", read)
+    monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**40)
+    for path in files_of(run[1]):
+        for one in hostile_files.sparse(path.read_bytes()):
+            assert replaced(run, tmp_path / "run", path, one.content, one.size) == "refused", one.name
+    assert max(sizes) < 2**20
 
 
 @pytest.mark.parametrize("run", ["replay"], indirect=True)

@@ -58,7 +58,6 @@ ALLOWED = {
     "envs/state.py": {"getattr"},
     "hooks/base.py": {"getattr"},
     "hooks/calling.py": {"globals()"},
-    "replay/rollout.py": {"getattr"},
     "config.py": {"getattr"},
     "exploration/noise.py": {"getattr"},
     "networks/shape.py": {"getattr"},

@@ -454,9 +454,9 @@ def test_checkpoints_in_which_draws_have_lost_their_td_errors_are_read(tmp_path)
     (draw, td_error), steps = agent._run.td_errors[0], np.arange(4)
     header, arrays = checkpoint.read(path, "run")
     drawn = header["run"]["dict"]["buffer"]["dict"]["priorities"]["dict"]["drawn"]
-    drawn.insert(0, [{"array": "lost"}, {"array": "lost"}])
+    drawn.insert(0, [{"array": "run.lost"}, {"array": "run.lost"}])
     kept = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
-    checkpoint.write(path, "run", {**arrays, "lost": steps}, kept)
+    checkpoint.write(path, "run", {**arrays, "run.lost": steps}, kept)
     with pytest.warns(UserWarning, match="at the start of new episodes"):
         ((same, error),) = rejeu.DQN.resume(tmp_path, agent.env)._run.td_errors
     np.testing.assert_array_equal(same.position, draw.position)

@@ -584,7 +584,7 @@ def test_a_checkpoint_full_of_nonsense_is_refused_by_our_own_error_alone(kind, t
                 elif len(place) == 1:
                     holder[place[-1]] = junk if isinstance(junk, int | str | list | None) else 0.5
                 else:
-                    holder[place[-1]] = plain.encode(junk, more, "junk")
+                    holder[place[-1]] = plain.encode(junk, more, "run.junk")
                 checkpoint.write(path, "run", more, changed)
                 try:
                     rejeu.AGENTS[name].resume(tmp_path, env())

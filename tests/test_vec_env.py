@@ -382,7 +382,7 @@ def test_statistics_without_clipping_are_saved(tmp_path):
 
 def test_statistics_of_another_environment_are_refused(tmp_path):
     path = VecNormalize(walks()).save(tmp_path / "statistics")
-    with pytest.raises(CheckpointError, match=r"obs.mean has the shape \(3,\), expected .* \(4,\)"):
+    with pytest.raises(CheckpointError, match=r"obs.mean is float64\[3\], expected float64\[4\]"):
         VecNormalize.load(path, make_vec_env("CartPole-v1"))
     with pytest.raises(CheckpointError, match="'vec_normalize', expected 'agent'"):
         rejeu.SAC.load(path)

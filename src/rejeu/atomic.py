@@ -93,6 +93,12 @@ def remove_stale(path: Path, age: float = STALE) -> None:
                         other.unlink()
 
 
+def shortened(path: str | Path) -> str:
+    """Returns a path for a message: whole, unless it is longer than a line or two."""
+    text = str(path)
+    return text if len(text) <= 300 else f"{text[:150]}...{text[-50:]}"
+
+
 def _sync_folder(folder: Path) -> None:
     """Brings the new name to disk where folders can be opened for that; elsewhere the system does so in its own time."""
     if os.name != "posix":
@@ -109,4 +115,6 @@ def _explained(error: OSError, path: Path) -> OSError:
     """Returns an error of the same class whose message holds path, reason and remedy."""
     reason = error.strerror or str(error)
     advice = ADVICE.get(error.errno or 0, "give a path on another disk")
-    return OSError(error.errno or errno.EIO, f"{path} could not be written: {reason}; {advice}; nothing was replaced")
+    return OSError(
+        error.errno or errno.EIO, f"{shortened(path)} could not be written: {reason}; {advice}; nothing was replaced"
+    )

@@ -11,6 +11,7 @@ file on purpose and the checksums with it; against that, nothing in a file is ev
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import zlib
@@ -25,7 +26,7 @@ from rejeu import atomic, tensors
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError
 from rejeu.memory import physical_memory
-from rejeu.tensors import DTYPES, Entry, Malformed, Table, shown
+from rejeu.tensors import DTYPES, Entry, Malformed, Spec, Table, shown
 
 SUFFIX = ".safetensors"
 FOREIGN = (".zip", ".pkl")
@@ -36,6 +37,8 @@ HEADER_KEY, CHECKSUM_KEY = "rejeu", "crc32"
 """Where the header, and the checksum of its text, stand among the file's metadata."""
 CHECKSUMS = "checksums"
 """Where the header holds the checksum of each array, by name."""
+MOST_PARTS = 1000
+"""Parts between holes up to which the bytes of a file are counted; one of more counts as if it had no holes."""
 RESERVED = ("schema", "kind", CHECKSUMS)
 
 Header = dict[str, Any]
@@ -51,8 +54,14 @@ MIGRATIONS: dict[int, Callable[[Header], Header]] = {1: _from_1}
 
 
 def resolve(path: str | Path) -> Path:
-    """Returns the path with ``.safetensors`` added if it has no suffix, as Stable-Baselines3 adds ``.zip``."""
-    path = Path(path)
+    """Returns the path with ``.safetensors`` added if it has no suffix, as Stable-Baselines3 adds ``.zip``.
+
+    Raises:
+        ValueError: if it does not name a file, as ``""``, ``"."`` and ``"/"`` do not.
+    """
+    if (given := Path(path)).name in ("", ".."):
+        raise ValueError(f"{str(path)!r} is not the path of a file; give one, such as 'model{SUFFIX}'")
+    path = given
     return path if path.suffix else path.with_name(path.name + SUFFIX)
 
 
@@ -85,43 +94,112 @@ def write(path: str | Path, kind: str, arrays: Mapping[str, Any], header: Mappin
     return path
 
 
-def read(path: str | Path, kind: str) -> tuple[Header, dict[str, np.ndarray]]:
-    """Returns header and arrays of a file of that ``kind``; headers of older schemas come as those of the present one.
+class Contents:
+    """A file that is open: its header, and which arrays it holds, to be compared with what is expected before any is read."""
 
-    For ``model.zip``, where there is none, ``model.safetensors`` is read.
+    def __init__(self, path: Path, file: BinaryIO, header: Header, sums: dict[str, int] | None, table: Table) -> None:
+        self.path = path
+        self.header = header
+        """That of the present schema."""
+        self.specs = {entry.name: Spec(entry.shape, np.dtype(DTYPES[entry.dtype])) for entry in table.entries}
+        """Shape and dtype of each array, by name."""
+        self._file, self._sums, self._table = file, sums, table
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        CheckpointError: if it is not a complete, undamaged rejeu file of that kind; it says what is wrong, and of damaged
-            arrays which.
-    """
-    with _opened(path) as (path, file, size):
-        header, sums, table = _head(path, file, size, kind)
-        memory = physical_memory()
-        if memory is not None and size > memory:
-            raise CheckpointError(f"{path} has {size / 2**30:.1f} GiB and the machine {memory / 2**30:.1f} GiB")
+    @property
+    def room(self) -> int:
+        """Bytes that the file holds, holes left out where the system tells them."""
+        return _without_holes(self._file)
+
+    def read(self, prefix: str = "") -> dict[str, np.ndarray]:
+        """Returns the arrays whose names begin so, by their whole names.
+
+        Raises:
+            CheckpointError: if one is damaged; it says which.
+        """
         arrays = {}
-        for entry in table.entries:
-            array = tensors.read_array(file, entry)
-            if sums is not None and sums[entry.name] != _checksum(tensors.plain(entry.name, array)):
-                raise CheckpointError(
-                    f"{path}: the array {shown(entry.name)} is damaged (its checksum differs); restore the file from a "
-                    "copy"
-                )
-            arrays[entry.name] = array
-    return _migrated(path, header), arrays
-
-
-def read_header(path: str | Path, kind: str) -> Header:
-    """Returns the header alone of a file of that ``kind``: as :func:`read`, but the arrays are not looked at."""
-    with _opened(path) as (path, file, size):
-        header, _, _ = _head(path, file, size, kind)
-    return _migrated(path, header)
+        with _explained(self.path):
+            for entry in self._table.entries:
+                if entry.name.startswith(prefix):
+                    self._file.seek(self._table.start + entry.begin)
+                    arrays[entry.name] = array = tensors.read_array(self._file, entry)
+                    if self._sums is not None and self._sums[entry.name] != _checksum(tensors.plain(entry.name, array)):
+                        raise CheckpointError(
+                            f"{self.path}: the array {shown(entry.name)} is damaged (its checksum differs); restore the "
+                            "file from a copy"
+                        )
+        return arrays
 
 
 @contextlib.contextmanager
-def _opened(path: str | Path) -> Iterator[tuple[Path, BinaryIO, int]]:
-    """Gives the path that is read, its open file and size, and says of whatever goes wrong within which file it was."""
+def opened(path: str | Path, kind: str) -> Iterator[Contents]:
+    """Gives the contents of a file of that ``kind``; headers of older schemas come as those of the present one.
+
+    For ``model.zip``, where there is none, ``model.safetensors`` is read. No array is read: a loader first compares
+    ``specs`` with what it expects (:func:`match`), so that a file cannot make it read more than the model needs.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it is not a complete rejeu file of that kind; it says what is wrong.
+    """
+    with contextlib.ExitStack() as stack:
+        with _explained(path):
+            path = _existing(path)
+            file = stack.enter_context(path.open("rb"))
+            size = os.fstat(file.fileno()).st_size
+            header, sums, table = _head(path, file, size, kind)
+            memory = physical_memory()
+            if memory is not None and size > memory:
+                raise CheckpointError(f"{path} has {size / 2**30:.1f} GiB and the machine {memory / 2**30:.1f} GiB")
+        yield Contents(path, file, _migrated(path, header), sums, table)
+
+
+def read(path: str | Path, kind: str) -> tuple[Header, dict[str, np.ndarray]]:
+    """Returns header and all arrays, whatever they are: for files that are known to be good. Loaders use :func:`opened`.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it is not a complete, undamaged rejeu file of that kind; it says what is wrong.
+    """
+    with opened(path, kind) as file:
+        return file.header, file.read()
+
+
+def read_header(path: str | Path, kind: str) -> Header:
+    """Returns the header alone of a file of that ``kind``; see :func:`opened`."""
+    with opened(path, kind) as file:
+        return file.header
+
+
+def match(expected: PyTree, found: Mapping[str, Any], path: str | Path) -> None:
+    """Raises ``CheckpointError`` unless arrays, or their specs, are those of a tree of shapes; it names the first that is not.
+
+    Args:
+        expected: a tree whose leaves have a shape and a dtype.
+        found: arrays or specs by name.
+        path: where they are from, for the message.
+    """
+    keys = names(expected)
+    for key, leaf in zip(keys, jax.tree.leaves(expected), strict=True):
+        if key not in found:
+            raise CheckpointError(f"{path} has no {key}; it was saved with other networks or another algorithm")
+        if found[key].shape != leaf.shape or found[key].dtype != leaf.dtype:
+            raise CheckpointError(
+                f"{path}: {key} is {found[key].dtype}{shown(list(found[key].shape))}, expected "
+                f"{leaf.dtype}{list(leaf.shape)}; it was saved with other networks or for another environment"
+            )
+    if extra := sorted({*found} - {*keys}):
+        raise CheckpointError(
+            f"{path} has {shown(extra[0])}, which this agent has not; it was saved with another configuration"
+        )
+
+
+def within(found: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Returns the entries whose names begin so, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
+
+
+def _existing(path: str | Path) -> Path:
+    """Returns the path of a file that is there, as :func:`opened` looks for it."""
     path = resolve(path)
     if path.suffix in FOREIGN and not path.exists() and path.with_suffix(SUFFIX).exists():
         path = path.with_suffix(SUFFIX)
@@ -129,17 +207,48 @@ def _opened(path: str | Path) -> Iterator[tuple[Path, BinaryIO, int]]:
         raise FileNotFoundError(f"there is no file {path}")
     if not path.is_file():
         raise CheckpointError(f"{path} is no file but a folder or a device; give the path of a file")
+    return path
+
+
+def _without_holes(file: BinaryIO) -> int:
+    """Returns the size of a file, holes left out where the system tells them; where it stands is not changed."""
+    handle = file.fileno()
+    size, place = os.fstat(handle).st_size, os.lseek(handle, 0, os.SEEK_CUR)
+    if not hasattr(os, "SEEK_DATA"):
+        return size
+    total = end = 0
     try:
-        with path.open("rb") as file:
-            yield path, file, os.fstat(file.fileno()).st_size
+        for _ in range(MOST_PARTS):
+            begin = os.lseek(handle, end, os.SEEK_DATA)
+            end = os.lseek(handle, begin, os.SEEK_HOLE)
+            total += end - begin
+        return size
+    except OSError as error:
+        return total if error.errno == errno.ENXIO else size  # no data are left, or holes cannot be told
+    finally:
+        os.lseek(handle, place, os.SEEK_SET)
+
+
+@contextlib.contextmanager
+def _explained(path: str | Path) -> Iterator[None]:
+    """Says of whatever goes wrong with a file which file it was."""
+    shown_path = atomic.shortened(path)
+    try:
+        yield
+    except FileNotFoundError:
+        raise
     except Malformed as error:
         raise CheckpointError(
-            f"{path} is not a complete safetensors file ({error}); it was cut short or is of another program"
+            f"{shown_path} is not a complete safetensors file ({error}); it was cut short or is of another program"
         ) from None
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise CheckpointError(f"{shown_path} cannot be read: {error.strerror or error}") from None
     except MemoryError:
-        raise CheckpointError(f"{path} holds more than there is memory for") from None
+        raise CheckpointError(f"{shown_path} holds more than there is memory for") from None
+    except CheckpointError:
+        raise
+    except ValueError as error:
+        raise CheckpointError(str(error)) from None
 
 
 def _head(path: Path, file: BinaryIO, size: int, kind: str) -> tuple[Header, dict[str, int] | None, Table]:
@@ -236,18 +345,5 @@ def arrays_to_tree(expected: PyTree, arrays: Mapping[str, np.ndarray], path: str
     Raises:
         CheckpointError: unless names, shapes and dtypes are the same, naming the first that is not.
     """
-    keys, leaves = names(expected), jax.tree.leaves(expected)
-    for key, leaf in zip(keys, leaves, strict=True):
-        if key not in arrays:
-            raise CheckpointError(f"{path} has no {key}; it was saved with other networks or another algorithm")
-        found = arrays[key]
-        if found.shape != leaf.shape or found.dtype != leaf.dtype:
-            raise CheckpointError(
-                f"{path}: {key} is {found.dtype}{list(found.shape)}, expected {leaf.dtype}{list(leaf.shape)}; "
-                "it was saved with other networks or for another environment"
-            )
-    if extra := sorted(set(arrays) - set(keys)):
-        raise CheckpointError(
-            f"{path} has {shown(extra[0])}, which this agent has not; it was saved with another configuration"
-        )
-    return jax.tree.unflatten(jax.tree.structure(expected), [arrays[key] for key in keys])
+    match(expected, arrays, path)
+    return jax.tree.unflatten(jax.tree.structure(expected), [arrays[key] for key in names(expected)])

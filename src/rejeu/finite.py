@@ -253,28 +253,40 @@ def load_batch(agent: Agent, path: str | Path) -> tuple[Transition | Rollout, Cl
         FileNotFoundError: if there is no such file.
         CheckpointError: if it holds no batch, or none of such an agent.
     """
-    header, arrays = checkpoint.read(path, "batch")
-    structure = spaces.structure(agent.observation_space)
-    obs: Any = jax.tree.unflatten(structure, [0] * structure.num_leaves)
-    expected: Any
-    if "ended" in arrays:
-        obs = Masked(obs, 0) if agent.takes_masks else obs
-        carry = jax.tree.map(lambda leaf: 0, agent._compiled.initial_carry(1))
-        expected = Rollout(obs, 0, 0, obs, 0, 0, 0, 0, 0, carry)
-    else:
-        expected = Transition(obs, 0, 0, obs, 0, 0 if "weight" in arrays else None)
-    names = checkpoint.names(expected)
-    if header.get("algorithm") != agent.name or {*names} != {*arrays}:
-        raise CheckpointError(
-            f"{path} holds a batch of {str(header.get('algorithm'))[:40]} with {', '.join(sorted(arrays))[:200]}; "
-            f"this is {agent.name}, whose batches have {', '.join(sorted(names))}"
-        )
+    with checkpoint.opened(path, "batch") as file:
+        expected = _batch_like(agent, file)
+        header, arrays = file.header, file.read()
     try:
         clock = header["clock"]
         clock = Clock(np.uint32(clock["step"]), np.uint32(clock["episode"]), np.float32(clock["progress"]))
     except (KeyError, TypeError, ValueError, OverflowError):
         raise CheckpointError(f"{path}: the header is damaged") from None
+    names = checkpoint.names(expected)
     return jax.tree.unflatten(jax.tree.structure(expected), [arrays[name] for name in names]), clock
+
+
+def _batch_like(agent: Agent, file: checkpoint.Contents) -> Transition | Rollout:
+    """Returns a batch of the form of the one in a file, with numbers for arrays.
+
+    Raises:
+        CheckpointError: if it holds none of such an agent.
+    """
+    structure = spaces.structure(agent.observation_space)
+    obs: Any = jax.tree.unflatten(structure, [0] * structure.num_leaves)
+    expected: Any
+    if "ended" in file.specs:
+        obs = Masked(obs, 0) if agent.takes_masks else obs
+        carry = jax.tree.map(lambda leaf: 0, agent._compiled.initial_carry(1))
+        expected = Rollout(obs, 0, 0, obs, 0, 0, 0, 0, 0, carry)
+    else:
+        expected = Transition(obs, 0, 0, obs, 0, 0 if "weight" in file.specs else None)
+    names = checkpoint.names(expected)
+    if file.header.get("algorithm") != agent.name or {*names} != {*file.specs}:
+        raise CheckpointError(
+            f"{file.path} holds a batch of {str(file.header.get('algorithm'))[:40]} with "
+            f"{', '.join(sorted(file.specs))[:200]}; this is {agent.name}, whose batches have {', '.join(sorted(names))}"
+        )
+    return expected
 
 
 def examine(agent: Agent, path: str | Path) -> Found:

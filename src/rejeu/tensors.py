@@ -47,6 +47,23 @@ class Entry(NamedTuple):
     end: int
 
 
+class Spec(NamedTuple):
+    """Shape and dtype of an array that was not read yet."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        """Its number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """Its size in bytes."""
+        return self.size * self.dtype.itemsize
+
+
 class Table(NamedTuple):
     """What stands before the arrays of a file."""
 

@@ -124,9 +124,9 @@ class Agent(ABC):
         self.interrupted_by: int | None = None
         """The number of that signal."""
         self.logger = Logger()
+        """Takes further numbers for the rows of statistics."""
         self.failed_writes = FailedWrites()
         """What ``learn`` could not write, such as checkpoints and log rows on a full disk; training continues without."""
-        """Takes further numbers for the rows of statistics."""
         self.best: best.Best | None = None
         """The best weights so far, by smoothed training return or by evaluation."""
         self.steps_per_second = math.nan
@@ -481,7 +481,11 @@ class Agent(ABC):
         source = load_path_or_dict
         if isinstance(source, str | Path):
             path = source
-            _, source = checkpoint.read(path, "agent")
+            with checkpoint.opened(path, "agent") as file:
+                shapes = self._compiled.shapes
+                own = {} if exact_match else dict(zip(checkpoint.names(shapes), jax.tree.leaves(shapes), strict=True))
+                checkpoint.match(shapes, {**own, **file.specs}, path)
+                source = file.read()
             checkpoint.require_finite(source, path)
         arrays = {key: np.asarray(value) for key, value in source.items()}
         if not exact_match:
@@ -522,16 +526,10 @@ class Agent(ABC):
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged, of another algorithm, environment, schema or shape; it says which.
         """
-        path = files.find(path)
-        header, arrays = checkpoint.read(path, "agent")
-        agent = files.load(
-            cls,
-            path,
-            header,
-            arrays,
-            lambda agent: None if env is None else agent._vector(env, seed=agent.seed),
-            changes,
-        )
+        with checkpoint.opened(files.find(path), "agent") as file:
+            agent = files.load(
+                cls, file, lambda agent: None if env is None else agent._vector(env, seed=agent.seed), changes
+            )
         agent._own_env = isinstance(env, str)
         return agent
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -85,51 +86,47 @@ def find(path: str | Path) -> str | Path:
         FileNotFoundError: if a folder holds no model.
     """
     folder = Path(path)
-    if not folder.is_dir() or (folder.name and checkpoint.resolve(path).is_file()):
+    if not os.path.isdir(folder) or (folder.name not in ("", "..") and checkpoint.resolve(path).is_file()):
         return path
     for name in ("best", "agent"):
         if (folder / f"{name}.safetensors").is_file():
             return folder / f"{name}.safetensors"
     raise FileNotFoundError(
-        f"{path} is a folder without a model; a run folder holds best.safetensors or agent.safetensors"
+        f"{str(path)!r} is a folder without a model; a run folder holds best.safetensors or agent.safetensors"
     )
 
 
 def load(
     cls: type[A],
-    path: str | Path,
-    header: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
+    file: checkpoint.Contents,
     make_env: Callable[[A], VectorEnv | None],
     changes: dict[str, Any],
     threads: int | None = None,
+    prefix: str = "",
 ) -> A:
-    """Returns the agent that a header and the arrays of its state describe; its buffer is empty.
+    """Returns the agent that a file describes; its buffer is empty. No array is read that the agent does not have.
 
     Args:
         cls: the class of the agent.
-        path: where they are from, for messages.
-        header: what :func:`header` returned.
-        arrays: everything learnt, by name.
+        file: its header holds what :func:`header` returned.
         make_env: returns where it goes on learning, None for an agent that only predicts.
         changes: constructor arguments or hyper-parameters to set otherwise.
         threads: that JAX's device is to have; None for the number that suits the agent.
+        prefix: of the names of everything learnt, in the file.
 
     Raises:
         CheckpointError: if something is damaged or of another algorithm or environment.
     """
-    name = cls.algorithm.Config.name
+    name, path, header = cls.algorithm.Config.name, file.path, file.header
     if header.get("algorithm") != name:
         other = str(header.get("algorithm"))[:40]
         raise CheckpointError(f"{path} holds a {other} agent, not {name}; use rejeu.load(path) or rejeu.{other}.load")
     own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
     given = {key: own.pop(key) for key in loading.GIVEN if key in own}
     try:
-        saved = loading.interpret(header, arrays, cls.algorithm.Config, given, changes)
+        saved = loading.interpret(header, file.room, cls.algorithm.Config, given, changes)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
-    checkpoint.require_finite(arrays, path)
-
     agent = cls.__new__(cls)
     agent._set_up(
         saved.policy, saved.config, saved.seed, own.pop("verbose", 0), own.pop("tensorboard_log", None),
@@ -139,6 +136,9 @@ def load(
         agent._build(saved.observation_space, saved.action_space)
     except loading.WRONG as error:
         raise CheckpointError(f"{path}: {loading.brief(error)}") from None
+    checkpoint.match(agent._compiled.shapes, checkpoint.within(file.specs, prefix), path)
+    arrays = checkpoint.within(file.read(prefix), prefix)
+    checkpoint.require_finite(arrays, path)
     state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
     agent._trained_on = trained_on(header)
     vector = make_env(agent)

@@ -1,4 +1,4 @@
-"""What the header of a model file says, checked against the arrays of the file before anything is built from it."""
+"""What the header of a model file says, checked against the size of the file before anything is built from it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Saved(NamedTuple):
 
 def interpret(
     header: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
+    room: int,
     kind: type,
     given: Mapping[str, Any],
     changes: Mapping[str, Any],
@@ -55,7 +55,7 @@ def interpret(
 
     Args:
         header: JSON values of schema ``checkpoint.SCHEMA``.
-        arrays: of the same file; of them only the sizes are used.
+        room: bytes that the file holds.
         kind: class of the algorithm's configuration.
         given: some of ``GIVEN`` as the user has them.
         changes: hyper-parameters as the user has them.
@@ -65,11 +65,11 @@ def interpret(
         TypeError, ValueError: where ``given`` or ``changes`` are.
     """
     try:
-        return _interpret({**header, **given}, arrays, kind, changes)
+        return _interpret({**header, **given}, room, kind, changes)
     except WRONG as error:
         own = _torso(changes)
         others = given or changes.keys() - own.keys()
-        if isinstance(error, CheckpointError) or (others and _is_sound(header, arrays, kind, own)):
+        if isinstance(error, CheckpointError) or (others and _is_sound(header, room, kind, own)):
             raise
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
 
@@ -101,14 +101,14 @@ def whole_seed(seed: Any) -> int:
 
 def _interpret(
     header: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
+    room: int,
     kind: type,
     changes: Mapping[str, Any],
 ) -> Saved:
     try:
         config: Any = configs.rebuild(kind, header["config"], changes)
-        check_sizes(config, arrays)
-        largest = max(spaces.LARGEST, sum(array.nbytes for array in arrays.values()))
+        check_sizes(config, room)
+        largest = max(spaces.LARGEST, room)
         observation_space = spaces.rebuild(header["observation_space"], largest)
         threshold = header.get("success_threshold")
         policy = header["policy"]
@@ -141,13 +141,28 @@ def check_counters(saved: Mapping[str, Any]) -> dict[str, int]:
     return counters | {"episodes_before": configs.whole("episodes_before", before, 0, counters["episode"])}
 
 
-def check_sizes(config: Any, arrays: Mapping[str, np.ndarray]) -> None:
+def check_space(description: Any, own: gym.Space, kind: str) -> None:
+    """Raises ``ValueError`` unless a space of a file is an agent's own: of observations in structure, of actions in bounds.
+
+    Args:
+        description: JSON values.
+        own: the agent's.
+        kind: ``"observation"`` or ``"action"``.
+    """
+    if description == spaces.describe(own):
+        return
+    other = spaces.rebuild(description, max(spaces.LARGEST, sum(leaf.nbytes for leaf in spaces.leaves(own))))
+    if not spaces.same(other, own, bounds=kind == "action"):
+        raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
+
+
+def check_sizes(config: Any, room: int) -> None:
     """Raises ``CheckpointError`` where a configuration asks for networks larger than all arrays together.
 
     Every layer of that width, or ensemble of that number, would have at least as many numbers. So what is built to
     compare shapes is no larger than what was read.
     """
-    largest = max(SMALL, sum(array.size for array in arrays.values()))
+    largest = max(SMALL, room)
     policy = config.policy_kwargs
     widths = {key: value for key, value in vars(policy).items() if isinstance(value, tuple)}
     numbers = {key: value for key, value in vars(policy).items() if type(value) is int}

@@ -57,11 +57,16 @@ class OffPolicyAgent(Agent):
         """
         if self._run.replay is None:
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
-        _, arrays = checkpoint.read(path, "replay")
         try:
-            if (action := arrays.get("action")) is not None:
-                spaces.check_actions(self.action_space, action, "the replay file")
+            with checkpoint.opened(path, "replay") as file:
+                for kind, own in (("observation", self.observation_space), ("action", self.action_space)):
+                    loading.check_space(file.header.get(f"{kind}_space"), own, kind)
+                self._run.replay.ring.check(file.specs)
+                arrays = file.read()
+            spaces.check_actions(self.action_space, arrays["action"], "the replay file")
             self._run.replay.restore(arrays)
+        except CheckpointError:
+            raise
         except ValueError as error:
             raise CheckpointError(f"{path}: {loading.brief(error)}") from None
         self._run.learn_from = self.config.learning_starts

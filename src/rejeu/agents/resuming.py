@@ -33,6 +33,13 @@ if TYPE_CHECKING:
 
 A = TypeVar("A", bound="Agent")
 
+MOST_BESIDE = 2**26
+"""Bytes that a checkpoint may hold beside weights and experience, for history, environments and callbacks; more, which nothing
+else bounds, must not be a hole in the file."""
+MOST_ZEROS = 64
+"""How many times as large as the file without its holes they may then be."""
+PER_BUFFER = ("heads", "started")
+"""Arrays of a replay buffer and of a rollout with one entry for each environment; a run has one of them."""
 MOST_ENVS = 4096
 """More environments than so many are not made because a file says so."""
 MOST_THREADS = 1024
@@ -77,8 +84,8 @@ def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
 
 
 def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
-    with ExitStack() as made:
-        agent = _resume_within(made, cls, path, env, changes)
+    with checkpoint.opened(path, "run") as file, ExitStack() as made:
+        agent = _resume_within(made, file, cls, env, changes)
         made.pop_all()
     assert agent.resumed is not None
     if not agent.resumed.exact:
@@ -86,16 +93,15 @@ def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
     return agent
 
 
-def _resume_within(made: ExitStack, cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
+def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
     """Returns the agent; environments that are made for it are closed with ``made``, should it be refused."""
-    header, arrays = checkpoint.read(path, "run")
-    state = {name[6:]: array for name, array in arrays.items() if name.startswith("state.")}
+    path, header = file.path, file.header
     try:
-        saved = plain.decode(header["run"], arrays)
         rows = [_rows_name(name) for name in header["rows"]]
-        counted = saved["buffer"]["heads" if "heads" in saved["buffer"] else "started"]
-        if len(counted) != header["n_envs"]:
-            raise ValueError(f"it is of {header['n_envs']} environments, and its replay buffer of {len(counted)}")
+        buffer = checkpoint.within(file.specs, "run.buffer.")
+        counted = " or ".join(str(buffer[name].size) for name in PER_BUFFER if name in buffer)
+        if counted != str(header["n_envs"]):
+            raise ValueError(f"it is of {header['n_envs']} environments, and its replay buffer of {counted or 'none'}")
     except loading.WRONG as error:
         raise refusal(path, error) from error
 
@@ -117,10 +123,12 @@ def _resume_within(made: ExitStack, cls: type[A], path: Path, env: Any, changes:
             ) from error
         return vector
 
-    agent = files.load(cls, path, header, state, make_env, changes, threads(path, header))
+    agent = files.load(cls, file, make_env, changes, threads(path, header), "state.")
     try:
-        parts = [checkpoint.read(path.parent / name, "rows")[1] for name in rows]
-        best = {n[5:]: array for n, array in arrays.items() if n.startswith("best.")}
+        check_specs(agent, file)
+        saved = plain.decode(header["run"], file.read("run."))
+        best = checkpoint.within(file.read("best."), "best.")
+        parts = [read_rows(path.parent / name, agent) for name in rows]
         reason = restore(agent, saved, parts, best, path)
         agent.resumed = Resumed(agent._run.step, not reason, reason) if reason else compared(agent, header)
         if "train_freq" not in changes:
@@ -135,6 +143,39 @@ def _resume_within(made: ExitStack, cls: type[A], path: Path, env: Any, changes:
         heads = [part["head"] for part in parts]
         agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
     return agent
+
+
+def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
+    """Checks what a run's file holds beside the state, before any of it is read.
+
+    Raises:
+        CheckpointError: if the best weights are of other networks, or something is there that no run has.
+        ValueError: if the rest is larger than a run needs, and nearly all of it a hole in the file.
+    """
+    if best := checkpoint.within(file.specs, "best."):
+        checkpoint.match(agent._compiled.shapes, best, file.path)
+    for name in file.specs:
+        if not name.startswith(("state.", "best.", "run.")):
+            raise CheckpointError(f"{file.path} has {checkpoint.shown(name)}, which no checkpoint of a run has")
+    buffer = agent._run.replay
+    if isinstance(buffer, RolloutBuffer):
+        experience = buffer.nbytes
+    else:
+        experience = 0 if buffer.priorities is None else 8 * buffer.ring.rows * buffer.ring.n_envs
+    found = sum(spec.nbytes for spec in checkpoint.within(file.specs, "run.").values())
+    if found > experience + MOST_BESIDE and found > MOST_ZEROS * file.room:
+        raise ValueError(f"it says that it holds {found:,} bytes of the run, nearly all of them a hole in the file")
+
+
+def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
+    """Returns a file of rows, once its arrays are known to be rows of the agent's buffer.
+
+    Raises:
+        CheckpointError, ValueError: if they are not.
+    """
+    with checkpoint.opened(path, "rows") as file:
+        agent._run.replay.ring.check_rows(file.specs)
+        return file.read()
 
 
 def compared(agent: Agent, header: dict[str, Any]) -> Resumed:

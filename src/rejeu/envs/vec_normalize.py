@@ -279,14 +279,16 @@ class VecNormalize(VecEnvWrapper):
             FileNotFoundError: if there is no such file.
             CheckpointError: if it is damaged, or of an environment with other observations.
         """
-        header, arrays = checkpoint.read(load_path, KIND)
-        try:
-            settings = {key: _read(key, header["settings"][key]) for key in NUMBERS}
-            switches = {key: _check_switch(key, header["settings"][key]) for key in SWITCHES}
-            new = VecNormalize(venv, **switches, **settings, norm_obs_keys=_check_keys(header["keys"]))  # type: ignore[arg-type]
-        except (LookupError, TypeError, ValueError) as error:
-            raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
-        new.put_statistics(arrays, load_path)
+        with checkpoint.opened(load_path, KIND) as file:
+            header = file.header
+            try:
+                settings = {key: _read(key, header["settings"][key]) for key in NUMBERS}
+                switches = {key: _check_switch(key, header["settings"][key]) for key in SWITCHES}
+                new = VecNormalize(venv, **switches, **settings, norm_obs_keys=_check_keys(header["keys"]))  # type: ignore[arg-type]
+            except (LookupError, TypeError, ValueError) as error:
+                raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
+            _check_specs(file.specs, new.statistics(), load_path)
+            new.put_statistics(file.read(), load_path)
         return new
 
 
@@ -316,6 +318,17 @@ def sync_envs_normalization(env: VecEnv, eval_env: VecEnv) -> None:
 
 def _arrays(moments: RunningMeanStd) -> dict[str, np.ndarray]:
     return {"mean": moments.mean, "var": moments.var, "count": np.array(moments.count, np.float64)}
+
+
+def _check_specs(found: Mapping[str, Any], own: Mapping[str, Any], path: str | Path) -> None:
+    """Raises ``CheckpointError`` unless both have the same names, shapes and dtypes."""
+    forms = [{name: f"{one.dtype}{list(one.shape)}" for name, one in arrays.items()} for arrays in (found, own)]
+    if differing := sorted(name for name in {*found, *own} if forms[0].get(name) != forms[1].get(name)):
+        name = differing[0]
+        raise CheckpointError(
+            f"{path}: {checkpoint.shown(name)} is {checkpoint.shown(forms[0].get(name, 'missing'))}, expected "
+            f"{forms[1].get(name, 'nothing of that name')}; it is of other observations or other settings"
+        )
 
 
 def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, path: str | Path) -> None:

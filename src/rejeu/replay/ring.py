@@ -311,26 +311,13 @@ class Ring:
         Raises:
             ValueError: if names, shapes or dtypes are not those of this ring.
         """
+        self.check(arrays)
         own = self._stored()
-        counters = {name: arrays[name] for name in COUNTERS} if {*COUNTERS} <= {*arrays} else {}
-        if missing := ({*own, *counters, "head", "n_steps"} ^ set(arrays)):
-            raise ValueError(f"the replay file and this buffer differ in the arrays {', '.join(sorted(missing))}")
+        counters = {name: arrays[name] for name in COUNTERS if name in arrays}
         head, n_steps = arrays["head"], arrays["n_steps"]
-        if head.shape != (self.n_envs,) or n_steps.shape != (self.n_envs,):
-            raise ValueError(
-                f"the replay file is of {head.size} environments and this agent has {self.n_envs}; make them equal"
-            )
-        if head.dtype != np.int64 or n_steps.dtype != np.int64 or head.min() < -1 or head.max() >= 2**62:
+        used = arrays["kind"].shape[1]
+        if head.min() < -1 or head.max() >= 2**62 or used != min(head.max() + 1, self.rows):
             raise ValueError("the replay file's counters are damaged")
-        used = int(min(head.max() + 1, self.rows))
-        expected_of = {name: (array.shape[1:], array.dtype) for name, array in own.items()}
-        for name, (shape, dtype) in (expected_of | {name: ((), np.dtype(np.int32)) for name in counters}).items():
-            expected = (self.n_envs, used, *shape)
-            if arrays[name].shape != expected or arrays[name].dtype != dtype:
-                raise ValueError(
-                    f"{name} in the replay file is {arrays[name].dtype}{list(arrays[name].shape)} and this buffer "
-                    f"expects {dtype}{list(expected)}; it was saved with another environment or buffer_size"
-                )
         for name in ("action", "reward"):
             if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"{name} in the replay file holds what is not finite, which no environment may return")
@@ -339,6 +326,35 @@ class Ring:
         for name, array in own.items():
             array.reshape(self.n_envs, self.rows, *array.shape[1:])[:, :used] = arrays[name]
         self._stand(head.copy())
+
+    def check(self, found: Mapping[str, Any]) -> None:
+        """Checks that arrays, or their specs, can be what :meth:`arrays` returned of a ring like this one.
+
+        Raises:
+            ValueError: if names, shapes or dtypes are others, or there are more rows than this ring has.
+        """
+        own = self._stored()
+        counters = {*COUNTERS} if {*COUNTERS} <= {*found} else set()
+        if differing := {*found} ^ {*own, *counters, "head", "n_steps"}:
+            raise ValueError(
+                f"the replay file and this buffer differ in the arrays {', '.join(sorted(differing))[:200]}"
+            )
+        head, n_steps = found["head"], found["n_steps"]
+        if head.shape != (self.n_envs,) or n_steps.shape != (self.n_envs,):
+            raise ValueError(
+                f"the replay file is of {head.size} environments and this agent has {self.n_envs}; make them equal"
+            )
+        if head.dtype != np.int64 or n_steps.dtype != np.int64:
+            raise ValueError("the replay file's counters are damaged")
+        n_envs, used = self.n_envs, min((*found["kind"].shape, 0, 0)[1], self.rows)
+        expected = {name: ((n_envs, used, *array.shape[1:]), array.dtype) for name, array in own.items()}
+        expected |= dict.fromkeys(counters, ((n_envs, used), np.dtype(np.int32)))
+        for name, (shape, dtype) in expected.items():
+            if found[name].shape != shape or found[name].dtype != dtype:
+                raise ValueError(
+                    f"{name} in the replay file is {found[name].dtype}{list(found[name].shape)} and this buffer expects "
+                    f"{dtype}{list(shape)}; it was saved with another environment or buffer_size"
+                )
 
     def rows_since(self, heads: np.ndarray) -> dict[str, np.ndarray]:
         """Returns the rows from those that were the newest at ``heads`` on, ``(n, ...)``, environment after environment.
@@ -364,21 +380,13 @@ class Ring:
         own = self._stored()
         known = newest = self.head
         for rows in parts:
-            if {*rows} - {"since_start"} != {*own, "first", "head"}:
-                raise ValueError(
-                    f"rows of the replay buffer hold {sorted(rows)}, expected {sorted({*own, 'first', 'head'})}"
-                )
+            self.check_rows(rows)
             first, head = rows["first"], rows["head"]
-            good = all(a.shape == (self.n_envs,) and a.dtype == np.int64 for a in (first, head))
-            if not good or not ((head >= first - 1) & (head - first < self.rows) & (first >= 0) & (head < 2**62)).all():
+            if not ((head >= first - 1) & (head - first < self.rows) & (first >= 0) & (head < 2**62)).all():
                 raise ValueError("rows of the replay buffer have damaged counters")
             n = int((head - first + 1).sum())
-            for name, array in own.items():
-                if rows[name].shape != (n, *array.shape[1:]) or rows[name].dtype != array.dtype:
-                    raise ValueError(
-                        f"{name} in rows of the replay buffer is {rows[name].dtype}{list(rows[name].shape)}, expected "
-                        f"{array.dtype}{[n, *array.shape[1:]]}; it was saved with another environment or buffer_size"
-                    )
+            if len(rows["kind"]) != n:
+                raise ValueError(f"rows of the replay buffer are {len(rows['kind'])}, and {n} by their counters")
             if rows["kind"].max(initial=0) > LAST:
                 raise ValueError("rows of the replay buffer have damaged kinds")
             if not (np.isfinite(rows["action"]).all() and np.isfinite(rows["reward"]).all()):
@@ -391,6 +399,32 @@ class Ring:
         if ((newest >= 0) & (known > np.maximum(newest - self.rows + 1, 0))).any():
             raise ValueError("rows of the replay buffer are missing")
         self._stand(newest.copy())
+
+    def check_rows(self, found: Mapping[str, Any]) -> None:
+        """Checks that arrays, or their specs, can be what :meth:`rows_since` returned.
+
+        Raises:
+            ValueError: if names, shapes or dtypes are others, or there are more rows than the ring has.
+        """
+        own = self._stored()
+        if {*found} - {"since_start"} != {*own, "first", "head"}:
+            raise ValueError(
+                f"rows of the replay buffer hold {', '.join(sorted(found))[:200]}, expected "
+                f"{', '.join(sorted({*own, 'first', 'head'}))}"
+            )
+        n = found["kind"].shape[0] if found["kind"].shape else 0
+        expected = {name: ((n, *array.shape[1:]), array.dtype) for name, array in own.items()}
+        expected |= dict.fromkeys(("first", "head"), ((self.n_envs,), np.dtype(np.int64)))
+        if "since_start" in found:
+            expected["since_start"] = ((n,), np.dtype(np.int32))
+        for name, (shape, dtype) in expected.items():
+            if found[name].shape != shape or found[name].dtype != dtype:
+                raise ValueError(
+                    f"{name} in rows of the replay buffer is {found[name].dtype}{list(found[name].shape)}, expected "
+                    f"{dtype}{list(shape)}; it was saved with another environment or buffer_size"
+                )
+        if n > self.rows * self.n_envs:
+            raise ValueError(f"there are {n:,} rows, and the replay buffer has {self.rows * self.n_envs:,}")
 
     def _stand(self, head: np.ndarray) -> None:
         """Takes the rows up to the times ``head`` for what is kept, and counts steps and episodes by their kinds."""

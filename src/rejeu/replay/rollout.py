@@ -55,6 +55,11 @@ class RolloutBuffer:
         """Steps of each environment kept so far."""
 
     @property
+    def nbytes(self) -> int:
+        """Bytes reserved."""
+        return self.n_steps * sum(array[0].nbytes for array in self._stores().values())
+
+    @property
     def full(self) -> bool:
         """Whether no further step fits in."""
         return self.length == self.n_steps
@@ -129,12 +134,14 @@ class RolloutBuffer:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns everything kept, as named arrays ``(steps, n_envs, ...)``."""
+        return {name: array[: self.length] for name, array in self._stores().items()}
+
+    def _stores(self) -> dict[str, np.ndarray]:
         stored = {f"obs.{i}": store for i, store in enumerate(self.obs)}
         stored |= {f"next_obs.{i}": store for i, store in enumerate(self.next_obs)}
-        stored |= {
+        return stored | {
             name: getattr(self, name) for name in ("action", "reward", "discount", "ended", "valid", "running_return")
         }
-        return {name: array[: self.length] for name, array in stored.items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Puts back what :meth:`arrays` returned.
@@ -143,9 +150,7 @@ class RolloutBuffer:
             ValueError: if names, shapes or dtypes are not those of this buffer, or if it would be full, as none is between
                 two steps; nothing is then changed.
         """
-        self.length, length = self.n_steps, self.length
-        own = self.arrays()
-        self.length = length
+        own = self._stores()
         if {*own} != {*arrays}:
             raise ValueError(f"the file and this buffer differ in the arrays {sorted({*own} ^ {*arrays})}")
         n = len(arrays["reward"])
