@@ -594,3 +594,14 @@ def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_
     assert "lower learning_rate (it is 1e+30)" in said
     agent = rejeu.load(tmp_path / "run" / "agent")
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+def test_a_saved_batch_whose_rewards_are_clipped_one_by_one_can_be_examined(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent = MAKE["SAC, normalised"](n_steps=3)
+    draw = agent._run.replay.draw
+    spoiled = lambda batch, drawn: (batch._replace(rewards=batch.rewards * np.float32(np.nan)), drawn)  # noqa: E731
+    agent._run.replay.draw = lambda *a: spoiled(*draw(*a))
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    assert "rewards (nan)" in finite.examine(agent, caught.value.batch).batch

@@ -19,9 +19,10 @@ from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.running_stats import MOST, Moments, NormalizationConfig, merged, normalised, nothing
 from rejeu.spaces import leaves, scale_action
 from tests.environments import Counter, Reach
-from tests.helpers import assert_same_parameters
+from tests.helpers import assert_same_parameters, small_sac
 from tests.probes.environments import Discretely, Later
 
+GAMMA = 0.9
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 WIDTH = 8
 merge = jax.jit(merged)
@@ -92,7 +93,7 @@ def showing(space, **settings):
         update=lambda state, batch, clock: (state, batch),
         recall=lambda carry, actor, obs, ended: (obs, carry),
     )
-    return normalised(inner, exploration.plain(inner), leaves(space), NormalizationConfig(**settings))
+    return normalised(inner, exploration.plain(inner), leaves(space), NormalizationConfig(**settings), GAMMA)
 
 
 def box(*shape):
@@ -212,6 +213,37 @@ def test_rewards_are_divided_by_the_deviation_of_the_returns_clipped_and_not_shi
     assert np.abs(expected).min() < 2.0
     np.testing.assert_allclose(shown.reward, expected, rtol=1e-5)
     np.testing.assert_allclose(shown.next_obs, zscore(batch.next_obs, batch.obs), atol=1e-4)
+
+
+def test_each_reward_of_an_n_step_return_is_clipped_by_itself():
+    algorithm, batch = showing(box(2), clip_reward=2.0), drawn_batch(5)
+    returns = np.float32([3.0, 9.0, 15.0, 9.0, 3.0, 15.0])
+    steps = np.random.default_rng(6).normal(0.0, 20.0, (6, 3)).astype(np.float32)
+    batch = batch._replace(reward=steps @ np.float32([1.0, GAMMA, GAMMA**2]), rewards=steps * GAMMA ** np.arange(3))
+    batch = batch._replace(rewards=batch.rewards.astype(np.float32))
+    shown = algorithm.update(after_seeing(algorithm, batch.obs, returns=returns), batch, CLOCK)[1]
+    each = np.clip(np.float64(steps) / np.std(np.float64(returns)), -2.0, 2.0)
+    assert (np.abs(each) == 2.0).any()
+    np.testing.assert_allclose(shown.reward, each @ np.array([1.0, GAMMA, GAMMA**2]), rtol=1e-5)
+    assert np.abs(shown.reward).max() > 2.0
+    assert shown.rewards is None
+    unseen = algorithm.update(algorithm.init(jax.random.PRNGKey(0)), batch, CLOCK)[1]
+    np.testing.assert_allclose(unseen.reward, batch.reward, rtol=1e-5)
+
+
+@pytest.mark.parametrize("hindsight", [False, True], ids=["plain", "hindsight"])
+def test_batches_hold_each_reward_where_it_is_to_be_clipped(hindsight):
+    def batch_of(**settings):
+        more = {"replay_buffer_class": "HerReplayBuffer"} if hindsight else {}
+        agent = small_sac(Reach() if hindsight else Counter((5,)), **more, **settings).learn(30)
+        return agent.replay_buffer.sample(np.random.default_rng(0), (2, 40))
+
+    batch = batch_of(normalize=True, n_steps=3)
+    assert batch.rewards.shape == (2, 40, 3)
+    np.testing.assert_allclose(batch.rewards.sum(axis=-1), batch.reward, rtol=1e-5)
+    assert batch_of(normalize=True).rewards is None
+    assert batch_of(normalize={"norm_reward": False}, n_steps=3).rewards is None
+    assert batch_of(n_steps=3).rewards is None
 
 
 @pytest.mark.parametrize("off", ["norm_obs", "norm_reward"])

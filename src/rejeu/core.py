@@ -41,6 +41,9 @@ class Transition(NamedTuple):
     """Weight of the bootstrapped value, ``(batch,)`` in [0, 1]."""
     weight: Any = None
     """Importance weights of prioritised replay, ``(batch,)`` in (0, 1]; None where all steps are equally likely."""
+    rewards: Any = None
+    """The discounted rewards that ``reward`` is the sum of, ``(batch, n)``, where normalization clips each; None
+    elsewhere. Algorithms do not see them."""
 
 
 class Masked(NamedTuple):

@@ -279,7 +279,8 @@ def _batch_like(agent: Agent, file: checkpoint.Contents) -> Transition | Rollout
         carry = jax.tree.map(lambda leaf: 0, agent._compiled.initial_carry(1))
         expected = Rollout(obs, 0, 0, obs, 0, 0, 0, 0, 0, carry)
     else:
-        expected = Transition(obs, 0, 0, obs, 0, 0 if "weight" in file.specs else None)
+        optional = {name: 0 for name in ("weight", "rewards") if name in file.specs}
+        expected = Transition(obs, 0, 0, obs, 0, **optional)
     names = checkpoint.names(expected)
     if file.header.get("algorithm") != agent.name or {*names} != {*file.specs}:
         raise CheckpointError(

@@ -150,7 +150,11 @@ def groups(leaves: tuple[Leaf, ...]) -> list[int | None]:
 
 
 def normalised(
-    algorithm: Algorithm, explorer: Explorer, leaves: tuple[Leaf, ...], config: NormalizationConfig
+    algorithm: Algorithm,
+    explorer: Explorer,
+    leaves: tuple[Leaf, ...],
+    config: NormalizationConfig,
+    gamma: float = 1.0,
 ) -> Algorithm:
     """Returns an algorithm on raw observations and rewards that keeps the statistics in its state.
 
@@ -159,6 +163,7 @@ def normalised(
         explorer: how it explores, noise included.
         leaves: those of the observations.
         config: what is scaled.
+        gamma: the discount factor of n-step returns, each of whose rewards is clipped by itself.
     """
     group = groups(leaves)
     members: dict[int, Leaf] = {g: leaf for g, leaf in zip(group, leaves, strict=True) if g is not None}
@@ -180,11 +185,16 @@ def normalised(
         z = (x.astype(jnp.float32) - mean) * jax.lax.rsqrt(variance + config.epsilon)
         return jnp.where(known, jnp.clip(z, -config.clip_obs, config.clip_obs), x.astype(jnp.float32))
 
-    def reward(statistics: Statistics, r: Array) -> Array:
+    def reward(statistics: Statistics, r: Array, most: float | Array = config.clip_reward) -> Array:
         if not config.norm_reward:
             return r
         scale = jax.lax.rsqrt(statistics.returns.variance + config.epsilon)
-        return jnp.where(statistics.returns.n_seen > 0, jnp.clip(r * scale, -config.clip_reward, config.clip_reward), r)
+        return jnp.where(statistics.returns.n_seen > 0, jnp.clip(r * scale, -most, most), r)
+
+    def n_step_reward(statistics: Statistics, rewards: Array) -> Array:
+        """Returns the sum of ``gamma^i r_i`` ``(batch, n)``, each ``r_i`` scaled and clipped."""
+        most = config.clip_reward * gamma ** jnp.arange(rewards.shape[1], dtype=jnp.float32)[None]
+        return jnp.sum(reward(statistics, rewards, most), axis=1)
 
     def seen(statistics: Statistics, obs: PyTree, weight: Array) -> Statistics:
         arrays = jax.tree.leaves(obs.obs if isinstance(obs, Masked) else obs)
@@ -219,10 +229,12 @@ def normalised(
             return learn(state, batch, clock)
         assert isinstance(batch, Transition)
         statistics = state.statistics
+        is_sum = batch.rewards is not None
         batch = batch._replace(
             obs=scaled(statistics, batch.obs),
             next_obs=scaled(statistics, batch.next_obs),
-            reward=reward(statistics, batch.reward),
+            reward=n_step_reward(statistics, batch.rewards) if is_sum else reward(statistics, batch.reward),
+            rewards=None,
         )
         learner, metrics = algorithm.update(state.learner, batch, clock)
         return State(learner, statistics), metrics

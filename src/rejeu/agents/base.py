@@ -163,7 +163,7 @@ class Agent(ABC):
         algorithm = self.algorithm.make(self.config, observation_space, action_space)
         if self.config.normalize is not None:
             explorer = exploration.make(algorithm, noise)
-            algorithm = normalised(algorithm, explorer, self._obs_leaves, self.config.normalize)
+            algorithm = normalised(algorithm, explorer, self._obs_leaves, self.config.normalize, self.config.gamma)
         self._compiled = Compiled(algorithm, noise, self.config.nonfinite == "skip")
 
     def _threads(self, n_envs: int) -> int:

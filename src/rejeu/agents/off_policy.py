@@ -141,9 +141,11 @@ class OffPolicyAgent(Agent):
             counters(config.hindsight),
         )
         priorities = None if config.priorities is None else Priorities(ring, config.priorities)
+        each_reward = config.normalize is not None and config.normalize.norm_reward
         if config.hindsight is None:
-            return ReplayBuffer(ring, config.gamma, config.n_steps, priorities)
-        return HerReplayBuffer(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, priorities)
+            return ReplayBuffer(ring, config.gamma, config.n_steps, priorities, each_reward)
+        goals = self._goals(env)
+        return HerReplayBuffer(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
 
     def _drop_rollout(self) -> None:
         """Nothing: learners with a replay buffer use the experience of any policy."""

@@ -27,7 +27,16 @@ import numpy as np
 from rejeu.core import Transition
 from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.ring import TERMINATED, Ring, Rows
-from rejeu.replay.uniform import batch, begin, bootstrap_discount, discounted_sum, discounts_by_kind, draw, look_ahead
+from rejeu.replay.uniform import (
+    batch,
+    begin,
+    bootstrap_discount,
+    discounted,
+    discounted_sum,
+    discounts_by_kind,
+    draw,
+    look_ahead,
+)
 
 
 class GoalSelectionStrategy(str, Enum):
@@ -95,8 +104,9 @@ class HerReplayBuffer:
         goals: GoalFunctions,
         n_steps: int = 1,
         priorities: Priorities | None = None,
+        each_reward: bool = False,
     ) -> None:
-        """Takes a ring that keeps the ``counters`` of ``config``.
+        """Takes a ring that keeps the ``counters`` of ``config``; ``each_reward`` is as for :class:`ReplayBuffer`.
 
         Raises:
             ValueError: if it does not.
@@ -112,6 +122,7 @@ class HerReplayBuffer:
         self.goals = goals
         self.n_steps = n_steps
         self.priorities = priorities
+        self.each_reward = each_reward and n_steps > 1
         self._discounts = discounts_by_kind(gamma)
         paths = [leaf.path for leaf in ring.obs_leaves]
         self.achieved = paths.index("achieved_goal")
@@ -157,8 +168,10 @@ class HerReplayBuffer:
         goal_index = self._goal_index(rng, rows.env[relabelled], rows.time[relabelled], step[relabelled])
         goal = ring.read_leaf(self.achieved, goal_index)
         steps: int | np.ndarray = 1
+        rewards = None
         if self.n_steps > 1:
-            reward, steps, terminated = self._n_step(rows, relabelled, goal)
+            rewards, steps, terminated = self._n_step(rows, relabelled, goal)
+            reward = discounted_sum(rewards, self.gamma)
             discount = bootstrap_discount(self.gamma, steps, terminated)
         _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
@@ -170,7 +183,8 @@ class HerReplayBuffer:
                     discount[relabelled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
         obs[self.desired][relabelled] = goal
         next_obs[self.desired][relabelled] = goal
-        return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight), drawn
+        rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
+        return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight, rewards), drawn
 
     def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
         """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
@@ -199,7 +213,7 @@ class HerReplayBuffer:
     def _n_step(
         self, rows: Rows, relabelled: slice | np.ndarray, goal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns n-step reward, number of steps and ``terminated``, for the new goals where there are any."""
+        """Returns rewards ``(batch, n)``, number of steps and ``terminated``, for the new goals where there are any."""
         ring = self.ring
         window = look_ahead(ring, rows, self.n_steps)
         rewards, valid = ring.reward[window.position], window.valid.copy()
@@ -213,7 +227,7 @@ class HerReplayBuffer:
             terminal[relabelled] = ends
             valid[relabelled, 1:] &= ~np.logical_or.accumulate(ends, axis=1)[:, :-1]
             terminal &= valid
-        return discounted_sum(rewards, valid, self.gamma), valid.sum(axis=1), terminal.any(axis=1)
+        return np.where(valid, rewards, np.float32(0.0)), valid.sum(axis=1), terminal.any(axis=1)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns everything kept, as named arrays; goals are drawn anew each time, so nothing else is needed."""

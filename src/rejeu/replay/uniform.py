@@ -16,11 +16,20 @@ from rejeu.replay.ring import LAST, TERMINATED, Ring, Rows
 class ReplayBuffer:
     """Draws transitions from a :class:`Ring`, uniformly or by priority."""
 
-    def __init__(self, ring: Ring, gamma: float, n_steps: int = 1, priorities: Priorities | None = None) -> None:
+    def __init__(
+        self,
+        ring: Ring,
+        gamma: float,
+        n_steps: int = 1,
+        priorities: Priorities | None = None,
+        each_reward: bool = False,
+    ) -> None:
+        """Draws from ``ring``; with ``each_reward`` transitions of several steps have :attr:`Transition.rewards`."""
         self.ring = ring
         self.gamma = gamma
         self.n_steps = n_steps
         self.priorities = priorities
+        self.each_reward = each_reward and n_steps > 1
         self._discounts = discounts_by_kind(gamma)
 
     def size(self) -> int:
@@ -55,14 +64,17 @@ class ReplayBuffer:
         rows, weight, drawn = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
         step, obs = self.ring.read(rows.position)
         steps: int | np.ndarray = 1
+        rewards = None
         if self.n_steps == 1:
             reward, discount = step["reward"], self._discounts.take(rows.kind)
         else:
             window = look_ahead(self.ring, rows, self.n_steps)
-            reward = discounted_sum(self.ring.reward[window.position], window.valid, self.gamma)
+            rewards = np.where(window.valid, self.ring.reward[window.position], np.float32(0.0))
+            reward = discounted_sum(rewards, self.gamma)
             steps, discount = window.steps, bootstrap_discount(self.gamma, window.steps, window.terminated)
         _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
-        return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight), drawn
+        rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
+        return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight, rewards), drawn
 
     def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
         """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
@@ -104,6 +116,7 @@ def batch(
     next_obs: list[np.ndarray],
     discount: np.ndarray,
     weight: np.ndarray | None,
+    rewards: np.ndarray | None = None,
 ) -> Transition:
     """Returns transitions in ``shape`` from flat arrays; weights are divided by the largest of each batch."""
 
@@ -113,8 +126,10 @@ def batch(
     if weight is not None:
         weight = shaped(weight)
         weight /= weight.max(axis=-1, keepdims=True)
+    if rewards is not None:
+        rewards = shaped(rewards)
     if len(shape) == 1:
-        return Transition(ring.tree(obs), action, reward, ring.tree(next_obs), discount, weight)
+        return Transition(ring.tree(obs), action, reward, ring.tree(next_obs), discount, weight, rewards)
     return Transition(
         ring.tree([shaped(leaf) for leaf in obs]),
         shaped(action),
@@ -122,6 +137,7 @@ def batch(
         ring.tree([shaped(leaf) for leaf in next_obs]),
         shaped(discount),
         weight,
+        rewards,
     )
 
 
@@ -150,10 +166,14 @@ def look_ahead(ring: Ring, rows: Rows, n: int) -> Window:
     return Window(index, valid, valid.sum(axis=1), ((kind == TERMINATED) & valid).any(axis=1))
 
 
-def discounted_sum(rewards: np.ndarray, valid: np.ndarray, gamma: float) -> np.ndarray:
-    """Returns ``sum_i gamma^i r_i`` over the valid steps, ``float32 (batch,)``."""
-    weights = gamma ** np.arange(rewards.shape[1])
-    return (np.where(valid, rewards, 0.0) @ weights).astype(np.float32)
+def discounted_sum(rewards: np.ndarray, gamma: float) -> np.ndarray:
+    """Returns ``sum_i gamma^i r_i`` of rewards ``(batch, n)``, ``float32 (batch,)``."""
+    return (rewards @ gamma ** np.arange(rewards.shape[1])).astype(np.float32)
+
+
+def discounted(rewards: np.ndarray, gamma: float) -> np.ndarray:
+    """Returns ``gamma^i r_i`` of rewards ``(batch, n)``, ``float32``."""
+    return (rewards * gamma ** np.arange(rewards.shape[1])).astype(np.float32)
 
 
 def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
