@@ -241,3 +241,16 @@ def test_flat_keys_are_those_of_dicts_of_arrays_alone():
     assert spaces.flat_keys(spaces.structure(flat)) == [leaf.path for leaf in spaces.leaves(flat)] == ["a.b", "m", "z"]
     for other in (box, gym_spaces.Tuple([box]), gym_spaces.Dict({"a": gym_spaces.Dict({"b": box})})):
         assert spaces.flat_keys(spaces.structure(other)) is None
+
+
+def test_every_whole_number_of_a_box_of_integers_gets_an_equal_part_of_the_range():
+    space = gym_spaces.Box(np.array([0, -2], np.int64), np.array([3, 2], np.int64), dtype=np.int64)
+    spread = np.linspace(-1.0, 1.0, 2001, dtype=np.float32)
+    actions = spaces.scale_action(space, np.stack([spread, spread], axis=1))
+    assert actions.dtype == np.int64
+    for column, numbers in enumerate((np.arange(4), np.arange(-2, 3))):
+        found, counts = np.unique(actions[:, column], return_counts=True)
+        np.testing.assert_array_equal(found, numbers)
+        np.testing.assert_allclose(counts, 2001 / len(numbers), atol=2)
+    assert spaces.scale_action(space, np.float32([[-7.0, 7.0]])).tolist() == [[0, 2]]
+    assert space.contains(actions[0])

@@ -197,7 +197,8 @@ def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     """Returns actions in the environment's own range from what an algorithm gives.
 
     Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; what lies beyond is clipped, and
-    components without finite bounds are left as they are. Discrete and MultiDiscrete: from 0 to n - 1 to the space's own
+    components without finite bounds are left as they are. Of a Box of integers, each number from low to high is given an
+    equal part of [-1, 1]. Discrete and MultiDiscrete: from 0 to n - 1 to the space's own
     numbers. MultiBinary: the bits.
     """
     return action_scaler(space)(action)
@@ -211,6 +212,9 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
             return lambda action: action.reshape(shape).clip(-1.0, 1.0)
         bounded = np.isfinite(space.low) & np.isfinite(space.high)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        if space.dtype.kind != "f":
+            half, whole = 0.5 * (high - low + 1.0), space.dtype
+            return lambda action: np.floor(low + (action.reshape(shape) + 1.0) * half).clip(low, high).astype(whole)
         start, half = np.where(bounded, low, -1.0), np.where(bounded, 0.5 * (high - low), 1.0)
         dtype = space.dtype
 
