@@ -515,6 +515,16 @@ def test_learning_goes_on_after_loading_and_collects_learning_starts_steps_first
     assert (loaded.num_timesteps, loaded.n_updates) == (31, 15)
 
 
+def test_another_number_of_environments_collects_learning_starts_steps_before_it_learns(agent):
+    """Its buffer is empty: batches would otherwise be copies of the first few steps."""
+    starts, n_updates = agent.config.learning_starts, agent.n_updates
+    agent.set_env(InProcess([Counter((5,)) for _ in range(2)]))
+    agent.learn(starts, reset_num_timesteps=False)
+    assert agent.n_updates == n_updates
+    agent.learn(4, reset_num_timesteps=False)
+    assert agent.n_updates == n_updates + 4
+
+
 def test_after_loading_the_buffer_too_learning_goes_on_at_once(agent, tmp_path):
     buffer = agent.save_replay_buffer(tmp_path / "buffer")
     loaded = rejeu.SAC.load(agent.save(tmp_path / "model"), env=Counter((5,)))

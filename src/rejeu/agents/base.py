@@ -431,7 +431,8 @@ class Agent(ABC):
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Gives the agent another environment of the same spaces; its episodes start anew.
 
-        With another number of environments a replay buffer starts empty; otherwise it is kept.
+        With another number of environments a replay buffer starts empty, and ``learning_starts`` steps are taken before
+        the next gradient step, as after ``load``; otherwise it is kept.
 
         Raises:
             ValueError: if the spaces differ.
@@ -450,6 +451,7 @@ class Agent(ABC):
             run.replay = self._make_buffer(vector)
             run.td_errors = []
             run.carry = self._compiled.initial_carry(vector.n_envs)
+            run.learn_from = self._learn_from(run.step)
         else:
             self._keep_buffer(vector)
         run.env = vector
