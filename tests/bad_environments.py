@@ -229,6 +229,23 @@ class SameArray(Good):
         return self.array
 
 
+class HugeReward(Good):
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        return obs, 1e300 if self.late else reward, *rest
+
+
+class EndlessReward(Good):
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        return obs, 10**400 if self.late else reward, *rest
+
+
+class NoInfo(Good):
+    def step(self, action):
+        return *super().step(action)[:4], None if self.late else {}
+
+
 class Line(Reach):
     """A goal environment with nothing wrong."""
 
@@ -324,6 +341,13 @@ EVERY: dict[str, Fault] = {
     ),
     "no reward": Fault(NoReward, "error", "the reward None", "the reward None, expected one finite number"),
     "nan reward": Fault(NanReward, "error", "the reward nan, expected one finite", "returned the reward nan in env"),
+    "huge reward": Fault(
+        HugeReward, "error", r"the reward 1e\+300, beyond 3.4e\+38", r"the reward 1e\+300, beyond 3.4e\+38"
+    ),
+    "endless reward": Fault(
+        EndlessReward, "error", r"the reward 10000\d+, beyond", r"the reward 10000\d+, beyond 3.4e\+38"
+    ),
+    "no info": Fault(NoInfo, "error", "the info None, expected a dict", "step 3: .*the info None, expected a dict"),
     "reward array": Fault(RewardArray, "error", r"a reward of shape \(2,\)", r"a reward of shape \(2,\).*sum or av"),
     "reward of one": Fault(RewardOfOne, "error", r"a reward of shape \(1,\).*float\(reward\[0\]\)", None),
     "reward text": Fault(RewardText, "error", "the reward '.*' of type str", "the reward '.*' of type str, expected"),

@@ -246,15 +246,6 @@ def test_a_reward_of_goals_that_is_no_number_is_explained():
         goals.reward(np.zeros((4, 1), np.float32), np.zeros((4, 1), np.float32))
 
 
-def test_an_info_that_is_no_dict_is_explained():
-    class NoInfo(Good):
-        def step(self, action):
-            return *super().step(action)[:4], None
-
-    with pytest.raises(BadEnvironmentError, match=r"the info None, expected a dict; return \{\} if"):
-        small_sac(NoInfo(), learning_starts=99).learn(25)
-
-
 # The command.
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.envs.conversions import fitted, parts
-from rejeu.envs.faults import described, name_of, reset_fault, seed_fault
+from rejeu.envs.faults import described, name_of, reset_fault, reward_fault, seed_fault
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import Leaf, cast, flat_keys, leaves, plain, structure
 
@@ -129,4 +129,10 @@ def for_each(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
     if array.shape != (n_envs,) or array.dtype.kind not in ("fiub" if dtype == np.float32 else "iub"):
         kind = "numbers" if dtype == np.float32 else "bools"
         raise BadEnvironmentError(f"{name} as {described(values)}, expected {kind} of shape ({n_envs},)")
-    return array.astype(dtype, copy=False)
+    with np.errstate(over="ignore"):
+        kept = array.astype(dtype, copy=False)
+    if dtype == np.float32 and not math.isfinite(np.vdot(kept, kept)):
+        large = array[np.isinf(kept) & np.isfinite(array)]
+        if large.size:
+            raise BadEnvironmentError(reward_fault(large[0].item()))
+    return kept

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ FLAGS = frozenset((bool, np.bool_))
 """The types of ``terminated`` and ``truncated``."""
 NUMBERS = frozenset((float, int, np.float64, np.float32, np.int64, np.int32))
 """The types of rewards that are taken as they are."""
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest reward that can be kept."""
 
 
 def keeps(array: np.ndarray, dtype: Any) -> bool:
@@ -59,13 +62,18 @@ def reward_of(reward: Any) -> float:
     """Returns a reward as a float; arrays of one number are taken, None and text are not.
 
     Raises:
+        OverflowError: if it is finite and beyond ``LARGEST``.
         TypeError, ValueError: if it is no number.
     """
     if type(reward) in NUMBERS:
-        return float(reward)
-    if reward is None or isinstance(reward, str | bytes):
+        number = float(reward)
+    elif reward is None or isinstance(reward, str | bytes):
         raise TypeError("no number")
-    return float(np.asarray(reward, np.float64).reshape(()) if np.size(reward) == 1 else reward)
+    else:
+        number = float(np.asarray(reward, np.float64).reshape(()) if np.size(reward) == 1 else reward)
+    if LARGEST < abs(number) < math.inf:
+        raise OverflowError("more than a float32 holds")
+    return number
 
 
 def flag_of(flag: Any) -> bool:

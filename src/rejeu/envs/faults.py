@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.envs.conversions import FLAGS, flag_of, keeps, parts, reward_of
+from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, keeps, parts, reward_of
 from rejeu.spaces import Leaf, leaves
 
 STEP_VALUES = "(obs, reward, terminated, truncated, info)"
@@ -78,6 +78,8 @@ def reward_fault(reward: Any, strict: bool = False) -> str | None:
         return f"a reward of shape {np.shape(reward)}, expected one finite number; {hint}"
     try:
         number = reward_of(reward)
+    except OverflowError:
+        return f"the reward {reward!r:.40}, beyond {LARGEST:.3g}, the largest that float32 holds; scale rewards down"
     except (TypeError, ValueError):
         return f"the reward {described(reward)}, {fix}"
     if strict and not np.isfinite(number):

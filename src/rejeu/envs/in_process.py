@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from rejeu.envs import answers, faults, goals as goals_module, state
 from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
-from rejeu.envs.conversions import FLAGS, flag_of, reward_of
+from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, reward_of
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError
@@ -93,11 +93,15 @@ class InProcess(VectorEnv):
                     only[i] = obs  # what put does, without the call
                 else:
                     put(i, obs)
-                reward[i] = gain if type(gain) is float else reward_of(gain)
+                if type(gain) is not float or not -LARGEST <= gain <= LARGEST:
+                    gain = reward_of(gain)
+                reward[i] = gain
                 if ended is not False:
                     terminated[i] = ended if type(ended) in FLAGS else flag_of(ended)
                 if cut is not False:
                     truncated[i] = cut if type(cut) in FLAGS else flag_of(cut)
+                if type(info[i]) is not dict and not isinstance(info[i], dict):
+                    raise TypeError("the info is no dict")
             except Exception as error:  # whatever NumPy says of an answer that does not fit
                 raise self._bad(i, faults.step_fault(answer, self.observation_space), error) from error
         return Step(self._obs, reward, terminated, truncated, info)

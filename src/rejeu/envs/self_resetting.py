@@ -94,6 +94,11 @@ class SelfResetting(VectorEnv):
             reward = answers.for_each("rewards", reward, self.n_envs, np.float32)
         except BadEnvironmentError as error:
             raise self._bad(f"step returned {error}") from error.__cause__
+        for i, info in enumerate(infos):
+            if not isinstance(info, dict):
+                raise self._bad(
+                    f"step returned infos[{i}]={info!r:.40}, expected a dict; {{}} if there is nothing to say"
+                )
         truncated = np.array([bool(info.get(TIME_LIMIT, False)) for info in infos]) & done
         obs = self._after_reset = self._cast(shown)
         returns = None
