@@ -21,6 +21,7 @@ from rejeu.envs.subproc import SubprocVecEnv
 from rejeu.envs.vec_wrappers import VecMonitor
 from rejeu.envs.vector import GymnasiumVector, make_vector
 from rejeu.errors import BadEnvironmentError
+from rejeu.loops import host
 from rejeu.loops.host import check_finite
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac
@@ -244,6 +245,45 @@ def test_a_reward_of_goals_that_is_no_number_is_explained():
     goals = make_vector(RewardWithAxis, 1, "gymnasium").goals()
     with pytest.raises(BadEnvironmentError, match=r"compute_reward returned an array of shape \(1,\) .* of one goal"):
         goals.reward(np.zeros((4, 1), np.float32), np.zeros((4, 1), np.float32))
+
+
+class Far(Good):
+    """Shows its place 1e6 times as far away as it is; the place is declared to be from -20 to 20."""
+
+    scale = 1e6
+
+    def observe(self):
+        return super().observe() * np.float32([1.0, 1.0, self.scale])
+
+
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+def test_observations_far_outside_of_the_declared_bounds_are_told_once(algorithm):
+    agent = rejeu.AGENTS[algorithm]("MlpPolicy", make_vector(Far, 2, "gymnasium"), policy_kwargs={"net_arch": [4]})
+    words = r"Far returned the observation with -?\d.*e\+0\d at index 2 in environment 0, far outside of .*\[-20, 20\]"
+    with pytest.warns(UserWarning, match=words) as caught:
+        agent.learn(60)
+    assert len(caught) == 1
+    assert str(caught[0].message).endswith("declare the bounds that they really have")
+
+
+def test_observations_are_compared_with_their_bounds_at_steps_twice_as_far_apart_each_time(monkeypatch):
+    looked = []
+    monkeypatch.setattr(host.faults, "far_outside", lambda space, obs: looked.append(True))
+    steps = []
+    agent = small_sac(Good(), learning_starts=999)
+    agent.learn(200, lambda agent, turn: steps.extend([turn.step] * len(looked)) or looked.clear())
+    assert steps == [1, 2, 4, 8, 16, 32, 64, 128]
+
+
+def test_what_is_unbounded_or_little_outside_is_not_told():
+    class Little(Far):
+        scale = 2.0
+
+    class Unbounded(Far):
+        observation_space = gym.spaces.Box(np.float32([-1, -1, -np.inf]), np.float32([20, 20, 1]), dtype=np.float32)
+
+    for kind in (Little, Unbounded):
+        small_sac(kind(), learning_starts=999).learn(40)  # warnings are errors in tests
 
 
 # The command.

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import gymnasium as gym
+import jax
 import numpy as np
 from gymnasium import spaces
 
@@ -18,6 +19,8 @@ from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, keeps, parts, reward
 from rejeu.spaces import Leaf, leaves
 
 STEP_VALUES = "(obs, reward, terminated, truncated, info)"
+FAR = 10.0
+"""How many times the distance of its bounds an observation may lie outside of them before that is told."""
 TERMINATED_AND_TRUNCATED = (
     "terminated says that the task itself ended, truncated that a time limit cut the episode off; return both as bools"
 )
@@ -188,6 +191,29 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
             return "warning" if leaf.kind in ("continuous", "image") else "error", (
                 f"{name_of(leaf.path)} with {array[at]}{_place(at)}{more}, outside of the declared bounds "
                 f"[{low[at]}, {high[at]}]; declare the bounds that it really has, or clip it"
+            )
+    return None
+
+
+def far_outside(space: spaces.Space, obs: Any) -> str | None:
+    """Says which number of a batch of observations lies far outside of the declared bounds.
+
+    Far is ``FAR`` times the distance of the two bounds. Images cannot lie outside, and what is unbounded is not looked at.
+    """
+    for leaf, part, array in zip(leaves(space), parts(space), jax.tree.leaves(obs), strict=False):  # a mask may follow
+        if leaf.kind != "continuous":
+            continue
+        assert isinstance(part, spaces.Box)
+        low, high = part.low.astype(np.float64), part.high.astype(np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            width = high - low
+            outside = np.argwhere(((array < low - FAR * width) | (array > high + FAR * width)) & (width > 0))
+        if len(outside):
+            env, *at = outside[0].tolist()
+            where = tuple(at)
+            return (
+                f"{name_of(leaf.path)} with {array[env, *where]:.4g}{_place(where)} in environment {env}, far outside of "
+                f"the declared bounds [{part.low[where]:.4g}, {part.high[where]:.4g}]"
             )
     return None
 

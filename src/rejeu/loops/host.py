@@ -7,6 +7,7 @@ iterates them decides what else happens.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from rejeu.core import Clock, PyTree
+from rejeu.envs import faults
 from rejeu.envs.vector import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError, NonFiniteError
 from rejeu.loops.compiled import Compiled, PackedState
@@ -112,6 +114,8 @@ class Run:
     turn later."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*PARTS, "total"), 0.0))
     """Wall time by what it went into; ``update`` is the time that the loop waited for the device."""
+    next_look: float = 0
+    """Environment steps from which on observations are next compared with their declared bounds."""
     watch: Watch = field(default_factory=Watch)
     """Looks after the updates: whether what they leave is finite."""
 
@@ -253,6 +257,24 @@ def check_obs(run: Run, obs: PyTree, taken: int, what: str) -> None:
                 "finite numbers: mend the environment, or wrap it with gymnasium.wrappers.TransformObservation and "
                 "np.nan_to_num"
             )
+
+
+def look_at_bounds(run: Run, obs: PyTree) -> None:
+    """Warns if an observation ``(n_envs, ...)`` lies far outside of the declared bounds, once in a run.
+
+    To be called from the step ``run.next_look`` on, which is twice as far away every time: looking takes longer than a
+    step of some environments.
+    """
+    run.next_look = 2 * run.step + 1
+    fault = faults.far_outside(run.env.observation_space, obs)
+    if fault is not None:
+        run.next_look = math.inf
+        warnings.warn(
+            f"{run.env.env_id} returned {fault}, after {run.step} steps. Networks learn badly from large numbers: scale the "
+            "observations, or set normalize=True if it is not, and declare the bounds that they really have",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _check_action(run: Run, taken: int) -> None:

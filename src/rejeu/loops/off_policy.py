@@ -36,6 +36,7 @@ from rejeu.loops.host import (
     clock_of,
     counted,
     last_of,
+    look_at_bounds,
     reset_done,
     restart,
 )
@@ -76,6 +77,8 @@ def off_policy(
         step = env.step(action)
         t1 = time.perf_counter()
         check_finite(run, step, run.step)
+        if run.step >= run.next_look:
+            look_at_bounds(run, step.obs)
         if compiled.observe is not None:
             run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
         run.replay.add(run.action, step.reward, step.terminated, step.obs, active)

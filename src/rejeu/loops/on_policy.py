@@ -30,6 +30,7 @@ from rejeu.loops.host import (
     clock_of,
     counted,
     last_of,
+    look_at_bounds,
     reset_done,
     restart,
 )
@@ -73,6 +74,8 @@ def on_policy(
         step = env.step(action, stepped)
         t2 = time.perf_counter()
         check_finite(run, step, run.step)
+        if run.step >= run.next_look:
+            look_at_bounds(run, step.obs)
         counts = which_count(run, stepped, last)
         run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
         valid = True if counts is None else counts
