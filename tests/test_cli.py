@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -210,7 +211,17 @@ def test_list_shows_algorithms_and_presets(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
     assert re.search(r"SAC +Soft actor-critic", text)
-    assert re.search(r"parking-v0 +SAC +56,000 steps", text)
+    assert re.search(r"parking-v0 +SAC +56,000 steps  success", text)
+
+
+def test_list_groups_presets_by_environment_in_columns(capsys):
+    main(["list"])
+    lines = capsys.readouterr().out.partition("environments with")[2].splitlines()[1:]
+    rows = [line for line in lines if " steps  " in line]
+    assert len(rows) == len(rejeu.presets.ALL)
+    assert len({row.index(" steps  ") for row in rows}) == 1
+    named = [row.split()[0] for row in rows if not row.startswith("   ")]
+    assert sorted(named) == sorted({preset.env_id for preset in rejeu.presets.ALL})
 
 
 def test_version_is_printed(capsys):
@@ -271,6 +282,12 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "Pendulum-v1", "--steps", "5", "--minutes", "1"], "exclude each other"),
         (["train", "Pendulum-v1", "--steps", "0"], "--steps=0 must be"),
         (["train", "Pendulum-v1", "--seed", "-1"], "seed=-1 must be"),
+        (
+            ["train", "LunarLander-v2"],
+            "LunarLander-v2 is an old version that Gymnasium no longer has; use LunarLander-v3",
+        ),
+        (["train", "ALE/Pong-v5"], "pip install ale-py; EnvPool has Pong-v5: backend='envpool' (--backend envpool)"),
+        (["check", "Pong-v5"], "Gymnasium has no Pong-v5, so it cannot be drawn or stepped by Gymnasium; EnvPool has"),
         (["trian", "Pendulum-v1"], "no command is called 'trian'; did you mean train?"),
         (["train"], "rejeu train needs ENV"),
         (["train", "Pendulum-v1", "CartPole-v1"], "does not expect 'CartPole-v1'"),
@@ -290,6 +307,13 @@ def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, monkeypatch, tmp_p
     monkeypatch.chdir(tmp_path)
     assert message in error_of(capsys, *argv)
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.filterwarnings("ignore:.*HalfCheetah-v3 is out of date:DeprecationWarning")
+def test_an_old_version_that_gymnasium_lists_and_cannot_make_names_the_new_one(capsys):
+    assert "HalfCheetah-v3 is an old version that cannot be made any more" in error_of(
+        capsys, "check", "HalfCheetah-v3"
+    )
 
 
 def test_a_folder_that_is_no_run_is_an_error(capsys, tmp_path):
@@ -472,6 +496,27 @@ def test_what_could_not_be_written_is_repeated_at_the_end_of_the_command(tmp_pat
     assert [row["step"] for row in rows(out / "evaluations.csv")] == ["40"]
     assert not (out / "agent.safetensors").exists()
     assert rejeu.load(out / "best.safetensors").num_timesteps == 40
+
+
+def test_check_leaves_out_what_only_the_authors_of_a_package_can_change(capsys):
+    assert main(["check", "CartPole-v1"]) == 0
+    text = capsys.readouterr().out
+    assert text.splitlines()[0] == "CartPole-v1: no errors, no warnings"
+    assert re.search(r"\d+ warnings? on what only the authors of gymnasium can change; --all shows it", text)
+    assert main(["check", "CartPole-v1", "--all"]) == 0
+    assert "warning: gymnasium.utils.env_checker" in capsys.readouterr().out
+
+
+def test_a_warning_is_one_line_on_the_command_line(capsys):
+    argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1", "--minutes", "1"]
+    with pytest.MonkeyPatch.context() as patch:
+        warn = lambda arguments: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
+        patch.setattr("rejeu.cli.train.check", warn)
+        patch.setattr("rejeu.cli.train.named", lambda *_: (_ for _ in ()).throw(ValueError("over")))
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            assert main(argv) == 2
+    assert capsys.readouterr().err == "warning: one two\nrejeu: error: over\n"
 
 
 def test_an_error_of_many_lines_becomes_one():

@@ -1,4 +1,5 @@
 import dataclasses
+from pathlib import Path
 
 import pytest
 
@@ -37,3 +38,30 @@ def test_a_preset_cannot_be_changed():
     with pytest.raises(TypeError):
         preset.hyperparameters["gamma"] = 0.5
     assert hash(preset)
+
+
+ROOT = Path(__file__).parents[1]
+PAGES = {
+    "parking-v0 SAC": "README.md",
+    "rejeu/Ball-v0 TD3": "docs/ball.md",
+    "rejeu/Ball-v0 DDPG": "docs/ball.md",
+    "rejeu/Ball-v0 SAC": "docs/ball.md",
+    "rejeu/CartPoleNoVelocity-v0 RecurrentPPO": "docs/algorithms/ppo.md",
+}
+"""Where results are stated, if not on the page of the algorithm."""
+
+
+def test_every_preset_has_a_result_and_every_result_a_preset():
+    assert {f"{preset.env_id} {preset.algorithm}" for preset in presets.ALL} == set(presets.results())
+
+
+@pytest.mark.parametrize("name", presets.results())
+def test_results_are_the_same_in_the_documentation(name):
+    page = PAGES.get(name, f"docs/algorithms/{name.split()[1].lower()}.md")
+    text = " ".join((ROOT / page).read_text(encoding="utf-8").split()).replace("**", "")
+    figures = presets.results()[name]["figures"]
+    if name.startswith("rejeu/Ball-v0"):  # a cell for each algorithm
+        assert f"| {figures} |" in text
+    else:
+        assert figures in text
+    assert figures in next(p.result for p in presets.ALL if f"{p.env_id} {p.algorithm}" == name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import builtins
+import ctypes.util
 import importlib.util
 import os
 import re
@@ -381,3 +382,17 @@ def test_an_environment_of_envpool_is_filmed_though_its_package_was_not_imported
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "film")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.splitlines()[-1]).stat().st_size > 1000
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="EGL is Linux's")
+@pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="needs EGL")
+def test_mujoco_draws_without_a_screen(monkeypatch):
+    pytest.importorskip("mujoco")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    env = gym.make("InvertedPendulum-v5", render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = video.rgb_frame(env)
+    env.close()
+    assert frame.std() > 0
+    assert "MUJOCO_GL" not in os.environ

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import ctypes.util
 import dataclasses
 import html
 import os
@@ -10,6 +11,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -223,8 +225,7 @@ def display_for_pygame() -> Iterator[None]:
     therefore opened under that setting, and the setting hidden from whoever draws on it.
     """
     before = os.environ.get("SDL_VIDEODRIVER")
-    headless = sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
-    driver = "dummy" if before is None and headless else before
+    driver = "dummy" if before is None and is_headless() else before
     try:
         if driver == "dummy":
             os.environ["SDL_VIDEODRIVER"] = driver
@@ -242,18 +243,44 @@ def display_for_pygame() -> Iterator[None]:
 
 
 @contextmanager
+def mujoco_without_screen() -> Iterator[None]:
+    """Lets MuJoCo draw where there is no display, by EGL or else OSMesa, unless ``MUJOCO_GL`` is set; it is put back."""
+    if "mujoco" not in sys.modules or "MUJOCO_GL" in os.environ or not is_headless():
+        yield
+        return
+    libraries = {"egl": "EGL", "osmesa": "OSMesa"}
+    driver = next((name for name, library in libraries.items() if ctypes.util.find_library(library)), None)
+    try:
+        if driver is not None:
+            os.environ["MUJOCO_GL"] = driver
+        yield
+    finally:
+        os.environ.pop("MUJOCO_GL", None)
+
+
+def is_headless() -> bool:
+    """Returns whether this is a Linux without a display."""
+    return sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+
+
+@contextmanager
 def said_of_mujoco(env: gym.Env) -> Iterator[None]:
     """Raises ``ValueError``, which names the fix, where MuJoCo cannot draw for want of a screen."""
     try:
-        yield
+        with mujoco_without_screen(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"\(\d+\) b'")  # GLFW's, of which the error below tells
+            yield
     except Exception as error:
         kind = type(error)
         if (kind.__module__, kind.__name__) != ("mujoco", "FatalError"):
             raise
         chosen = os.environ.get("MUJOCO_GL")
+        fix = "set the environment variable MUJOCO_GL=egl (or osmesa) before starting Python"
+        if chosen is None:
+            fix = f"install EGL (on Debian and Ubuntu libegl1) or OSMesa (libosmesa6), or {fix}"
         raise ValueError(
             f"{env} cannot be drawn: MuJoCo got no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a screen or "
-            "drawing without one; set the environment variable MUJOCO_GL=egl (or osmesa) before starting Python"
+            f"drawing without one; {fix}"
         ) from error
 
 

@@ -5,11 +5,13 @@ What a command needs is imported when it runs, so that asking for help is quick.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, TextIO
+from typing import Any
 
 import tyro
 
@@ -50,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"rejeu {__version__}")
         return 0
+    if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
+        os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with interrupt.leaving(), warnings.catch_warnings():
         warnings.showwarning = show_warning
         return carry_out(argv)
@@ -71,19 +75,9 @@ def carry_out(argv: Sequence[str]) -> int:
         return 2
 
 
-def show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    """Prints a warning for the user on one line; others with the place in the code, as Python does."""
-    if category is UserWarning:
-        print(f"warning: {one_line(message)}", file=sys.stderr)
-    else:
-        print(warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr, end="")
+def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Prints a warning on one line, without the place in the code, which is no help on a command line."""
+    print(f"warning: {one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
 
 
 def expected_errors() -> tuple[type[Exception], ...]:

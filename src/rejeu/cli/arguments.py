@@ -20,6 +20,8 @@ class Option(NamedTuple):
     """Types that its value may have."""
     choices: tuple[str, ...]
     """The only values that it may have, where there are such."""
+    is_flag: bool
+    """Whether it takes no value."""
     takes_many: bool
     """Whether it takes all words up to the next option."""
     is_place: bool
@@ -52,6 +54,9 @@ def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
             if name not in by_name:
                 raise ValueError(f"rejeu {command} has no option {name}; {nearest(name, by_name)}")
             option = by_name[name]
+            if option.is_flag:
+                result.append(name)
+                continue
             end = i
             while (
                 not equals and end < len(words) and not words[end].startswith("--") and (option.takes_many or end == i)
@@ -117,6 +122,7 @@ def _option(field: dataclasses.Field[Any], hint: Any) -> Option:
         name=str(said.metavar) if is_place else f"--{said.name or field.name}".replace("_", "-"),
         kinds=get_args(hint) if isinstance(hint, UnionType) else (hint,),
         choices=get_args(hint) if get_origin(hint) is Literal else (),
+        is_flag=hint is bool,
         takes_many=get_origin(hint) is tuple and get_origin(get_args(hint)[0]) is tuple,
         is_place=is_place,
         is_required=field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -15,10 +16,30 @@ def run(arguments: List) -> int:
     from rejeu import AGENTS, presets
 
     print("algorithms")
-    for name, agent in AGENTS.items():
-        print(f"  {name:<22}{(agent.__doc__ or '').partition(chr(10))[0]}")
-    print("\npresets (any other Gymnasium or EnvPool id is trained with the algorithm's defaults)")
-    for preset in presets.ALL:
-        steps = f"{preset.total_steps:>10,} steps"
-        print(f"  {preset.env_id:<22}{preset.algorithm:<6}{steps}  {preset.result or preset.source}")
+    print(columns([(name, (agent.__doc__ or "").partition("\n")[0]) for name, agent in AGENTS.items()]))
+    print("\nenvironments with tuned hyper-parameters, the preset of rejeu train first")
+    env_ids = list(dict.fromkeys(preset.env_id for preset in presets.ALL))
+    rows = []
+    for env_id in env_ids:
+        of_env = [preset for preset in presets.ALL if preset.env_id == env_id]
+        for i, preset in enumerate(of_env):
+            first = env_id if i == 0 else ""
+            rows.append((first, preset.algorithm, f"{preset.total_steps:,} steps", preset.result or preset.source))
+    print(columns(rows))
+    print("\nAny other Gymnasium or EnvPool id is trained with the algorithm's defaults. Intervals are of 95 %.")
     return 0
+
+
+def columns(rows: Sequence[tuple[str, ...]]) -> str:
+    """Returns rows in columns, each as wide as its longest entry; numbers, which begin with a digit, to the right.
+
+    >>> print(columns([("a", "10"), ("bcd", "7")]))
+      a    10
+      bcd   7
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  " + "  ".join(map(_padded, row, widths)).rstrip() for row in rows)
+
+
+def _padded(text: str, width: int) -> str:
+    return text.rjust(width) if text[:1].isdigit() else text.ljust(width)

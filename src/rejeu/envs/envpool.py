@@ -14,7 +14,7 @@ from rejeu.config import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
 from rejeu.envs.contract import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
-from rejeu.envs.registry import make_env, provider, register, unknown_environment
+from rejeu.envs.registry import in_envpool, make_env, newer_version, provider, register, unknown_environment
 from rejeu.envs.seeds import END, Seed, checked
 from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, leaves
@@ -168,12 +168,12 @@ def check_envpool_knows(env_id: str) -> None:
 
 
 def envpool_knows(env_id: str) -> bool:
-    """Returns whether EnvPool is installed and has the environment, and the id is not of a package of its own goals."""
-    try:
-        import envpool
-    except ImportError:
-        return False
-    if env_id not in envpool.list_all_envs():
+    """Returns whether EnvPool is to be considered for an id.
+
+    That is if it is installed and has the environment; not if Gymnasium has a newer version only, or if the goals need a
+    package that is not installed.
+    """
+    if not in_envpool(env_id) or (env_id not in gym.registry and newer_version(env_id) is not None):
         return False
     needs_package_for_goals = provider(env_id) is not None and env_id != "parking-v0"
     return not needs_package_for_goals or register(env_id)

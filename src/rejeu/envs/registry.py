@@ -27,7 +27,7 @@ MOST_KWARGS = 100
 
 
 class Provider(NamedTuple):
-    """A package whose import registers environments, and rejeu's extra that installs it."""
+    """A package whose import registers environments, and rejeu's extra that installs it, empty if there is none."""
 
     module: str
     package: str
@@ -39,6 +39,7 @@ PROVIDERS: dict[tuple[str, ...], Provider] = {
         "parking-", "highway-", "merge-", "roundabout-", "intersection-", "racetrack-", "exit-", "two-way-", "u-turn-",
         "lane-keeping-",
     ): Provider("highway_env", "highway-env", "parking"),
+    ("ALE/",): Provider("ale_py", "ale-py", ""),
     ("Fetch", "Hand", "PointMaze", "AntMaze", "Adroit", "FrankaKitchen"): Provider(
         "gymnasium_robotics", "gymnasium-robotics", "robotics"
     ),
@@ -63,10 +64,21 @@ def register(env_id: str) -> bool:
     """Imports the package that registers ``env_id``; returns whether Gymnasium knows the id now."""
     source = provider(env_id)
     if source is not None and importlib.util.find_spec(source.module) is not None:
+        if not env_id.startswith("Adroit"):
+            _without_notice(source.module)
         module = importlib.import_module(source.module)
         if source.module == "gymnasium_robotics":
             gym.register_envs(module)
     return env_id in gym.registry or ":" in env_id
+
+
+def _without_notice(module: str) -> None:
+    """Drops what Farama's packages print at their first import, which is about other environments of theirs."""
+    try:
+        from farama_notifications import notifications
+    except ImportError:
+        return
+    notifications.pop(module, None)
 
 
 def is_plain_id(env_id: object) -> bool:
@@ -105,11 +117,17 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     if not register(env_id):
         source = provider(env_id)
-        if source is not None and importlib.util.find_spec(source.module) is None:
+        if source is not None and source.extra and importlib.util.find_spec(source.module) is None:
             raise MissingExtra(f"the environment {env_id}", source.package, source.extra)
         raise ValueError(unknown_environment(env_id))
     try:
         return gym.make(env_id, disable_env_checker=True, **kwargs)
+    except (gym.error.DeprecatedEnv, ImportError) as error:
+        if newer := newer_version(env_id):
+            raise ValueError(
+                f"{env_id} is an old version that cannot be made any more ({error}); use {newer}"
+            ) from None
+        raise
     except gym.error.DependencyNotInstalled as error:
         need = next((p for name, p in NEEDS.items() if name in str(error)), None)
         if need is None:
@@ -135,8 +153,40 @@ class _Maker:
 
 
 def unknown_environment(env_id: str) -> str:
-    """Returns the sentence for an id that nothing registers, with the nearest known ones."""
+    """Returns the sentence for an id that nothing registers: what to install, or what was probably meant."""
+    short = env_id.removeprefix("ALE/")
+    elsewhere = f"EnvPool has {short}: backend='envpool' (--backend envpool)" if in_envpool(short) else ""
+    if env_id.startswith("ALE/"):
+        also = f"; {elsewhere}" if elsewhere else ""
+        return f"{env_id} is of the package ale-py, which is not installed: pip install ale-py{also}"
+    if newer := newer_version(env_id):
+        return f"{env_id} is an old version that Gymnasium no longer has; use {newer}"
+    if elsewhere:
+        return f"Gymnasium has no {env_id}, so it cannot be drawn or stepped by Gymnasium; {elsewhere}"
     known = [*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"]
     near = difflib.get_close_matches(env_id, known, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else "rejeu list shows the environments that have presets"
     return f"no environment is called {env_id!r}; {hint}"
+
+
+def newer_version(env_id: str) -> str | None:
+    """Returns the id of the newest registered version of an environment, None if this one is the newest or has no version.
+
+    >>> newer_version("LunarLander-v2"), newer_version("LunarLander-v3"), newer_version("LunarLander")
+    ('LunarLander-v3', None, None)
+    """
+    name, dash, version = env_id.rpartition("-v")
+    if not dash or not version.isdecimal():
+        return None
+    versions = [key.rpartition("-v")[2] for key in gym.registry if key.rpartition("-v")[0] == name]
+    newest = max((int(text) for text in versions if text.isdecimal()), default=-1)
+    return f"{name}-v{newest}" if newest > int(version) else None
+
+
+def in_envpool(env_id: str) -> bool:
+    """Returns whether EnvPool is installed and has an environment of this id."""
+    try:
+        import envpool
+    except ImportError:
+        return False
+    return env_id in envpool.list_all_envs()

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from rejeu.presets import ball, box2d, classic_control, parking, robotics
-from rejeu.presets.preset import Preset
+from rejeu.presets.preset import Preset, results
 
 ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PRESETS, *ball.PRESETS, *robotics.PRESETS)
 """Every preset; of several for one environment the first is the best."""
@@ -27,7 +27,6 @@ def default(env_id: str, algorithm: str) -> Preset:
         evaluate_every=5_000,
         evaluate_episodes=20,
         source="the algorithm's defaults",
-        result="",
     )
 
 
@@ -36,4 +35,4 @@ def find(env_id: str, algorithm: str | None = None) -> Preset | None:
     return next((p for p in ALL if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
 
 
-__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "default", "find"]
+__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "default", "find", "results"]
