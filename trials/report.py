@@ -18,6 +18,7 @@ python trials/fuzz.py --seconds 300
 python trials/fuzz.py --seconds 600 --target run
 python trials/fuzz.py --seconds 600 --target rows
 python trials/soak.py --minutes 60
+python trials/transitions.py
 python trials/report.py"""
 
 
@@ -195,13 +196,44 @@ Memory grew by {found["growth_percent"]:.2f} %, {
 """
 
 
+def replayed() -> str:
+    found = read("transitions")
+    kinds: dict[str, list[Any]] = {"steps": [], "goals": [], "frames": []}
+    for case in found["cases"]:
+        kinds["frames" if case["frames"] else "steps" if case["strategy"] is None else "goals"].append(case)
+    names = {
+        "steps": "uniform and prioritized, 1 and 3 steps",
+        "goals": "the same with hindsight: future, final, episode, random, with and without `compute_terminated`",
+        "frames": "uniform and prioritized, 1 and 3 steps, stacks of 4 frames",
+    }
+    rows = [
+        (
+            names[kind],
+            len(cases),
+            *(f"{sum(case[key] for case in cases):,}" for key in ("transitions", "terminal", "differ")),
+        )
+        for kind, cases in kinds.items()
+    ]
+    wrapped = [case["times_wrapped"] for case in found["cases"]]
+    return f"""## Replayed transitions
+
+Transitions drawn from replay buffers in use, each compared with what the environments wrote down: observation, action, n-step
+reward, discount, next observation, goal, priority, importance weight, and how often each step is drawn. 1 and 3 environments,
+ends by terminal states and time limits, calls of `learn` that end within an episode, buffers that were filled
+{min(wrapped):g} to {max(wrapped):g} times over. {found["transitions"]:,} transitions, {found["differ"]} differ (commit
+{found["commit"]}, {found["date"]}).
+
+{table(("replay", "cases", "transitions", "into a terminal state", "differ"), rows)}
+"""
+
+
 def main() -> None:
-    parts = [kills(), resumed(), hostile(), fuzzed(), soaked()]
+    parts = [kills(), resumed(), hostile(), fuzzed(), soaked(), replayed()]
     PAGE.write_text(
         f"""# Reliability
 
-What was tried to break runs and files, how often, and what came out. This page is written by `trials/report.py` from the
-results under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the
+What was tried to break runs and files, and to find wrong transitions, how often, and what came out. This page is written by
+`trials/report.py` from the results under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the
 comparisons:
 
 ```
