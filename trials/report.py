@@ -233,8 +233,8 @@ def main() -> None:
         f"""# Reliability
 
 What was tried to break runs and files, and to find wrong transitions, how often, and what came out. This page is written by
-`trials/report.py` from the results under `trials/results`; the commands, on Linux, with an interpreter that has Stable-Baselines3 2.9.2 for the
-comparisons:
+`trials/report.py` from the results under `trials/results`; the commands, on Linux, with an interpreter that has
+Stable-Baselines3 2.9.2 for the comparisons:
 
 ```
 {COMMANDS}
