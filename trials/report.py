@@ -13,6 +13,7 @@ RESULTS = Path(__file__).parent / "results"
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
 COMMANDS = """python trials/kill.py --kills 200 --sb3-python PATH
 python trials/resume.py --sb3-python PATH
+python trials/signals.py --signals 48
 python trials/hostile.py --sb3-python PATH
 python trials/fuzz.py --seconds 300
 python trials/fuzz.py --seconds 600 --target run
@@ -102,6 +103,33 @@ the end):
 {table(head, rows)}
 """
     return text
+
+
+def signaled() -> str:
+    found = read("signals")
+    phases = found["by_phase"]
+    early = found["before_rejeu"]
+    counted = found["signals"] - len(early)
+    rows = [(name, n) for name, n in phases.items()]
+    resumed = found["left"].get("resumed", 0)
+    folders = counted - found["left"].get("no folder", 0)
+    return f"""## Ctrl-C and SIGTERM
+
+`{found["command"]}`, {found["date"]}, commit {found["commit"]}. `rejeu train` (SAC on the ball, {
+        found["seconds_of_a_run"]:.0f} s on a busy
+machine) got a signal at a random moment of its life, {found["sent_twice"]} times two in a row:
+
+{table(("sent during", "signals"), rows)}
+
+{len(early)} came before Python had begun to import rejeu, and ended it in Python's own way. Of the other {counted} ({
+        found["SIGINT"]
+    } Ctrl-C, {found["SIGTERM"]} SIGTERM):
+
+- exit status 130 or 143 as it should be: {found["right_status"]} of {counted};
+- one line on standard error at most, and no traceback: {found["one_line_at_most"]} of {counted};
+- both models load, and the run resumes from its checkpoint and trains on: {resumed} of {folders} that had begun;
+- ended after {found["most_seconds_until_the_end"]:.0f} s at most.
+"""
 
 
 def hostile() -> str:
@@ -228,7 +256,7 @@ ends by terminal states and time limits, calls of `learn` that end within an epi
 
 
 def main() -> None:
-    parts = [kills(), resumed(), hostile(), fuzzed(), soaked(), replayed()]
+    parts = [kills(), resumed(), signaled(), hostile(), fuzzed(), soaked(), replayed()]
     PAGE.write_text(
         f"""# Reliability
 

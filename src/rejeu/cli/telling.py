@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.interrupt import NAMES
+from rejeu.text import counted
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent
@@ -24,7 +25,7 @@ def header(config: RunConfig, environment: Environment, backend: str, folder: Ru
     """Returns what a run says of itself before it begins; ``backend`` says what steps the environments, and why."""
     what = "preset" if config.preset else "default hyper-parameters"
     span = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
-    every = f"evaluated on {config.evaluate_episodes} episodes every {config.evaluate_every:,} steps"
+    every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"
     return "\n".join(
         [
             f"environment   {environment}, {config.n_envs} at once",
