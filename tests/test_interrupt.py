@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import rejeu
 from rejeu import interrupt
 from rejeu.interrupt import Interrupt
 from tests.test_cli import TINY
@@ -88,3 +89,30 @@ def test_a_signal_after_training_ends_the_command_with_its_status_and_keeps_the_
     assert done.stderr == f"rejeu: interrupted after training; the models are saved in {tmp_path / 'run'}\n"
     files = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"agent.safetensors", "best.safetensors", "checkpoints", "curve.png", "episodes.csv"} <= files
+
+
+class Still:
+    """Does nothing, and sends a signal at its third action."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def predict(self, obs, state=None, deterministic=True):
+        self.calls += 1
+        if self.calls == 3:
+            raise_signal()
+        return 0, None
+
+
+def test_a_signal_while_filming_leaves_nothing_of_the_file(tmp_path):
+    with pytest.raises(interrupt.Stopped) as stopped:
+        rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
+    assert stopped.value.signal == signal.SIGTERM
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_film_made_while_training_is_completed_after_a_signal(tmp_path):
+    with Interrupt() as training:
+        path = rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
+    assert training.requested
+    assert [*tmp_path.iterdir()] == [path]

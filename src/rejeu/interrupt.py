@@ -23,6 +23,14 @@ NAMES: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 Handler = Callable[[int, FrameType | None], Any]
 
 
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM, raised where nothing is half done."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(NAMES[number])
+        self.signal = number
+
+
 class Interrupt:
     """While entered, the first Ctrl-C or SIGTERM sets ``requested``; the second acts at once.
 
@@ -49,11 +57,19 @@ class Interrupt:
         if first:
             self.signal = number
         previous = self._previous.get(number)
-        around = callable(previous) and isinstance(getattr(previous, "__self__", None), Interrupt)
+        around = self._is_within(number)
         if callable(previous) and (around or not first):
             previous(number, frame)
         if not around and not first:
             raise KeyboardInterrupt
+
+    def _is_within(self, number: int) -> bool:
+        return isinstance(getattr(self._previous.get(number), "__self__", None), Interrupt)
+
+    def check(self) -> None:
+        """Raises :class:`Stopped` if one of them came, unless this is entered within another, which then sees to it."""
+        if self.signal is not None and not self._is_within(self.signal):
+            raise Stopped(self.signal)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         restore(self._previous)

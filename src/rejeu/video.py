@@ -28,6 +28,7 @@ from rejeu.envs.registry import make_env, provider, register
 from rejeu.envs.vec_env import VecEnvWrapper
 from rejeu.envs.vector import InProcess
 from rejeu.errors import MissingExtra
+from rejeu.interrupt import Interrupt
 
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
@@ -68,6 +69,7 @@ def record_video(
         MissingExtra: if imageio-ffmpeg is not installed.
         ValueError: if the environment does not give pictures.
         TypeError: if ``env`` is none of the above.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM; nothing is left of the new file.
 
     >>> import rejeu, tempfile
     >>> from rejeu.video import record_video
@@ -83,12 +85,13 @@ def record_video(
     playing = shown_to(agent, env if given else rendering_env(agent, env))
     try:
         check_renders(playing)
-        with VideoFile(path, natural_fps(playing) if fps is None else fps) as video:
+        with Interrupt() as stop, VideoFile(path, natural_fps(playing) if fps is None else fps) as video:
             for _ in range(episodes):
                 obs, _ = playing.reset(seed=seed)
                 seed, done, memory = None, False, None
                 video.write(rgb_frame(playing))
                 while not done and steps_left:
+                    stop.check()
                     action, memory = agent.predict(obs, memory, deterministic=True)
                     obs, _, terminated, truncated, _ = playing.step(action)
                     frame = rgb_frame(playing)

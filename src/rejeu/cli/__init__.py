@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import sys
 import tempfile
 import warnings
@@ -33,12 +34,10 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
 DESCRIPTION = """Trains agents on Gymnasium environments.
 
 The shortest use: rejeu train parking-v0. Version: rejeu --version."""
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command and returns the exit status: 0, 2 after an error, 130 after Ctrl-C.
+    """Runs one command and returns the exit status: 0, 2 after an error, 130 after Ctrl-C, 143 after SIGTERM.
 
     Args:
         argv: without the program's name; None takes the process's own.
@@ -67,9 +66,9 @@ def carry_out(argv: Sequence[str]) -> int:
         given = tyro.extras.subcommand_cli_from_dict(kinds, prog="rejeu", description=DESCRIPTION, args=argv)
         run = next(function for kind, function in COMMANDS.values() if isinstance(given, kind))
         return run(given)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("rejeu: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)
     except expected_errors() as error:
         print(f"rejeu: error: {one_line(error)}", file=sys.stderr)
         return 2

@@ -20,6 +20,7 @@ from rejeu.config import number, whole
 from rejeu.envs.faults import id_of
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
+from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Pace, Player
 from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for
@@ -147,13 +148,14 @@ def natural_fps(env: gym.Env) -> float:
 
 
 def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:
-    with window:
+    with window, Interrupt() as stop:
         game.begin()
         for player in game.players:
             player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action; not while somebody plays
         window.open(game, keys)
         pace = Pace(fps)
         while not game.closed:
+            stop.check()
             turn(window, game)
             pace.wait()
 
