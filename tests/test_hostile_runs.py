@@ -28,16 +28,19 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module")
-def run(request, tmp_path_factory):
+def make_run(case, folder):
     """A kind of agent, a folder with one checkpoint of it in the course of an episode, and what was compiled for it."""
-    name, env_id, settings = CASES[request.param]
-    folder = tmp_path_factory.mktemp("run")
+    name, env_id, settings = CASES[case]
     agent = rejeu.AGENTS[name]("MlpPolicy", vector(env_id, 2)(), **settings)
     agent._own_env = True  # its environments were made from an id
     keep = lambda agent, turn: agent.remember_best((0.5, 1.0)) if turn.step == 6 else None  # noqa: E731
     agent.learn(60, [keep, Checkpoint(folder, every=1000, keep=1), lambda agent, turn: turn.step < 24])
     return rejeu.AGENTS[name], folder, agent._compiled
+
+
+@pytest.fixture(scope="module")
+def run(request, tmp_path_factory):
+    return make_run(request.param, tmp_path_factory.mktemp("run"))
 
 
 def resumed(run, tmp_path, change, **hyperparameters):
@@ -165,11 +168,16 @@ def files_of(folder):
 
 def replaced(run, folder, path, content, size=None):
     """What becomes of a run one of whose files is replaced; ``size`` is more than the content has where a hole follows."""
-    kind, whole, compiled = run
-    shutil.copytree(whole, folder, dirs_exist_ok=True)
+    shutil.copytree(run[1], folder, dirs_exist_ok=True)
     (folder / path.name).write_bytes(content)
     if size is not None:
         os.truncate(folder / path.name, size)
+    return resumed_from(run, folder)
+
+
+def resumed_from(run, folder):
+    """What becomes of it when the run in a folder is resumed."""
+    kind, _, compiled = run
     try:
         shared = mock.patch.object(rejeu.agents.base, "Compiled", return_value=copy.copy(compiled))
         with shared, warnings.catch_warnings():

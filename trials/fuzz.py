@@ -19,7 +19,6 @@ import argparse
 import hashlib
 import json
 import os
-import platform
 import random
 import re
 import subprocess
@@ -30,6 +29,8 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from provenance import provenance
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -114,7 +115,7 @@ def main() -> None:
     for target in SEEDS if arguments.target == "all" else [arguments.target]:
         found = in_process(target, arguments.seconds)
         print(target, found, flush=True)
-        found |= {"date": time.strftime("%Y-%m-%d"), "python": platform.python_version(), "system": platform.system()}
+        found |= provenance()
         result = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         path.write_text(json.dumps(result | {target: found}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 

@@ -18,8 +18,8 @@ import collections
 import json
 import os
 import pickle
-import platform
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -30,12 +30,16 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from provenance import provenance
+
 import rejeu
 from rejeu import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
 from tests.environments import Counter
 from tests.golden import record_files
+from tests.test_hostile_runs import files_of, make_run, replaced, resumed_from
+from tests.test_resume import compiled_once
 
 ROOT = Path(__file__).parents[1]
 KINDS = {"agent": "sac", "replay": "replay", "vec_normalize": "vec_normalize"}
@@ -51,8 +55,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sb3-python", type=Path, help="Python of an environment that has stable-baselines3")
     arguments = parser.parse_args()
-    result: dict[str, Any] = {"date": time.strftime("%Y-%m-%d"), "python": platform.python_version()}
-    result["system"] = platform.system()
+    result: dict[str, Any] = {**provenance({str(arguments.sb3_python): "PATH"})}
     before = peak_memory()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "file.safetensors"
@@ -69,7 +72,11 @@ def main() -> None:
             }
             if of not in schemas[:-1]:
                 found["hostile"] = by_kind(kind, content, loaders[kind], path)
+                found["six GiB in a hole"] = holes(content, lambda p, k=kind: outcome(loaders[k], p), path)
             print(title, json.dumps(found), flush=True)
+        for kind, parts in runs(Path(folder)).items():
+            result[kind] = parts
+            print(kind, json.dumps(parts), flush=True)
         result["megabytes that reading all of them took"] = round((peak_memory() - before) / 2**20)
         result["code in a rejeu file"] = code_in_ours(Path(folder))
         if arguments.sb3_python is not None:
@@ -133,6 +140,54 @@ def by_kind(kind: str, content: bytes, read: Callable[[Path], object], path: Pat
     for variant in (*hostile_files.variants(content), *SPECIAL[kind](content)):
         groups[variant.kind].append(variant.content)
     return {group: count(iter(contents), read, path) for group, contents in sorted(groups.items())}
+
+
+def holes(content: bytes, read: Callable[[Path], str], path: Path) -> dict[str, Any]:
+    """Returns the outcomes of sparse files, and the longest time that one took, in seconds."""
+    found: collections.Counter[str] = collections.Counter()
+    longest = 0.0
+    for one in hostile_files.sparse(content):
+        path.write_bytes(one.content)
+        os.truncate(path, one.size)
+        began = time.perf_counter()
+        found[read(path)] += 1
+        longest = max(longest, time.perf_counter() - began)
+    path.unlink()
+    return {**found, "longest seconds": round(longest, 2)}
+
+
+def runs(folder: Path) -> dict[str, Any]:
+    """Returns the outcomes of checkpoints of which one file was replaced: all of the corpus, by the file that was."""
+    found: dict[str, Any] = {}
+    for name in ("replay", "rollout"):
+        with compiled_once():
+            run = make_run(name, folder / name)
+            for whole in files_of(run[1]):
+                content, kind = whole.read_bytes(), whole.name.split("_")[0]
+                groups: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+                longest = 0.0
+                for variant in (*hostile_files.variants(content), *hostile_files.bad_runs(content)):
+                    began = time.perf_counter()
+                    groups[variant.kind][replaced(run, folder / "tried", whole, variant.content)] += 1
+                    longest = max(longest, time.perf_counter() - began)
+                found[f"checkpoint with a {name}, {kind}"] = {
+                    "bytes": len(content),
+                    "hostile": {group: {**counts} for group, counts in sorted(groups.items())},
+                    "longest seconds": round(longest, 2),
+                    "six GiB in a hole": holes(
+                        content, lambda path, r=run, w=whole: replaced_by(r, folder / "tried", w, path), folder / "hole"
+                    ),
+                }
+    return found
+
+
+def replaced_by(run: Any, folder: Path, whole: Path, path: Path) -> str:
+    """Returns what becomes of a run one of whose files is replaced by one with a hole."""
+    shutil.copytree(run[1], folder, dirs_exist_ok=True)
+    (folder / whole.name).unlink()
+    path.rename(folder / whole.name)
+    path.touch()
+    return resumed_from(run, folder)
 
 
 def peak_memory() -> int:

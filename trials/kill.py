@@ -8,8 +8,10 @@ out of three as soon as a file is being written. After every death the folder mu
 most one interval older than the last step said. At the end the run is taken to a fixed step and compared, bit for bit, with
 one that nothing interrupted.
 
-With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2) a process that saves model and replay buffer there over
-and over is killed likewise, and it is counted how often what it leaves cannot be loaded.
+With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2) SAC on Pendulum is killed there in two ways: saving as most
+people do, by ``CheckpointCallback`` with its replay buffer every 100 steps, where every file has a new name; and saving model
+and replay buffer over and over under the same names, as a run that keeps its newest model does. It is counted how often what
+was left cannot be loaded, and how many steps the newest files that can be are behind.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ import argparse
 import json
 import os
 import random
-import shlex
 import signal
 import subprocess
 import sys
@@ -66,6 +67,45 @@ def live_sb3(folder: str) -> None:
         model.save(f"{folder}/model")
         model.save_replay_buffer(f"{folder}/replay")
         os.write(1, b"%d\n" % i)
+
+
+def live_sb3_callback(folder: str) -> None:
+    """Trains with Stable-Baselines3's checkpoints, which have new names, and says every step."""
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
+    class Say(BaseCallback):
+        def _on_step(self) -> bool:
+            os.write(1, b"%d\n" % self.num_timesteps)
+            return True
+
+    model = SAC("MlpPolicy", "Pendulum-v1", seed=7, **SETTINGS)
+    model.learn(10**9, [CheckpointCallback(EVERY, folder, save_replay_buffer=True), Say()])
+
+
+def check_sb3_callback(folder: str) -> None:
+    from stable_baselines3 import SAC
+
+    model = SAC("MlpPolicy", "Pendulum-v1", **SETTINGS)
+    steps = sorted({int(path.name.split("_")[-2]) for path in Path(folder).glob("rl_model_*_steps.*")}, reverse=True)
+    errors: list[str] = []
+    for step in steps:
+        n = len(errors)
+        for what, load in (
+            ("model", lambda step=step: SAC.load(f"{folder}/rl_model_{step}_steps")),
+            (
+                "replay_buffer",
+                lambda step=step: model.load_replay_buffer(f"{folder}/rl_model_replay_buffer_{step}_steps"),
+            ),
+        ):
+            try:
+                load()
+            except Exception as error:  # whatever it is, the file is lost
+                errors.append(f"{what}: {type(error).__name__}: {error}".replace(folder, "FOLDER")[:100])
+        if len(errors) == n:
+            print(json.dumps({"step": step, "errors": errors}))
+            return
+    print(json.dumps({"step": None, "errors": errors}))
 
 
 def check_sb3(folder: str) -> None:
@@ -209,6 +249,38 @@ def kill_sb3(python: str, kills: int, rng: random.Random) -> dict[str, object]:
     }
 
 
+def kill_sb3_callback(python: str, kills: int, rng: random.Random) -> dict[str, object]:
+    lost, unusable, nothing, errors = [], 0, 0, set()
+    for k in range(kills):
+        with tempfile.TemporaryDirectory() as folder:
+            life = Life([python, __file__, "--live-sb3-callback", folder])
+            while life.listen() < 2 * EVERY and life.process.poll() is None:
+                time.sleep(0.01)
+            time.sleep(rng.uniform(0, 1.0))
+            if k % 3 != 0:  # as soon as a new file is there
+                names = set(os.listdir(folder))
+                until = time.monotonic() + 10.0
+                while set(os.listdir(folder)) == names and time.monotonic() < until:
+                    time.sleep(0.0002)
+            said = life.kill()
+            command = [python, __file__, "--check-sb3-callback", folder]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            found = json.loads(done.stdout.strip().splitlines()[-1])
+            print(f"Stable-Baselines3's callback, kill {k}: said {said}, {found}", flush=True)
+            unusable += bool(found["errors"])
+            errors |= set(found["errors"])
+            nothing += found["step"] is None
+            lost += [] if found["step"] is None else [said - found["step"]]
+    return {
+        "kills": kills,
+        "interval": EVERY,
+        "newest_checkpoint_not_whole": unusable,
+        "no_checkpoint_whole": nothing,
+        "most_steps_lost": max(lost, default=-1),
+        "errors": sorted(errors),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200)
@@ -218,6 +290,8 @@ def main() -> None:
     parser.add_argument("--live", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--live-sb3", help=argparse.SUPPRESS)
     parser.add_argument("--check-sb3", help=argparse.SUPPRESS)
+    parser.add_argument("--live-sb3-callback", help=argparse.SUPPRESS)
+    parser.add_argument("--check-sb3-callback", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.live:
         live(arguments.live[0], int(arguments.live[1]))
@@ -225,15 +299,19 @@ def main() -> None:
         live_sb3(arguments.live_sb3)
     elif arguments.check_sb3:
         check_sb3(arguments.check_sb3)
+    elif arguments.live_sb3_callback:
+        live_sb3_callback(arguments.live_sb3_callback)
+    elif arguments.check_sb3_callback:
+        check_sb3_callback(arguments.check_sb3_callback)
     else:
+        from provenance import provenance
+
         rng = random.Random(arguments.seed)
-        result: dict[str, object] = {
-            "command": shlex.join(["python", "trials/kill.py", "--kills", str(arguments.kills)])
-        }
+        result: dict[str, object] = {**provenance({arguments.sb3_python: "PATH"})}
         result["rejeu"] = kill_rejeu(arguments.kills, rng)
         if arguments.sb3_python:
-            result["command"] = f"{result['command']} --sb3-python SB3_PYTHON"
             result["stable_baselines3"] = kill_sb3(arguments.sb3_python, arguments.sb3_kills, rng)
+            result["stable_baselines3_callback"] = kill_sb3_callback(arguments.sb3_python, arguments.sb3_kills, rng)
         RESULT.parent.mkdir(parents=True, exist_ok=True)
         RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         print(json.dumps(result, indent=1))

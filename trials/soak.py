@@ -13,8 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import shlex
-import sys
 import tempfile
 import threading
 import time
@@ -22,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+from provenance import provenance
 
 RESULT = Path(__file__).parent / "results" / "soak.json"
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "soak.png"
@@ -159,8 +158,7 @@ def main() -> None:
     watch.end()
     after = watch.look()
     content = {
-        "command": shlex.join(["python", "trials/soak.py", "--minutes", f"{arguments.minutes:g}"]),
-        "python": sys.version.split()[0],
+        **provenance(),
         **judge(watch.rows, arguments.minutes),
         **result,
         "steps": watch.rows[-1]["steps"],

@@ -45,7 +45,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     try:
         if path.exists() and not path.is_file():
             raise OSError(errno.EISDIR, "there is a folder, or something else that is no file, of that name")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         remove_stale(path)
         try:
             with temporary.open("xb") as file:
@@ -60,6 +60,23 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     except OSError as error:
         raise _explained(error, path) from error
     _sync_folder(path.parent)
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder, and those above it that are missing, and brings their names to disk; one that is there is left alone.
+
+    Raises:
+        OSError: if that is impossible.
+    """
+    missing = []
+    while not path.is_dir():
+        missing.append(path)
+        if path == path.parent:
+            break
+        path = path.parent
+    for folder in reversed(missing):
+        folder.mkdir(exist_ok=True)
+        _sync_folder(folder.parent)
 
 
 def append(path: Path, content: bytes) -> None:

@@ -29,7 +29,7 @@ import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
-from rejeu import checkpoint, compilation, finite, plain
+from rejeu import atomic, checkpoint, compilation, finite, plain
 from rejeu.agents import files
 from rejeu.config import number, whole
 from rejeu.core import PyTree
@@ -125,7 +125,7 @@ class Checkpoint:
             RunInUseError: if another process holds it.
             FileExistsError: if it holds the checkpoints of another run.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic.make_folder(self.folder)
         lock = FileLock(self.folder / "lock")
         try:
             lock.acquire(timeout=0)
