@@ -18,7 +18,7 @@ from tyro.conf import UseAppendAction, arg
 
 from rejeu.cli import settings
 from rejeu.cli.importing import find_id, find_wrapper, imports
-from rejeu.envs.registry import are_plain, is_plain_id
+from rejeu.envs.registry import are_plain
 from rejeu.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def recorded(
     """
     if given.env is not None:
         return named(given.env, given)
-    if not isinstance(env_id, str) or not is_plain_id(env_id):
+    if not isinstance(env_id, str) or imports(env_id):
         raise CheckpointError(
             f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "
             "--env ID"
