@@ -7,6 +7,7 @@ words. Everything else the user must type again, and the error says what.
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -179,7 +180,7 @@ def recorded(
     """
     if given.env is not None:
         return named(given.env, given)
-    if not isinstance(env_id, str) or imports(env_id):
+    if not isinstance(env_id, str) or imports(env_id) or not re.fullmatch(r"[\w./-]{1,200}", env_id):
         raise CheckpointError(
             f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "
             "--env ID"
