@@ -31,6 +31,7 @@ from rejeu.networks import (
     action_values,
     channels_last,
     convolutions,
+    encoder,
     image_shape,
 )
 from rejeu.spaces import leaves
@@ -351,6 +352,36 @@ def test_the_nature_network_has_the_published_number_of_parameters():
     cnn = jax.eval_shape(lambda key: CNN(key, (84, 84, 4), NATURE), jax.random.PRNGKey(0))
     expected = (8 * 8 * 4 + 1) * 32 + (4 * 4 * 32 + 1) * 64 + (3 * 3 * 64 + 1) * 64 + (7 * 7 * 64 + 1) * 512
     assert sum(p.size for p in jax.tree.leaves(cnn)) == expected == 1_684_128
+
+
+def test_images_in_chunks_give_the_same_features_and_gradients(monkeypatch):
+    cnn, images = CNN(jax.random.PRNGKey(0), (8, 8, 1), SMALL), RNG.integers(0, 256, (7, 8, 8, 1), dtype=np.uint8)
+
+    def features_and_gradient():
+        loss = lambda cnn: (jnp.sum(jnp.square(cnn(images))), cnn(images))  # noqa: E731
+        return jax.tree.leaves(jax.jit(jax.grad(loss, has_aux=True))(cnn))
+
+    expected = features_and_gradient()
+    for size in (1, 3):  # without and with a rest
+        monkeypatch.setattr(encoder, "CHUNK", size)
+        for one, other in zip(features_and_gradient(), expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_the_memory_for_images_does_not_grow_with_their_number(monkeypatch):
+    """Each takes 102 kB in the convolutions (9 x 9 patches of 288 numbers and 11 x 11 of 16), and 1 kB as features."""
+    cnn = CNN(jax.random.PRNGKey(0), (24, 24, 1), SMALL)
+    loss = lambda cnn, images: jnp.sum(jnp.square(cnn(images)))  # noqa: E731
+
+    def temporaries(n):
+        images = jax.ShapeDtypeStruct((n, 24, 24, 1), np.uint8)
+        return jax.jit(jax.grad(loss)).lower(cnn, images).compile().memory_analysis().temp_size_in_bytes
+
+    whole = temporaries(256)
+    monkeypatch.setattr(encoder, "CHUNK", 16)
+    few, many = temporaries(64), temporaries(256)
+    assert many < whole / 5
+    assert many - few < (256 - 64) * 6_000
 
 
 def test_channels_are_found_where_stable_baselines3_finds_them():

@@ -21,11 +21,12 @@ from typing import Any, ClassVar, Literal, TypeVar
 from rejeu import finite, running_stats, schedules
 from rejeu.errors import CheckpointError
 from rejeu.exploration import noise as action_noises
-from rejeu.networks import PolicyConfig
+from rejeu.networks import PolicyConfig, Widths, reads_image, settled
 from rejeu.replay.hindsight import HindsightConfig
 from rejeu.replay.prioritized import PriorityConfig
 from rejeu.running_stats import NormalizationConfig
 from rejeu.schedules import Schedule
+from rejeu.spaces import Leaf
 
 C = TypeVar("C")
 
@@ -85,6 +86,10 @@ class OffPolicyConfig:
     own."""
 
     name: ClassVar[str] = ""
+    hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
+    """Default widths of the networks."""
+    hidden_layers_on_images: ClassVar[Widths] = hidden_layers
+    """The same where the observation is an image."""
 
     def __post_init__(self) -> None:
         put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
@@ -221,7 +226,7 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
     merged = {**saved, **changes}
     policy, old = changes.get("policy_kwargs"), saved.get("policy_kwargs")
     if isinstance(policy, Mapping) and isinstance(old, Mapping):
-        replaced = ("pi", "qf") if "net_arch" in policy else ()
+        replaced = ("pi", "qf", "vf") if "net_arch" in policy else ()
         merged["policy_kwargs"] = {key: value for key, value in old.items() if key not in replaced} | dict(policy)
     policy = merged.get("policy_kwargs")
     if isinstance(policy, Mapping) and isinstance(torso := policy.get("torso"), str):
@@ -230,6 +235,18 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
             f"load(path, policy_kwargs=dict(torso={torso[:40]}))"
         )
     return build(kind, merged)
+
+
+def with_widths(config: C, leaves: tuple[Leaf, ...]) -> C:
+    """Returns a configuration whose ``policy_kwargs`` say the widths of hidden layers that were left to the default.
+
+    These depend on the observation, whose ``leaves`` are given.
+    """
+    kind: Any = type(config)
+    widths = kind.hidden_layers_on_images if reads_image(leaves) else kind.hidden_layers
+    shape = config.policy_kwargs  # type: ignore[attr-defined]
+    said = settled(vars(shape), widths)
+    return dataclasses.replace(config, policy_kwargs=dataclasses.replace(shape, **said)) if said else config  # type: ignore
 
 
 ELSEWHERE = {

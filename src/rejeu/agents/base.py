@@ -157,6 +157,7 @@ class Agent(ABC):
         """Compiles the algorithm for these spaces."""
         self.observation_space, self.action_space = observation_space, action_space
         self._obs_leaves = spaces.leaves(observation_space)
+        self.config = configs.with_widths(self.config, self._obs_leaves)
         noise = self._noise()
         if noise is not None:
             check_fits(noise, action_space)

@@ -12,6 +12,7 @@ from rejeu import config as configs, spaces
 from rejeu.agents.best import BEST_WINDOW
 from rejeu.agents.policies import check_policy
 from rejeu.errors import CheckpointError
+from rejeu.networks import settled
 
 COUNTERS = ("step", "steps_before", "episode", "n_updates")
 """What a model file counts; all below 2^32."""
@@ -106,7 +107,7 @@ def _interpret(
     changes: Mapping[str, Any],
 ) -> Saved:
     try:
-        config: Any = configs.rebuild(kind, header["config"], changes)
+        config: Any = configs.rebuild(kind, _with_widths(header["config"], kind), changes)
         check_sizes(config, room)
         largest = max(spaces.LARGEST, room)
         observation_space = spaces.rebuild(header["observation_space"], largest)
@@ -154,6 +155,16 @@ def check_space(description: Any, own: gym.Space, kind: str) -> None:
     other = spaces.rebuild(description, max(spaces.LARGEST, sum(leaf.nbytes for leaf in spaces.leaves(own))))
     if not spaces.same(other, own, bounds=kind == "action"):
         raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
+
+
+def _with_widths(config: Any, kind: Any) -> dict[str, Any]:
+    """Returns the configuration of a file with the widths of hidden layers that it leaves to the default.
+
+    Files say them since the default depends on the observation. In those written before, it did not.
+    """
+    shape = config.get("policy_kwargs")
+    shape = {} if shape is None else shape
+    return {**config, "policy_kwargs": {**shape, **settled(shape, kind.hidden_layers)}}
 
 
 def check_sizes(config: Any, room: int) -> None:

@@ -40,7 +40,7 @@ from rejeu.algorithms.actor_critic import (
     standardised,
 )
 from rejeu.algorithms.ppo import descend
-from rejeu.config import number
+from rejeu.config import number, with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_action, leaves
@@ -103,6 +103,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     check_action(action_space, config.name)
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
     check_value_rate(config, obs_leaves)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     eps = config.rms_prop_eps
     optimizer = (
         optax.scale_by_rms(RMSPROP_DECAY, eps, initial_scale=1.0)
@@ -111,7 +112,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     )
 
     def init(key: Array) -> State:
-        network = ActorCritic(key, obs_leaves, kind, config.policy_kwargs, config.use_sde)
+        network = ActorCritic(key, obs_leaves, kind, shape, config.use_sde)
         return State(network, optimizer.init(network), jnp.int32(0))
 
     def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:

@@ -46,7 +46,7 @@ from rejeu.core import (
     weighted_mean,
 )
 from rejeu.distributions import TanhNormal
-from rejeu.networks import PolicyConfig
+from rejeu.networks import PolicyConfig, Widths
 from rejeu.normalisation import RenormalisedNetwork, with_statistics
 from rejeu.randomness import nth
 from rejeu.schedules import Schedule, at
@@ -83,6 +83,8 @@ class Config(OffPolicyConfig):
     tau: ClassVar[float] = 1.0  # type: ignore[misc]
 
     name: ClassVar[str] = "CrossQ"
+    hidden_layers: ClassVar[Widths] = Widths(ACTOR_LAYERS, CRITIC_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = hidden_layers
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)

@@ -26,7 +26,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, whole
+from rejeu.config import OffPolicyConfig, whole, with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -41,12 +41,12 @@ from rejeu.core import (
     value_and_grad,
     weighted_mean,
 )
-from rejeu.networks import Actor, Critic
+from rejeu.networks import Actor, Critic, Widths
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
 
 HIDDEN_LAYERS = (400, 300)
-"""Default widths of actor and critic, those of the paper."""
+"""Default widths of actor and critic but on images, those of the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +60,8 @@ class Config(OffPolicyConfig):
     """Gradient steps between two moves of both targets. Raising it is steadier and slower."""
 
     name: ClassVar[str] = "DDPG"
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
@@ -92,7 +94,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
         return ddpg_discrete.make(config, observation_space, action_space)
     box = check_box_action(action_space, "DDPG")
-    obs_leaves, action_dim, shape = leaves(observation_space), action_dimension(box), config.policy_kwargs
+    obs_leaves, action_dim = leaves(observation_space), action_dimension(box)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     optimizer = optax.scale_by_adam()
 
     def init(key: Array) -> State:

@@ -23,6 +23,7 @@ from jax import Array
 
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, Config
 from rejeu.compilation import outlined
+from rejeu.config import with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -61,7 +62,8 @@ class State(eqx.Module):
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
     """Returns DDPG for Discrete actions."""
-    obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
+    obs_leaves, n_actions = leaves(observation_space), int(action_space.n)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     optimizer = optax.scale_by_adam()
 
     def init(key: Array) -> State:

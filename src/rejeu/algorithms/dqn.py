@@ -31,7 +31,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, number, whole
+from rejeu.config import OffPolicyConfig, number, whole, with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -46,12 +46,12 @@ from rejeu.core import (
     weighted_mean,
 )
 from rejeu.exploration.noise import ActionNoise
-from rejeu.networks import MLP, Actor, Encoder, Linear, PolicyConfig, Torso, make_torso
+from rejeu.networks import MLP, Actor, Encoder, Linear, PolicyConfig, Torso, Widths, make_torso
 from rejeu.schedules import Exponential, Linear as LinearSchedule, Schedule, at
 from rejeu.spaces import Leaf, leaves
 
 HIDDEN_LAYERS = (64, 64)
-"""Default widths of the network, those of Stable-Baselines3."""
+"""Default widths of the network but on images, those of Stable-Baselines3."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +92,8 @@ class Config(OffPolicyConfig):
     """Split the last hidden layer into a stream for the state's value and one for the actions' advantages."""
 
     name: ClassVar[str] = "DQN"
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
@@ -126,7 +128,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is no array.
     """
     n_actions = check_discrete_action(action_space, "DQN")
-    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
+    obs_leaves = leaves(observation_space)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     widths = shape.critic_widths(HIDDEN_LAYERS)
     optimizer = optax.scale_by_adam()
     epsilon = epsilon_schedule(config)

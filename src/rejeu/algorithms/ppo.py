@@ -48,7 +48,7 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardised,
 )
-from rejeu.config import number, whole
+from rejeu.config import number, whole, with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.randomness import nth
 from rejeu.schedules import Schedule, at
@@ -142,11 +142,12 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     check_action(action_space, config.name)
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
     check_value_rate(config, obs_leaves)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     optimizer = optax.scale_by_adam(eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
-        network = ActorCritic(network_key, obs_leaves, kind, config.policy_kwargs, config.use_sde)
+        network = ActorCritic(network_key, obs_leaves, kind, shape, config.use_sde)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
     def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:

@@ -39,9 +39,9 @@ from rejeu.algorithms.dqn import (
     moves_due,
     taken,
 )
-from rejeu.config import OffPolicyConfig, whole
+from rejeu.config import OffPolicyConfig, whole, with_widths
 from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, weighted_mean
-from rejeu.networks import Actor
+from rejeu.networks import Actor, Widths
 from rejeu.quantiles import quantile_huber_loss
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import leaves
@@ -79,6 +79,8 @@ class Config(OffPolicyConfig):
     """Longest gradient, as a Euclidean norm over all parameters; longer ones are scaled down. None: no limit."""
 
     name: ClassVar[str] = "QRDQN"
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
@@ -107,7 +109,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is no array.
     """
     n_actions, n_quantiles = check_discrete_action(action_space, "QRDQN"), config.n_quantiles
-    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
+    obs_leaves = leaves(observation_space)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     widths = shape.critic_widths(HIDDEN_LAYERS)
     optimizer = optax.scale_by_adam(eps=0.01 / config.batch_size)
     epsilon = epsilon_schedule(config)

@@ -38,7 +38,7 @@ from rejeu.algorithms.actor_critic import (
     unmasked,
 )
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
-from rejeu.config import nested, whole
+from rejeu.config import nested, whole, with_widths
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew
 from rejeu.networks import Encoder
@@ -271,11 +271,12 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     check_action(action_space, config.name)
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     optimizer = optax.scale_by_adam(eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
-        network: Any = RecurrentActorCritic(network_key, obs_leaves, kind, config.policy_kwargs)
+        network: Any = RecurrentActorCritic(network_key, obs_leaves, kind, shape)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
     def act(

@@ -26,7 +26,7 @@ from jax import Array
 
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, actor_loss, policy
 from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, number, whole
+from rejeu.config import OffPolicyConfig, number, whole, with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -41,7 +41,7 @@ from rejeu.core import (
     value_and_grad,
     weighted_mean,
 )
-from rejeu.networks import Actor, Critic, action_values
+from rejeu.networks import Actor, Critic, Widths, action_values
 from rejeu.randomness import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
@@ -64,6 +64,8 @@ class Config(OffPolicyConfig):
     """Number of critics; the least of their values is the target."""
 
     name: ClassVar[str] = "TD3"
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
@@ -99,7 +101,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is no array.
     """
     box = check_box_action(action_space, "TD3")
-    obs_leaves, action_dim, shape = leaves(observation_space), action_dimension(box), config.policy_kwargs
+    obs_leaves, action_dim = leaves(observation_space), action_dimension(box)
+    shape = with_widths(config, obs_leaves).policy_kwargs
     optimizer = optax.scale_by_adam()
 
     def init(key: Array) -> State:

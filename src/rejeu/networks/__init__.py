@@ -18,9 +18,10 @@ from rejeu.networks.encoder import (
     encode_leaf,
     image_shape,
     n_features,
+    reads_image,
 )
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
-from rejeu.networks.shape import BRANCHES, PolicyConfig
+from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled
 from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_torso, own_torso
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "ResidualBlock",
     "SimBa",
     "Torso",
+    "Widths",
     "action_values",
     "channels_last",
     "convolutions",
@@ -52,4 +54,6 @@ __all__ = [
     "n_features",
     "own_torso",
     "product",
+    "reads_image",
+    "settled",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,6 +29,10 @@ NATURE = Convolutions(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512)
 reinforcement learning" (Nature 518)."""
 SMALL = Convolutions(((32, 4, 2), (64, 3, 1)), 256)
 """For images of 8 to 35 pixels on their shorter side. Our own choice; smaller ones are flattened."""
+
+
+CHUNK = 256
+"""Most images that go through convolutions at once: one of 84 by 84 pixels takes 1.2 MB on the way."""
 
 
 class Convolution(eqx.Module):
@@ -86,11 +91,30 @@ class CNN(eqx.Module):
         self.linear = Linear(linear_key, height * width * channels, kind.n_outputs)
 
     def __call__(self, x: Array) -> Array:
-        """Maps images ``(batch, ...)`` of 0 to 255 to features ``(batch, n_outputs)``."""
+        """Maps images ``(batch, ...)`` of 0 to 255 to features ``(batch, n_outputs)``, ``CHUNK`` images at a time."""
+        return in_chunks(self.features, x, CHUNK)
+
+    def features(self, x: Array) -> Array:
+        """Returns the same of all images at once."""
         x = channels_last(x).astype(jnp.float32) / 255.0
         for layer in self.layers:
             x = jax.nn.relu(layer(x))
         return jax.nn.relu(self.linear(x.reshape(x.shape[0], -1)))
+
+
+def in_chunks(function: Callable[[Array], Array], x: Array, size: int) -> Array:
+    """Returns ``function(x)`` for a function of rows, computed ``size`` rows at a time.
+
+    A gradient computes each chunk again, so that what lies between input and output is never kept of more than one.
+    """
+    n_chunks, rest = divmod(x.shape[0], size)
+    if n_chunks == 0 or (n_chunks == 1 and rest == 0):
+        return function(x)
+    chunks = x[: n_chunks * size].reshape(n_chunks, size, *x.shape[1:])
+    once = jax.checkpoint(lambda chunk: function(chunk), prevent_cse=False)  # which hashes what it is given
+    parts = jax.lax.map(once, chunks)
+    parts = parts.reshape(n_chunks * size, *parts.shape[2:])
+    return parts if rest == 0 else jnp.concatenate([parts, function(x[n_chunks * size :])])
 
 
 class Encoder(eqx.Module):
@@ -130,6 +154,14 @@ class Encoder(eqx.Module):
             for leaf, x in zip(self.leaves, jax.tree.leaves(obs), strict=True)
         ]
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+
+
+def reads_image(leaves: tuple[Leaf, ...]) -> bool:
+    """Returns whether an observation is one image, or one stack of images, that convolutions read.
+
+    A Dict or Tuple is not, whatever it holds.
+    """
+    return len(leaves) == 1 and not leaves[0].path and convolutions(leaves[0]) is not None
 
 
 def convolutions(leaf: Leaf) -> Convolutions | None:

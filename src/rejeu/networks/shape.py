@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from jax import Array
 
 from rejeu.networks.layers import ACTIVATIONS
+
+
+class Widths(NamedTuple):
+    """Widths of hidden layers."""
+
+    actor: tuple[int, ...]
+    critics: tuple[int, ...]
+
 
 BRANCHES = ("state_layers", "action_layers", "common_layers", "critic_layers", "actor_layers")
 """Settings of ``PolicyConfig`` of which any one turns the branch shape on."""
@@ -20,7 +28,7 @@ class PolicyConfig:
 
     net_arch: tuple[int, ...] | None = None
     """Widths of the hidden layers of actor and critics; a mapping ``{"pi": [...], "qf": [...]}`` sets them apart.
-    None leaves the algorithm's own default."""
+    None leaves the algorithm's own default, which may be another on images."""
     pi: tuple[int, ...] | None = None
     """Widths of the actor's hidden layers where they differ from ``net_arch``."""
     qf: tuple[int, ...] | None = None
@@ -122,6 +130,19 @@ class PolicyConfig:
             return branch
         simba = (self.width,) * self.n_blocks if self.architecture == "simba" else default
         return next(widths for widths in (arch, self.net_arch, simba) if widths is not None)
+
+
+def settled(shape: Mapping[str, Any], widths: Widths) -> dict[str, Any]:
+    """Returns settings that say which ``widths`` the settings ``shape`` leave to the default.
+
+    There are none where the hidden layers are of another kind: branches, SimBa or the user's own.
+    """
+    is_plain = shape.get("torso") is None and shape.get("architecture", "mlp") == "mlp"
+    if not is_plain or any(shape.get(key) for key in BRANCHES) or shape.get("net_arch") is not None:
+        return {}
+    if widths.actor == widths.critics:
+        return {"net_arch": widths.actor}
+    return {key: width for key, width in zip(("pi", "qf"), widths, strict=True) if shape.get(key) is None}
 
 
 def _widths(key: str, value: Any) -> tuple[int, ...] | None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from rejeu import finite, running_stats, schedules
 from rejeu.config import nested, number, whole
-from rejeu.networks import PolicyConfig, convolutions
+from rejeu.networks import PolicyConfig, Widths, convolutions
 from rejeu.running_stats import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
@@ -120,6 +120,10 @@ class OnPolicyConfig:
     ``torso`` of your own."""
 
     name: ClassVar[str] = ""
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    """Default widths of policy and value."""
+    hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
+    """The same where the observation is an image."""
 
     def __post_init__(self) -> None:
         put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
