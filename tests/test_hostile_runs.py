@@ -176,13 +176,17 @@ def replaced(run, folder, path, content, size=None):
 
 
 def resumed_from(run, folder):
-    """What becomes of it when the run in a folder is resumed."""
+    """What becomes of it when the run in a folder is resumed and, if it can be, trained for some steps."""
     kind, _, compiled = run
     try:
         shared = mock.patch.object(rejeu.agents.base, "Compiled", return_value=copy.copy(compiled))
         with shared, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that it is not exact
-            kind.resume(folder).env.close()
+            agent = kind.resume(folder)
+            try:
+                agent.learn(8, reset_num_timesteps=False)
+            finally:
+                agent.env.close()
     except CheckpointError as error:
         text = str(error)
         return "refused" if "\n" not in text and len(text) < 1000 else f"refused at length: {text[:300]}"

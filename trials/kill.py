@@ -101,7 +101,8 @@ def check_sb3_callback(folder: str) -> None:
             try:
                 load()
             except Exception as error:  # whatever it is, the file is lost
-                errors.append(f"{what}: {type(error).__name__}: {error}".replace(folder, "FOLDER")[:100])
+                text = f"{what}: {type(error).__name__}: {error}".replace(folder, "FOLDER")
+                errors.append(text.replace(f"_{step}_", "_N_")[:100])
         if len(errors) == n:
             print(json.dumps({"step": step, "errors": errors}))
             return

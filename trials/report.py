@@ -303,7 +303,8 @@ flipped, for every bit; the corpus of `tests/hostile_files.py` (headers that lie
 places, names given twice, nesting without end, hyper-parameters that are not numbers, unknown classes, spaces of another
 agent, values of checkpoints ...); and sparse files that claim 6 GiB (the longest took {longest:.2f} s). What
 is not refused was read:
-files of schema 1 have no checksums, and some values of a checkpoint may be others. Cuts and flips go through the reader that
+files of schema 1 have no checksums, and some values of a checkpoint may be others; such a run was then trained for
+some steps. Cuts and flips go through the reader that
 all loaders share; the corpus goes through the loaders.
 
 {table(("file", "cut short", "one bit flipped", "corpus", "sparse"), rows)}
