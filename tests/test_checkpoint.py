@@ -211,7 +211,7 @@ def test_arrays_in_another_order_of_bytes_and_memory_come_back_as_numbers(tmp_pa
         (lambda h, a: a.update(extra=np.zeros(2)), "has extra, which this agent has not"),
         (lambda h, a: a.update(log_alpha=np.zeros(2, np.float32)), r"log_alpha is float32\[2\], expected float32\[\]"),
         (lambda h, a: a.update(log_alpha=np.zeros((), np.float64)), r"log_alpha is float64\[\], expected float32\[\]"),
-        (lambda h, a: a.update(log_alpha=np.zeros((), np.float16)), "log_alpha has a dtype that rejeu does not write"),
+        (lambda h, a: a.update(log_alpha=np.zeros((), np.float16)), r"log_alpha is float16\[\], expected float32\[\]"),
     ],
 )
 def test_a_file_that_does_not_fit_says_what_differs(trained, tmp_path, change, words):
@@ -488,7 +488,7 @@ def test_a_path_that_is_a_folder_is_refused(trained, tmp_path):
         ({}, {"x": "x" * 5 * 2**20}, ValueError, "keep many numbers in arrays"),
         ({}, {"x": [{}] * 2**18}, ValueError, "brackets and quotes"),
         ({}, {"x": 2**128}, ValueError, "more than 128 bits"),
-        ({"a": np.zeros(2, np.float16)}, {}, TypeError, "a has the dtype float16; expected one of float32"),
+        ({"a": np.zeros(2, np.complex64)}, {}, TypeError, "a has the dtype complex64; expected one of float32"),
         ({"a": np.array(["text"])}, {}, TypeError, "a has the dtype"),
         ({"a": np.array([object()])}, {}, TypeError, "a has the dtype object"),
         ({"__metadata__": np.zeros(2)}, {}, ValueError, "no array may be called __metadata__"),

@@ -26,6 +26,7 @@ from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.hooks import BaseCallback, EvalCallback
 from rejeu.loops.compiled import Compiled
 from tests.bit_flipping import BitFlipping
+from tests.environments import Sampled
 from tests.every_agent import KINDS
 from tests.helpers import small_sac
 
@@ -621,3 +622,12 @@ def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, tmp_
         assert_same(facts(again), facts(cut_off))
         again.learn(50, reset_num_timesteps=False)
     assert_same(facts(again), facts(whole))
+
+
+def test_observations_of_half_precision_are_saved(tmp_path):
+    env = lambda: Sampled(gym.spaces.Box(-1.0, 1.0, (2,), np.float16))  # noqa: E731
+    agent = small_sac(env(), learning_starts=99).learn(20, Checkpoint(tmp_path))
+    assert agent.replay_buffer.ring.obs_leaves[0].dtype == "float16"
+    with pytest.warns(UserWarning, match="at the start of new episodes"):
+        resumed = rejeu.SAC.resume(tmp_path, env())
+    assert_same(resumed.replay_buffer.arrays(), agent.replay_buffer.arrays())

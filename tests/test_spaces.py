@@ -100,6 +100,18 @@ def test_a_space_without_fixed_size_is_refused_with_its_place():
 ASYMMETRIC = gym_spaces.Box(np.float32([-1.0, 0.0, -3.0]), np.float32([3.0, 0.5, -1.0]))
 
 
+@pytest.mark.parametrize("space", [gym_spaces.Dict(), gym_spaces.Tuple([gym_spaces.Discrete(2), gym_spaces.Dict()])])
+def test_a_space_that_holds_nothing_is_refused(space):
+    with pytest.raises(TypeError, match="which holds nothing"):
+        spaces.leaves(space)
+
+
+@pytest.mark.parametrize("check", [spaces.check_box_action, spaces.check_action])
+def test_actions_without_a_component_are_refused(check):
+    with pytest.raises(ValueError, match="has no component, so there is nothing to choose"):
+        check(gym_spaces.Box(-1.0, 1.0, (0,)), "SAC")
+
+
 def test_the_ends_of_the_range_become_the_bounds_exactly():
     ends = np.array([[-1.0] * 3, [1.0] * 3, [0.0] * 3], np.float32)
     np.testing.assert_array_equal(

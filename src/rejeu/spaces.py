@@ -53,8 +53,14 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
     """Returns the leaves of a space in the order in which JAX flattens its observations (Dict keys sorted).
 
     Raises:
-        TypeError: for spaces that are not fixed-size arrays (Text, Graph, Sequence, OneOf).
+        TypeError: for spaces that are not fixed-size arrays (Text, Graph, Sequence, OneOf), and for a Dict or Tuple that
+            holds nothing.
     """
+    if isinstance(space, spaces.Dict | spaces.Tuple) and not len(space.spaces):
+        where = f" at {path!r}" if path else ""
+        raise TypeError(
+            f"the observation space{where} is {space}, which holds nothing; give it a part, or leave it out"
+        )
     if isinstance(space, spaces.Dict):
         return tuple(
             leaf for key in sorted(space.spaces) for leaf in leaves(space.spaces[key], f"{path}.{key}".lstrip("."))
@@ -155,6 +161,7 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
             else "wrap the environment in a gymnasium.ActionWrapper with a Box action space"
         )
         raise ValueError(f"{algorithm} needs a Box action space, got {space}; {instead}")
+    check_not_empty(space)
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise ValueError(
             f"{algorithm} needs finite action bounds, got low={space.low.tolist()}, high={space.high.tolist()}; "
@@ -174,6 +181,7 @@ def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
         ValueError: otherwise, naming what to do instead.
     """
     if isinstance(space, spaces.Box):
+        check_not_empty(space)
         if space.dtype.kind != "f" or not space.shape:
             raise ValueError(f"{algorithm} needs Box actions of floats with an axis, got {space}; use MultiDiscrete")
         if not (space.high > space.low).all():
@@ -186,6 +194,14 @@ def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
             "environment in a gymnasium.ActionWrapper"
         )
     return space
+
+
+def check_not_empty(space: spaces.Box) -> None:
+    """Raises ``ValueError`` if actions have no component."""
+    if not action_dimension(space):
+        raise ValueError(
+            f"the action space {space} has no component, so there is nothing to choose; give it one or more"
+        )
 
 
 def action_dimension(space: spaces.Box) -> int:
