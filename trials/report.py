@@ -36,8 +36,7 @@ on no network file system (NFS, SMB)
 - **Damage on purpose.** Checksums are no signatures. Who changes a file and its checksums can make an agent act badly; what is
   tested is that no code of theirs runs and that no time or memory is spent on arrays that the model does not have.
 - **Runs of days.** The longest trial took an hour. No run was killed more often than stands above.
-- **Environments' own faults.** Environments that end their process (`os._exit`) or leak memory were not tried in these trials;
-  `tests/test_bad_environments.py` and `tests/test_workers.py` test exceptions, wrong values, hangs and killed workers.
+- **Environments' own faults.** Environments that leak memory, or end the process that learns (`os._exit`), were not tried.
 - **Other machines.** Equal results are promised, and were compared, on one machine with the same versions and number of
   threads."""
 
@@ -358,6 +357,40 @@ again, or that is a finding as well.
 """
 
 
+def environments() -> str:
+    found = read("environments")
+    parts = ("in this process", "in worker processes")
+    rows = [
+        (
+            where,
+            found[where]["kinds"],
+            found[where]["runs"],
+            found[where]["as they must be"],
+            ", ".join(f"{n} {outcome}" for outcome, n in found[where]["outcomes"].items()),
+            found[where]["longest seconds"],
+        )
+        for where in parts
+    ]
+    wrong = [one for where in parts for one in found[where]["not as they must be"]]
+    faults = "".join(f"- {one['kind']} ({one.get('algorithm', 'SAC')}): {'; '.join(one['wrong'])}\n" for one in wrong)
+    again = found["restarted workers"]
+    return f"""## Environments of every kind
+
+PPO and SAC trained for 240 steps in environments of every kind of `trials/environment_kinds.py`: spaces of all kinds, episodes
+that end in all ways, one fault each in what they answer, and such as raise, exit, hang or are killed. What must come of a run
+is known beforehand: all its steps and finite weights; our own error, which names the environment; the environment's own; or
+a refusal when the agent is made. After an error there must be a checkpoint of that step, which loads with finite weights, and
+no worker process may be left.
+
+{table(("where", "kinds", "runs", "as they must be", "outcomes", "longest, seconds"), rows)}
+
+{faults}{again["workers started again"]} workers that killed themselves were started again: {again["steps taken"]} of
+{again["steps asked for"]} steps were taken.
+
+{origin("environments")}
+"""
+
+
 def soaked() -> str:
     found = read("soak")
     minutes = found["minutes_suspended"]
@@ -414,6 +447,7 @@ SECTIONS: dict[str, Callable[[], str]] = {
     "resume": resumed,
     "hostile": hostile,
     "fuzz": fuzzed,
+    "environments": environments,
     "soak": soaked,
 }
 """The trials in the order of the page, by the name of their results."""
