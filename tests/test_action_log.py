@@ -160,3 +160,14 @@ def test_a_pool_that_does_not_repeat_its_episodes_begins_new_ones(tmp_path):
         again = rejeu.DQN.resume(tmp_path, other)
     assert not again.resumed.exact
     assert again.learn().num_timesteps == 100
+
+
+def test_a_record_with_more_operations_than_it_says_is_refused_at_the_first_too_many():
+    with closing(make_vector("CartPole-v1", 2, "envpool", seed=1)) as env:
+        obs = env.reset().copy()
+        many = np.frombuffer(zlib.compress(bytes([action_log.RESET]) * action_log.BLOCK), np.uint8)
+        saved = {**env.snapshot(), "blocks": [many]}
+        with pytest.raises(ValueError, match="does not hold the 1 operations"):
+            env.restore(saved, obs)
+        with pytest.raises(ValueError, match="n_operations"):
+            env.restore({**saved, "n_operations": 10**8}, obs)

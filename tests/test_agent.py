@@ -515,8 +515,9 @@ def test_learning_goes_on_after_loading_and_collects_learning_starts_steps_first
     assert (loaded.num_timesteps, loaded.n_updates) == (31, 15)
 
 
-def test_another_number_of_environments_collects_learning_starts_steps_before_it_learns(agent):
+def test_another_number_of_environments_collects_learning_starts_steps_before_it_learns():
     """Its buffer is empty: batches would otherwise be copies of the first few steps."""
+    agent = small_sac(Counter((5,))).learn(20)
     starts, n_updates = agent.config.learning_starts, agent.n_updates
     agent.set_env(InProcess([Counter((5,)) for _ in range(2)]))
     agent.learn(starts, reset_num_timesteps=False)

@@ -390,7 +390,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys):
     assert not (tmp_path / "cut" / "agent.safetensors").exists()
     capsys.readouterr()
     assert main(["resume", str(tmp_path / "cut")]) == 0
-    assert re.search(r"resumed at step \d+, exactly where it stood", capsys.readouterr().out)
+    assert re.search(r"resumed at step [\d,]+, exactly where it stood", capsys.readouterr().out)
     for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
         assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
     one, two = (rejeu.load(tmp_path / run / "agent.safetensors").get_parameters() for run in ("whole", "cut"))

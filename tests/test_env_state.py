@@ -198,3 +198,18 @@ def assert_vectors_continue_alike(one, two):
         np.testing.assert_array_equal(first.obs, second.obs)
     done = np.ones(n_envs, bool)
     np.testing.assert_array_equal(one.reset_done(done).copy(), two.reset_done(done))
+
+
+def test_a_worker_that_is_lost_before_a_snapshot_ends_its_episode_at_the_next_step():
+    with closing(make_vector("CartPole-v1", 2, "gymnasium-async", seed=0, restart_workers=1)) as env:
+        env.reset()
+        env.step(np.zeros(2, int))
+        env.workers.workers[1].process.kill()
+        env.workers.workers[1].process.join()
+        with pytest.warns(RuntimeWarning, match="started anew"):
+            assert env.snapshot() is None
+        step = env.step(np.zeros(2, int))
+        assert step.truncated.tolist() == [False, True]
+        env.reset_done(step.truncated)
+        assert env.snapshot() is not None
+        assert not env.step(np.zeros(2, int)).truncated.any()

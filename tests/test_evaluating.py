@@ -279,3 +279,33 @@ def test_a_masked_agent_may_be_evaluated_in_its_own_environment_while_it_learns(
     env = masked.env.inner.envs[0].env
     masked.learn(24, every(7, lambda agent: (agent.evaluate(1, env=env), evaluate_policy(agent, env, 1))))
     assert env.illegal == 0
+
+
+def test_training_does_not_go_on_from_the_seed_of_an_evaluation():
+    env = Starts()
+    agent = rejeu.A2C("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [4]})
+    agent.learn(60, lambda agent, turn: turn.step % 20 or agent.evaluate(1, seed=7) is not None)
+    evaluated = [i for i, seed in enumerate(env.seeds) if seed == 7]
+    assert len(evaluated) == 3
+    after = [env.starts[i + 1] for i in evaluated]
+    assert len({*after}) == 3
+
+
+class Starts(gym.Env):
+    """Episodes of five steps that begin at random; remembers where, and by what seeds it was reset."""
+
+    observation_space, action_space = gym.spaces.Box(0.0, 1.0, (1,)), gym.spaces.Discrete(2)
+
+    def __init__(self):
+        self.seeds, self.starts = [], []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n = 0
+        self.seeds.append(seed)
+        self.starts.append(float(self.np_random.random()))
+        return np.full(1, self.starts[-1], np.float32), {}
+
+    def step(self, action):
+        self.n += 1
+        return np.zeros(1, np.float32), 0.0, False, self.n == 5, {}

@@ -76,7 +76,8 @@ def start_device(n_threads: int) -> None:
     if _threads is not None:
         return
     if _is_running() or THREADS in os.environ:
-        _threads = int(os.environ.get(THREADS, cores()))
+        given = os.environ.get(THREADS, "")
+        _threads = int(given) if given.isdecimal() and int(given) > 0 else cores()
         return
     _threads = n_threads
     os.environ[THREADS] = str(n_threads)

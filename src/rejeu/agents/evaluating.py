@@ -64,7 +64,7 @@ def play(
         agent._check_spaces(vector, "the environment to evaluate in")
         check_scaled(agent, vector)
         again = None if made_here else seed  # others have just been made with it
-        with lent(agent, vector):
+        with lent(agent, vector, seeded=again is not None):
             return evaluate(policy(agent, deterministic), vector, episodes, threshold, again, seconds)
     finally:
         if made_here:
@@ -89,10 +89,11 @@ def trained_on(agent: Agent) -> str | Callable[[], gym.Env]:
 
 
 @contextmanager
-def lent(agent: Agent, vector: VectorEnv) -> Iterator[None]:
+def lent(agent: Agent, vector: VectorEnv, seeded: bool = False) -> Iterator[None]:
     """While entered, ``vector`` may be played in: if the agent trains on the same environments, its episodes are given up.
 
-    Training goes on in new ones, whether it is under way or still to come.
+    Training goes on in new ones, whether it is under way or still to come; ``seeded`` says that the environments were seeded
+    for the play, and gives them a seed of training again.
     """
     run = agent._run
     shared = run.env is not None and not identities(run.env).isdisjoint(identities(vector))
@@ -100,6 +101,8 @@ def lent(agent: Agent, vector: VectorEnv) -> Iterator[None]:
         run.obs = run.action = None  # also if playing fails
     yield
     if shared:
+        if seeded:
+            run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
         agent._give_up_episodes()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -56,6 +57,11 @@ class ActionLog:
         self._most_steps = min(most_steps, MOST_BYTES // max(self._row_bytes, 1))
         self._blocks: list[np.ndarray] = []
         self._open = bytearray()
+
+    @property
+    def most_operations(self) -> int:
+        """The most operations that a log can hold: a step of one environment each, and a reset after each."""
+        return 4 * self._most_steps + 2
 
     @property
     def is_full(self) -> bool:
@@ -138,14 +144,14 @@ def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[Operat
     Raises:
         ValueError: if the log is damaged.
     """
-    n = whole("n_operations", saved["n_operations"], least=0)
+    n = whole("n_operations", saved["n_operations"], least=0, most=log.most_operations)
     console = Console(stderr=True)
     hidden = n < MANY_OPERATIONS or not (console.is_terminal or console.is_jupyter)
     operations = log.operations(saved)
     text = f"Replaying {title}"
-    yield from track(operations, text, total=n, console=console, transient=True, disable=hidden)
-    if log.n_operations != n:
-        raise ValueError(f"the record of actions holds {log.n_operations} operations, expected {n}")
+    yield from islice(track(operations, text, total=n, console=console, transient=True, disable=hidden), n)
+    if log.n_operations != n or next(operations, None) is not None:
+        raise ValueError(f"the record of actions does not hold the {n} operations that it should")
 
 
 def _compressed(data: bytearray) -> np.ndarray:

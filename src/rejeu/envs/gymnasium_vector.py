@@ -64,7 +64,9 @@ class GymnasiumVector(VectorEnv):
     def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        self._obs = self._after_reset = self._reset(seed=seed if seed is None else for_each(seed, self.n_envs))
+        # A vector environment of somebody else's kind may take no list.
+        given = seed if seed is None or isinstance(seed, int) else for_each(seed, self.n_envs)
+        self._obs = self._after_reset = self._reset(seed=given)
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         self._strayed = np.zeros(self.n_envs, bool)
         return self._obs

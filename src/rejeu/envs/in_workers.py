@@ -56,6 +56,8 @@ class InWorkers(VectorEnv):
         self.n_envs = n_envs
         self.n_steps = 0
         """How often the vector was stepped."""
+        self._lost: dict[int, Restarted] = {}
+        """Environments whose process was replaced between two steps; the next step says so."""
         self._anew: set[int] = set()
         """Environments in new processes, which were not reset yet."""
         self._make_one = make_one
@@ -91,6 +93,7 @@ class InWorkers(VectorEnv):
     def _reset(self, seeds: Mapping[int, int | None]) -> Any:
         """Resets the environments that are the keys; again where a worker was lost at that."""
         for i, seed in seeds.items():
+            self._lost.pop(i, None)
             if seed is not None:
                 self._seeds[i] = seed
         waiting = {i: ("reset", self._next_seed(i) if seed is None else seed) for i, seed in seeds.items()}
@@ -123,7 +126,9 @@ class InWorkers(VectorEnv):
         terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
-        said = self._heard(self.workers.ask({i: ("step", action[i]) for i in which}), "step")
+        lost = {i: self._lost.pop(i) for i in which if i in self._lost}
+        asked = {i: ("step", action[i]) for i in which if i not in lost}
+        said = {**self._heard(self.workers.ask(asked), "step"), **lost}
         stepped = []
         for i, answer in said.items():
             if isinstance(answer, Restarted):
@@ -160,7 +165,8 @@ class InWorkers(VectorEnv):
 
     def snapshot(self) -> list[Any] | None:
         said = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
-        known = all(isinstance(one, list) for one in said.values())  # None: not offered; Restarted: lost just now
+        self._lost |= {i: answer for i, answer in said.items() if isinstance(answer, Restarted)}
+        known = all(isinstance(one, list) for one in said.values())  # None: not offered
         return [said[i] for i in range(self.n_envs)] if known else None
 
     def restore(self, saved: Any, obs: Any) -> list[int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +21,8 @@ PLAIN_WORD = re.compile(r"[\w-]{0,60}")
 """Texts that are neither a path nor an id of anything to import."""
 LARGEST = 1e6
 """Largest number that a file may hand to an environment: larger ones could ask for any amount of memory."""
+MAKES_OWN = frozenset(("id", "env_id", "render_mode", "disable_env_checker", "vectorization_mode"))
+"""Arguments of ``gymnasium.make`` itself, which are no environment's."""
 MOST_KWARGS = 100
 """Most keyword arguments of an environment that are taken from a file."""
 
@@ -98,6 +99,7 @@ def are_plain(env_kwargs: object) -> bool:
         isinstance(env_kwargs, dict)
         and len(env_kwargs) <= MOST_KWARGS
         and all(isinstance(key, str) and key.isidentifier() and len(key) <= 60 for key in env_kwargs)
+        and MAKES_OWN.isdisjoint(env_kwargs)
         and all(_is_plain(value) for value in env_kwargs.values())
     )
 
@@ -105,7 +107,7 @@ def are_plain(env_kwargs: object) -> bool:
 def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return PLAIN_WORD.fullmatch(value) is not None
-    return isinstance(value, bool | int | float) and math.isfinite(value) and abs(value) <= LARGEST
+    return isinstance(value, bool | int | float) and -LARGEST <= value <= LARGEST  # which NaN is not
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:

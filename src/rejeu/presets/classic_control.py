@@ -132,10 +132,10 @@ PRESETS = (
         env_id="CartPole-v1",
         algorithm="PPO",
         hyperparameters={
-            "n_steps": 64,
+            "n_steps": 128,
             "batch_size": 256,
-            "gae_lambda": 0.9,
-            "gamma": 0.98,
+            "gae_lambda": 0.98,
+            "gamma": 0.99,
             "n_epochs": 20,
             "learning_rate": "lin_5e-4",
             "clip_range": "lin_0.2",
@@ -145,7 +145,7 @@ PRESETS = (
         evaluate_every=10_000,
         evaluate_episodes=20,
         backend="envpool",
-        source="rejeu's own tuning on seeds 100 to 135, from RL Baselines3 Zoo, hyperparams/ppo.yml",
+        source="rejeu's own tuning on seeds 100 to 249, from RL Baselines3 Zoo, hyperparams/ppo.yml",
     ),
     Preset(
         env_id="CartPole-v1",

@@ -89,8 +89,10 @@ class ReplayMemory:
             raise ValueError(f"action has the shape {taken.shape}, expected {self.action_space.shape or ()}")
         if isinstance(self.action_space, gym.spaces.Discrete):
             spaces.check_env_actions(self.action_space, taken, "push")
-        if not np.isfinite(taken).all() or not np.isfinite(reward):
-            raise ValueError(f"action={action!r} and reward={reward!r} must be finite")
+        if not np.isfinite(taken).all() or not abs(reward) <= np.finfo(np.float32).max:
+            raise ValueError(f"action={action!r} and reward={reward!r} must be finite as float32")
+        if not all(np.isfinite(part).all() for part in (*before, *after)):
+            raise ValueError("obs and next_obs must be finite")
         i = self._n_pushed % self.capacity
         for stores, parts in ((self._obs, before), (self._next_obs, after)):
             for store, part in zip(stores, parts, strict=True):

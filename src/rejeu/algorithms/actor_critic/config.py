@@ -170,7 +170,7 @@ class OnPolicyConfig:
     def learns_from_part(self, n: int, n_envs: int) -> bool:
         """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends.
 
-        Only where no gradient step is then taken on less than a minibatch. Where a rollout is one minibatch it is not.
+        It must hold a minibatch at least. Where a whole rollout is one minibatch it is never learned from.
         """
         return False
 
