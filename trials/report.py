@@ -366,7 +366,7 @@ def environments() -> str:
             found[where]["kinds"],
             found[where]["runs"],
             found[where]["as they must be"],
-            ", ".join(f"{n} {outcome}" for outcome, n in found[where]["outcomes"].items()),
+            ", ".join(f"{outcome}: {n}" for outcome, n in found[where]["outcomes"].items()),
             found[where]["longest seconds"],
         )
         for where in parts
@@ -379,8 +379,8 @@ def environments() -> str:
 PPO and SAC trained for 240 steps in environments of every kind of `trials/environment_kinds.py`: spaces of all kinds, episodes
 that end in all ways, one fault each in what they answer, and such as raise, exit, hang or are killed. What must come of a run
 is known beforehand: all its steps and finite weights; our own error, which names the environment; the environment's own; or
-a refusal when the agent is made. After an error there must be a checkpoint of that step, which loads with finite weights, and
-no worker process may be left.
+a refusal when the agent is made. After an error there must be a checkpoint of that step, which loads with finite weights
+(not after `sys.exit`, Ctrl-C and `NonFiniteError`, which leave the last one on schedule), and no worker process may be left.
 
 {table(("where", "kinds", "runs", "as they must be", "outcomes", "longest, seconds"), rows)}
 
