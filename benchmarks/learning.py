@@ -24,7 +24,8 @@ import numpy as np
 from scipy import stats
 
 import rejeu
-from rejeu import config as configs, presets
+from rejeu import presets, validation
+from rejeu.algorithms import config as configs
 from rejeu.callbacks import Evaluate
 from rejeu.envs import make_vector
 
@@ -99,7 +100,7 @@ def main() -> None:
         "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
         "versions": {name: importlib.metadata.version(name) for name in ("rejeu", "jax", "gymnasium", "envpool")},
         "hyperparameters": configs.to_json(
-            configs.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, preset.hyperparameters)
+            validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, preset.hyperparameters)
         ),
         "n_envs": preset.n_envs,
         "runs": runs,

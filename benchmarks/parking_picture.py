@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import rejeu
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
-from rejeu.video import rgb_frame
+from rejeu.reporting.video import rgb_frame
 
 MOMENTS = 4
 

@@ -17,8 +17,8 @@ import gymnasium as gym
 
 import rejeu
 from rejeu import agents, spaces
-from rejeu.loops.compiled import Compiled
-from tests.probes.environments import Discretely, Probe
+from rejeu.loops.learner import Compiled
+from tests.algorithms.probes.environments import Discretely, Probe
 
 
 class Kind(NamedTuple):

@@ -16,7 +16,7 @@ import rejeu
 from rejeu import agents, spaces
 from rejeu.algorithms import sac
 from rejeu.core import Algorithm
-from rejeu.loops.compiled import Compiled
+from rejeu.loops.learner import Compiled
 from rejeu.loops.packing import Readings
 
 _algorithms: dict[Any, Algorithm] = {}

@@ -9,9 +9,9 @@ import numpy as np
 
 import rejeu
 from rejeu import agents
-from rejeu.envs.vector import InProcess
+from rejeu.envs.make import InProcess
+from tests.algorithms.probes.environments import Bitwise, Discretely, Doubly, Probe
 from tests.every_agent import shared_functions
-from tests.probes.environments import Bitwise, Discretely, Doubly, Probe
 
 
 class Kind(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from rejeu import spaces
-from rejeu.replay.ring import Ring
+from rejeu.buffers.ring import Ring
 
 
 @dataclass

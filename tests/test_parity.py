@@ -21,7 +21,7 @@ import pytest
 from scipy import stats
 
 from rejeu import presets, spaces
-from rejeu.envs.vector import make_vector
+from rejeu.envs.make import make_vector
 
 LANDERS = "LunarLander-v3", "LunarLanderContinuous-v3"
 

@@ -326,7 +326,7 @@ def change_array(arrays: dict[str, Any], draw: random.Random) -> None:
 
 def table_reader(path: Path) -> Callable[[], None]:
     """Returns what reads the table, the header and the arrays."""
-    from rejeu import checkpoint
+    from rejeu.io import checkpoint
 
     def read() -> None:
         for kind in ("agent", "replay", "vec_normalize"):
@@ -342,8 +342,9 @@ def table_reader(path: Path) -> Callable[[], None]:
 
 def header_reader(path: Path) -> Callable[[], None]:
     """Returns what interprets headers, of whichever algorithm, and builds nothing."""
-    from rejeu import agents, checkpoint
+    from rejeu import agents
     from rejeu.agents import loading
+    from rejeu.io import checkpoint
 
     def read() -> None:
         header, arrays = checkpoint.read(path, "agent")

@@ -104,7 +104,7 @@ class Runs:
 
     def __init__(self, folder: Path) -> None:
         """Makes the runs, and a file for each input to begin with."""
-        from rejeu import checkpoint
+        from rejeu.io import checkpoint
 
         share_compiled()
         self.whole = folder / "whole"
@@ -214,7 +214,7 @@ class Runs:
 
     def is_affordable(self, agent: Any, path: Path) -> bool:
         """Returns whether to learn: what is asked for is little, and compiled already, most of the time."""
-        from rejeu import config as configs
+        from rejeu.algorithms import config as configs
 
         config, run = vars(agent.config), agent._run
         asked = {key: config.get(key) or 0 for key in COSTLY}
@@ -231,7 +231,7 @@ class Runs:
 
 def header_of(path: Path, kind: str) -> dict[str, Any]:
     """Returns the header of a file, nothing where there is none."""
-    from rejeu import checkpoint
+    from rejeu.io import checkpoint
 
     try:
         return checkpoint.read_header(path, kind)
@@ -243,8 +243,9 @@ def share_compiled() -> None:
     """Lets agents of one configuration share what is compiled, which takes most of the time."""
     import jax
 
-    from rejeu import config as configs, spaces
+    from rejeu import spaces
     from rejeu.agents.base import Agent
+    from rejeu.algorithms import config as configs
 
     build, kept = Agent._build, {}
 

@@ -1,6 +1,6 @@
 """Reads every damaged and hostile file there is to make, and records what came of each.
 
-The larger version of ``tests/test_hostile_files.py``: truncation at every byte and a flip of every bit, of every kind of
+The larger version of ``tests/io/test_hostile_files.py``: truncation at every byte and a flip of every bit, of every kind of
 file and both schemas, beside the corpus of ``tests/hostile_files.py``::
 
     python trials/hostile.py --sb3-python path/to/python/with/stable-baselines3
@@ -33,13 +33,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from provenance import provenance
 
 import rejeu
-from rejeu import checkpoint
+from rejeu.io import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
+from tests.agents.test_resume import compiled_once
 from tests.environments import Counter
 from tests.golden import record_files
-from tests.test_hostile_runs import files_of, make_run, replaced, resumed_from
-from tests.test_resume import compiled_once
+from tests.io.test_hostile_runs import files_of, make_run, replaced, resumed_from
 
 ROOT = Path(__file__).parents[1]
 KINDS = {"agent": "sac", "replay": "replay", "vec_normalize": "vec_normalize"}

@@ -53,9 +53,9 @@ WITHOUT = {"": (), "without fsync of files": ("sync",), "without fsync of folder
 def on_paper(root: Path) -> dict[str, Any]:
     """Tries every state of every run; returns totals."""
     import rejeu
+    from tests.agents.test_resume import compiled_once
     from tests.crash_states import crash_states
-    from tests.test_power_loss import EVERY, is_loss, outcome, recorded
-    from tests.test_resume import compiled_once
+    from tests.io.test_power_loss import EVERY, is_loss, outcome, recorded
 
     found: dict[str, Any] = {"interval": EVERY}
     for name, (kind, keep, settings) in RUNS.items():

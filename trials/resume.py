@@ -101,7 +101,7 @@ def compiled_once() -> Iterator[None]:
     from unittest import mock
 
     import rejeu
-    from rejeu.loops.compiled import Compiled
+    from rejeu.loops.learner import Compiled
 
     made: list[Any] = []
 

@@ -62,7 +62,7 @@ class Watch(threading.Thread):
 def train(minutes: float, folder: Path, watch: Watch) -> dict[str, object]:
     import rejeu
     from rejeu.callbacks import Checkpoint, Evaluate, Film
-    from rejeu.logging import CsvFile
+    from rejeu.reporting.logging import CsvFile
 
     env = rejeu.make_vector("parking-v0", 8, "envpool", seed=0)
     agent = rejeu.SAC(

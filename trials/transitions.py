@@ -28,7 +28,7 @@ from gymnasium import spaces
 from scipy.stats import chisquare
 
 import rejeu
-from rejeu.envs.vector import InProcess
+from rejeu.envs.make import InProcess
 
 RESULT = Path(__file__).parent / "results" / "transitions.json"
 GAMMA, ALPHA, EPSILON, BETA = 0.9, 0.6, 1e-3, (0.4, 1.0)

@@ -6,25 +6,25 @@
 100
 """
 
-from rejeu import interrupt
+from rejeu.agents import interrupt
 
 interrupt.guard_imports()
 
-from rejeu import plots
 from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
+from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
+from rejeu.buffers.replay_memory import ReplayMemory
+from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.checker import check_env
+from rejeu.envs.make import make_vector
 from rejeu.envs.monitor import Monitor
 from rejeu.envs.time_limit import TimeLimitTerminates
-from rejeu.envs.vector import make_vector
 from rejeu.errors import BadEnvironmentError, CheckpointError, MissingExtra, WorkerError
-from rejeu.evaluation import Evaluation, evaluate_policy
 from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from rejeu.exploration.parameter_space import ParameterNoise
-from rejeu.replay.hindsight import GoalSelectionStrategy, HerReplayBuffer
-from rejeu.replay.memory import ReplayMemory
-from rejeu.replay.uniform import ReplayBuffer
+from rejeu.reporting import plots
+from rejeu.reporting.evaluation import Evaluation, evaluate_policy
+from rejeu.reporting.video import record_video, show_videos
 from rejeu.schedules import Exponential, Linear
-from rejeu.video import record_video, show_videos
 
 __version__ = "0.1.0"
 

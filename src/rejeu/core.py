@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from rejeu.compilation import one_kernel, outlined
+from rejeu.xla import one_kernel, outlined
 
 PyTree = Any
 Metrics = dict[str, Array]

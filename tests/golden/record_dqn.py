@@ -1,4 +1,4 @@
-"""Records three gradient steps of Stable-Baselines3's DQN for ``tests/test_dqn.py``.
+"""Records three gradient steps of Stable-Baselines3's DQN for ``tests/algorithms/test_dqn.py``.
 
 Run with the Python of an environment that has stable-baselines3 (2.9.2 was used)::
 

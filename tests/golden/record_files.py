@@ -1,4 +1,4 @@
-"""Records files of the present schema, and what they hold, for ``tests/test_schemas.py``.
+"""Records files of the present schema, and what they hold, for ``tests/io/test_schemas.py``.
 
 Run once for each schema that is released, with the code that writes it::
 
@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import rejeu
-from rejeu import checkpoint
+from rejeu.io import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests.environments import Counter, Reach, Sampled
 

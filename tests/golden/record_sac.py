@@ -1,4 +1,4 @@
-"""Records three gradient steps of Stable-Baselines3's SAC, noise included, for ``tests/test_sac.py``.
+"""Records three gradient steps of Stable-Baselines3's SAC, noise included, for ``tests/algorithms/test_sac.py``.
 
 Run with the Python of an environment that has stable-baselines3 (2.9.2 was used)::
 

@@ -1,4 +1,4 @@
-"""Records what Stable-Baselines3's vector environments and callbacks show, for ``tests/test_sb3_golden.py``.
+"""Records what Stable-Baselines3's vector environments and callbacks show, for ``tests/sb3/test_golden.py``.
 
 Run with the Python of an environment that has stable-baselines3 (2.9.2 was used)::
 

@@ -1,6 +1,6 @@
 """Scripts as a Stable-Baselines3 user writes them, of which the library's name is the only argument.
 
-``record_vec_env.py`` runs them with Stable-Baselines3 and keeps what they see; ``tests/test_sb3_golden.py`` runs the same
+``record_vec_env.py`` runs them with Stable-Baselines3 and keeps what they see; ``tests/sb3/test_golden.py`` runs the same
 with rejeu's mirror. Nothing here imports either.
 """
 

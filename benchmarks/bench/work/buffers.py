@@ -44,8 +44,8 @@ def rejeu_ring(kind: str, rows: int) -> Any:
     That of parking keeps what hindsight's strategy ``future`` needs.
     """
     from rejeu import spaces as own
-    from rejeu.replay.hindsight import HindsightConfig, counters
-    from rejeu.replay.ring import LAST, STEP, Ring
+    from rejeu.buffers.hindsight import HindsightConfig, counters
+    from rejeu.buffers.ring import LAST, STEP, Ring
 
     space = observation_space(kind)
     kept = counters(HindsightConfig() if kind == "parking" else None)

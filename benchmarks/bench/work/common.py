@@ -68,9 +68,9 @@ def threads_used(agent: Any, library: str, n_envs: int) -> dict[str, Any]:
     """Returns how many threads torch has, and whether rejeu takes one (1) or all (0) for an agent's updates."""
     used: dict[str, Any] = {"torch_threads": threads_of(library)}
     if library == "rejeu":
-        from rejeu import compilation
+        from rejeu import xla
 
-        used["threads"] = 1 if agent._work(n_envs) <= compilation.LITTLE_WORK else 0
+        used["threads"] = 1 if agent._work(n_envs) <= xla.LITTLE_WORK else 0
     return used
 
 
@@ -121,12 +121,12 @@ def time_learning(agent: Any, library: str, warm_up: int, unit: int, seconds: fl
     taken = run(steps)
     result: dict[str, Any] = {"seconds_per_step": taken / steps, "steps": steps, "seconds": taken}
     if library == "rejeu":
-        from rejeu import compilation
+        from rejeu import xla
 
         spent = {part: value - before[part] for part, value in agent.seconds.items()}
         parts = {part: spent[part] / steps for part in ("env", "replay", "update")}
         result["seconds_by_part"] = parts | {"rest": taken / steps - sum(parts.values())}
-        result["compile_seconds"] = compilation.seconds()
+        result["compile_seconds"] = xla.seconds()
     return result
 
 

@@ -38,7 +38,7 @@ def rejeu_job(folder: Path, backend: str, n_envs: int, settings: dict[str, Any],
     import jax
 
     import rejeu
-    from rejeu import compilation
+    from rejeu import xla
 
     env: Any = rejeu.make_vector("parking-v0", n_envs, backend, seed=0)
     imported = time.perf_counter()
@@ -71,7 +71,7 @@ def rejeu_job(folder: Path, backend: str, n_envs: int, settings: dict[str, Any],
         "train_seconds": trained - imported,
         "file_seconds": filed - trained,
         "evaluate_seconds": done - filed,
-        "compile_seconds": compilation.seconds(),
+        "compile_seconds": xla.seconds(),
         "success_rate": evaluation.success_rate,
         "mean_return": evaluation.mean_return,
         "seconds_by_part": by_part,

@@ -18,10 +18,10 @@ def measure(library: str, what: str, sizes: list[int], seconds: float) -> dict[s
 
 
 def rejeu_sampler(what: str, size: int) -> Any:
-    from rejeu.envs.vector import make_vector
-    from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig
-    from rejeu.replay.prioritized import Priorities, PriorityConfig
-    from rejeu.replay.uniform import ReplayBuffer
+    from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
+    from rejeu.buffers.prioritized import Priorities, PriorityConfig
+    from rejeu.buffers.uniform import ReplayBuffer
+    from rejeu.envs.make import make_vector
 
     rng = np.random.default_rng(0)
     if what == "hindsight":

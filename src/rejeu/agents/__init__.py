@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rejeu import checkpoint
 from rejeu.agents import files
 from rejeu.agents.base import Agent, Callback, whole_seed
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ
 from rejeu.agents.on_policy import A2C, PPO, MaskablePPO, RecurrentPPO
 from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
 
 KINDS = (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO)
 

@@ -20,7 +20,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import checkpoint, compilation, config as configs, finite, spaces, summary
+from rejeu import spaces, validation, xla
 from rejeu.agents import best, evaluating, files, learning, predicting, resuming, statistics
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import RowFiles
@@ -29,22 +29,25 @@ from rejeu.agents.files import AGENT_ARGUMENTS
 from rejeu.agents.loading import whole_seed
 from rejeu.agents.policies import check_policy
 from rejeu.agents.resuming import Resumed
+from rejeu.algorithms import config as configs
 from rejeu.envs.auto_reset import AutoResetView, around
+from rejeu.envs.make import Backend, InProcess, VectorEnv
 from rejeu.envs.masks import split
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vec_normalize import VecNormalize, unwrap_vec_normalize
-from rejeu.envs.vector import Backend, InProcess, VectorEnv
-from rejeu.evaluation import Evaluation
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
-from rejeu.failed_writes import FailedWrites
-from rejeu.history import History
 from rejeu.hooks import BaseCallback
-from rejeu.logging import Logger, Sink
-from rejeu.loops import host
-from rejeu.loops.compiled import Compiled, PackedState
-from rejeu.loops.host import Progress, Run
-from rejeu.running_stats import normalised
+from rejeu.io import checkpoint
+from rejeu.io.failed_writes import FailedWrites
+from rejeu.loops import finite
+from rejeu.loops.learner import Compiled, PackedState
+from rejeu.loops.run import Progress, Run, initial_run
+from rejeu.normalization import normalised
+from rejeu.reporting import summary
+from rejeu.reporting.evaluation import Evaluation
+from rejeu.reporting.history import History
+from rejeu.reporting.logging import Logger, Sink
 
 Callback = Callable[["Agent", Progress], bool | None]
 """Called after every step of the environments; ``False``, and nothing else, stops training."""
@@ -60,7 +63,7 @@ class Agent(ABC):
     _learning: bool = False
     """Whether ``learn`` is under way."""
     report_folder: Path | None = None
-    """Where a batch that broke something is saved; None: see :func:`rejeu.finite.folder_of`."""
+    """Where a batch that broke something is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
 
@@ -78,25 +81,25 @@ class Agent(ABC):
         device: str = "auto",
         **hyperparameters: Any,
     ) -> None:
-        known = [*configs.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
+        known = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
         for key in hyperparameters:
             if key not in known:
-                raise TypeError(configs.unknown_name(key, known, self.name))
+                raise TypeError(validation.unknown_name(key, known, self.name))
         self._set_up(
             policy,
             self.algorithm.Config(**hyperparameters),
             int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed),
             verbose,
             tensorboard_log,
-            configs.whole("stats_window_size", stats_window_size, least=1),
-            None if success_threshold is None else configs.number("success_threshold", success_threshold),
-            configs.whole("best_window", best_window, least=1),
+            validation.whole("stats_window_size", stats_window_size, least=1),
+            None if success_threshold is None else validation.number("success_threshold", success_threshold),
+            validation.whole("best_window", best_window, least=1),
         )
         self._own_env = isinstance(env, str)
         vector = self._vector(env, 1, seed=self.seed)
         check_policy(policy, vector.observation_space)
         self._build(vector.observation_space, vector.action_space)
-        compilation.start_device(self._threads(vector.n_envs))
+        xla.start_device(self._threads(vector.n_envs))
         self._start(vector)
 
     def _set_up(
@@ -151,7 +154,7 @@ class Agent(ABC):
         """Id and keyword arguments of the environments that a loaded agent was trained on, where its file says."""
         self._own_env = False
         """Whether the environment was given by its id."""
-        compilation.enable_cache()
+        xla.enable_cache()
 
     def _build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
         """Compiles the algorithm for these spaces."""
@@ -170,14 +173,14 @@ class Agent(ABC):
     def _threads(self, n_envs: int) -> int:
         """Returns how many threads suit updates on ``n_envs`` environments, by the largest layer; for images all."""
         if any(leaf.kind == "image" for leaf in self._obs_leaves):
-            return compilation.cores()
+            return xla.cores()
         weights = [leaf.size for leaf in jax.tree.leaves(self._compiled.shapes) if len(leaf.shape) > 1]
-        return compilation.threads_for(self._batch_size(n_envs) * max(weights, default=0))
+        return xla.threads_for(self._batch_size(n_envs) * max(weights, default=0))
 
     def _start(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
         """Begins a run on ``env`` with a fresh state, or the given one, and an empty buffer; None only predicts."""
         buffer, learn_from = (None, 0) if env is None else (self._make_buffer(env), self._learn_from(0))
-        self._run: Run = host.initial_run(env, buffer, self._compiled, learn_from, self.seed, state)
+        self._run: Run = initial_run(env, buffer, self._compiled, learn_from, self.seed, state)
 
     @abstractmethod
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
@@ -290,7 +293,7 @@ class Agent(ABC):
             episodes: stop when so many episodes have ended, over all environments.
             minutes: stop after so much wall time. Schedules follow whichever limit is nearest; episodes and training time
                 before this call count as steps do.
-            sinks: further places for the rows of statistics, such as ``rejeu.logging.CsvFile(path)``.
+            sinks: further places for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)``.
 
         Without any limit, an agent from :meth:`resume` goes on with the ``learn`` that was cut off, to its end; arguments
         that count steps and rows are then those of that call.
@@ -542,7 +545,7 @@ class Agent(ABC):
 
         Everything stands as it stood: what was learnt, the replay buffer, running episodes, exploration, random numbers,
         counters, statistics, callbacks' own memory (give ``learn`` the same callbacks). Where the environments
-        can be saved (see :mod:`rejeu.envs.state`) or repeat their episodes (EnvPool), the run that follows is the same,
+        can be saved (see :mod:`rejeu.envs.snapshot`) or repeat their episodes (EnvPool), the run that follows is the same,
         bit for bit, that would have followed without a break; elsewhere new episodes begin, and a warning says so.
         ``resumed`` tells which.
 
@@ -558,7 +561,7 @@ class Agent(ABC):
         return resuming.resume(cls, Path(folder), env, changes)
 
     def summary(self) -> str:
-        """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.summary`."""
+        """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""
         return summary.describe(self._compiled.shapes, self._obs_leaves)
 
     def __repr__(self) -> str:

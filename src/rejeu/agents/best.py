@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rejeu import finite
-from rejeu.loops.compiled import PackedState
-from rejeu.text import counted
+from rejeu.loops import finite
+from rejeu.loops.learner import PackedState
+from rejeu.reporting.text import counted
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rejeu.config import number, whole
+from rejeu.validation import number, whole
 
 
 @dataclass

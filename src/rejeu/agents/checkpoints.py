@@ -29,15 +29,17 @@ import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
-from rejeu import atomic, checkpoint, compilation, finite, plain
+from rejeu import xla
 from rejeu.agents import files
-from rejeu.config import number, whole
+from rejeu.buffers.ring import Ring
+from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
-from rejeu.failed_writes import RETRY_SECONDS
-from rejeu.loops.host import Progress, Run
-from rejeu.replay.ring import Ring
-from rejeu.replay.rollout import RolloutBuffer
+from rejeu.io import atomic, checkpoint, plain
+from rejeu.io.failed_writes import RETRY_SECONDS
+from rejeu.loops import finite
+from rejeu.loops.run import Progress, Run
+from rejeu.validation import number, whole
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
@@ -317,7 +319,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,
         "own_env": agent._own_env,
-        "threads": compilation.threads(),
+        "threads": xla.threads(),
         "run": plain.encode(everything, arrays, "run"),
     }
     return header, arrays

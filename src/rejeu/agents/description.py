@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING, Any
 
-from rejeu import config as configs
+from rejeu import validation
 from rejeu.agents.files import AGENT_ARGUMENTS
 
 if TYPE_CHECKING:
@@ -20,12 +20,12 @@ def describe(cls: type[Agent], common: inspect.Signature) -> None:
         common: what every agent takes, whose last parameter stands for the hyper-parameters.
     """
     config = cls.algorithm.Config
-    docs = configs.field_docs(config)
+    docs = validation.field_docs(config)
     lines = [f"{(config.__doc__ or '').strip()}", "", "Args:"]
     lines += [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
     defaults = config()
     parameters = list(common.parameters.values())[:-1]
-    for key in configs.field_names(config):
+    for key in validation.field_names(config):
         default = getattr(defaults, key)
         lines.append(f"    {key}: {docs[key]} Default: {default!r}.")
         parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))

@@ -10,13 +10,13 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import predicting
-from rejeu.config import number, whole
 from rejeu.envs.auto_reset import identities
 from rejeu.envs.envpool import envpool_knows
+from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import maker, register
 from rejeu.envs.vec_normalize import unwrap_vec_normalize
-from rejeu.envs.vector import VectorEnv
-from rejeu.evaluation import Evaluation, evaluate
+from rejeu.reporting.evaluation import Evaluation, evaluate
+from rejeu.validation import number, whole
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
@@ -107,7 +107,7 @@ def lent(agent: Agent, vector: VectorEnv, seeded: bool = False) -> Iterator[None
 
 
 def policy(agent: Agent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
-    """Returns the policy as :func:`rejeu.evaluation.evaluate` takes it; it remembers from call to call."""
+    """Returns the policy as :func:`rejeu.reporting.evaluation.evaluate` takes it; it remembers from call to call."""
     memory: Any = None
 
     def act(obs: Any, ended: np.ndarray) -> np.ndarray:

@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from rejeu import checkpoint, compilation, config as configs, spaces
+from rejeu import spaces, xla
 from rejeu.agents import loading
+from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
-    from rejeu.envs.vector import VectorEnv
+    from rejeu.envs.make import VectorEnv
 
 A = TypeVar("A", bound="Agent")
 
@@ -145,7 +147,7 @@ def load(
     if vector is not None:
         agent._check_spaces(vector, "the given environment")
     n_envs = 1 if vector is None else vector.n_envs
-    compilation.start_device(agent._threads(n_envs) if threads is None else threads)
+    xla.start_device(agent._threads(n_envs) if threads is None else threads)
     try:
         stand(agent, vector, state, saved)
     except (ArithmeticError, MemoryError, ValueError) as error:

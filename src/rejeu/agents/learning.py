@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import config as configs, finite
+from rejeu import validation
 from rejeu.agents import resuming, statistics
 from rejeu.agents.best import note_training_return
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import Checkpoint
+from rejeu.agents.interrupt import Interrupt
 from rejeu.errors import NonFiniteError
-from rejeu.failed_writes import RetryingSink
 from rejeu.hooks import Hooks, told_apart
-from rejeu.interrupt import Interrupt
-from rejeu.logging import Console, Sink, TensorBoard, next_folder
+from rejeu.io.failed_writes import RetryingSink
+from rejeu.loops import finite
+from rejeu.reporting.logging import Console, Sink, TensorBoard, next_folder
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent, Callback
@@ -66,9 +67,9 @@ def begin(
     if goes_on:
         call = cut_off(agent)
     else:
-        n_steps = None if total_timesteps is None else configs.whole("total_timesteps", total_timesteps, least=1)
-        n_episodes = None if episodes is None else configs.whole("episodes", episodes, least=1)
-        seconds = None if minutes is None else 60 * configs.number("minutes", minutes, above=0)
+        n_steps = None if total_timesteps is None else validation.whole("total_timesteps", total_timesteps, least=1)
+        n_episodes = None if episodes is None else validation.whole("episodes", episodes, least=1)
+        seconds = None if minutes is None else 60 * validation.number("minutes", minutes, above=0)
         if reset_num_timesteps:
             agent._steps_before, agent._episodes_before = run.step, run.episode
             agent._seconds_before = run.seconds["total"]

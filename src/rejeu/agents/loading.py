@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from rejeu import config as configs, spaces
+from rejeu import spaces, validation
 from rejeu.agents.best import BEST_WINDOW
 from rejeu.agents.policies import check_policy
+from rejeu.algorithms import config as configs
 from rejeu.errors import CheckpointError
 from rejeu.networks import settled
 
@@ -119,12 +120,12 @@ def _interpret(
             observation_space,
             spaces.rebuild(header["action_space"], largest),
             check_counters(header["counters"]),
-            {key: configs.whole_exact(header["rng"][key]) for key in ("state", "inc")},
+            {key: validation.whole_exact(header["rng"][key]) for key in ("state", "inc")},
             policy,
             whole_seed(header["seed"]),
-            None if threshold is None else configs.number("success_threshold", threshold),
-            configs.whole("stats_window_size", header["stats_window_size"], 1),
-            configs.whole("best_window", header.get("best_window", BEST_WINDOW), 1),
+            None if threshold is None else validation.number("success_threshold", threshold),
+            validation.whole("stats_window_size", header["stats_window_size"], 1),
+            validation.whole("best_window", header.get("best_window", BEST_WINDOW), 1),
         )
     except KeyError as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)} is missing") from None
@@ -136,10 +137,10 @@ def check_counters(saved: Mapping[str, Any]) -> dict[str, int]:
     Raises:
         KeyError, TypeError, ValueError: if they are damaged.
     """
-    counters = {key: configs.whole(key, saved[key], 0, 2**32 - 1) for key in COUNTERS}
-    configs.whole("steps_before", counters["steps_before"], 0, counters["step"])
+    counters = {key: validation.whole(key, saved[key], 0, 2**32 - 1) for key in COUNTERS}
+    validation.whole("steps_before", counters["steps_before"], 0, counters["step"])
     before = saved.get("episodes_before", 0)  # older files do not have it
-    return counters | {"episodes_before": configs.whole("episodes_before", before, 0, counters["episode"])}
+    return counters | {"episodes_before": validation.whole("episodes_before", before, 0, counters["episode"])}
 
 
 def check_space(description: Any, own: gym.Space, kind: str) -> None:

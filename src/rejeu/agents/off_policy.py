@@ -9,21 +9,22 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from rejeu import checkpoint, spaces
+from rejeu import spaces
 from rejeu.agents import loading, predicting
 from rejeu.agents.base import Agent
 from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
-from rejeu.config import OffPolicyConfig
-from rejeu.envs.vector import Backend, VectorEnv, make_vector
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.buffers.hindsight import GoalFunctions, HerReplayBuffer, counters
+from rejeu.buffers.prioritized import Priorities
+from rejeu.buffers.ring import Ring
+from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
-from rejeu.loops.host import Progress
+from rejeu.io import checkpoint
 from rejeu.loops.off_policy import begin_episodes, off_policy
-from rejeu.replay.hindsight import GoalFunctions, HerReplayBuffer, counters
-from rejeu.replay.prioritized import Priorities
-from rejeu.replay.ring import Ring
-from rejeu.replay.uniform import ReplayBuffer
+from rejeu.loops.run import Progress
 
 
 class OffPolicyAgent(Agent):

@@ -15,13 +15,13 @@ from rejeu.agents.base import Agent
 from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
 from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import Masked
+from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.envs.masks import make_masked, mask_leaf, n_choices
-from rejeu.envs.vector import Backend, VectorEnv, make_vector
 from rejeu.exploration.noise import Noise
-from rejeu.loops.host import Progress
 from rejeu.loops.on_policy import begin_episodes, on_policy
-from rejeu.replay.rollout import RolloutBuffer
+from rejeu.loops.run import Progress
 
 
 class OnPolicyAgent(Agent):

@@ -9,9 +9,10 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import finite, spaces
+from rejeu import spaces
 from rejeu.envs.masks import split
-from rejeu.loops import host
+from rejeu.loops import finite
+from rejeu.loops.run import clock_of
 from rejeu.spaces import Leaf
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
     if deterministic:
         action, memory = compiled.recall(run.state, memory, obs, ended)
         return np.asarray(action), memory
-    clock = host.clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent._n_predictions % 2**31))
+    clock = clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent._n_predictions % 2**31))
     agent._n_predictions += 1
     action, memory = compiled.sample(run.state, memory, obs, ended, run.key, clock)
     return np.asarray(action), memory if has_memory else None

@@ -14,19 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu import checkpoint, compilation, plain, spaces
+from rejeu import spaces, xla
 from rejeu.agents import files, loading
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import PER_ENV, ROWS_FILE, SCALARS, RowFiles, run_files
-from rejeu.config import number, whole
+from rejeu.buffers.prioritized import Draw, Priorities
+from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
-from rejeu.envs.contract import DivergedError
-from rejeu.envs.vector import BACKENDS, Backend, VectorEnv
+from rejeu.envs.base import DivergedError
+from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
-from rejeu.loops.host import Run, is_finite
+from rejeu.io import checkpoint, plain
 from rejeu.loops.packing import Readings
-from rejeu.replay.prioritized import Draw, Priorities
-from rejeu.replay.rollout import RolloutBuffer
+from rejeu.loops.run import Run, is_finite
+from rejeu.validation import number, whole
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
@@ -180,13 +181,13 @@ def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
 
 def compared(agent: Agent, header: dict[str, Any]) -> Resumed:
     """Returns how a run resumes whose environments stand where they stood."""
-    before, here = header.get("threads", compilation.threads()), compilation.threads()
+    before, here = header.get("threads", xla.threads()), xla.threads()
     if before == here:
         return Resumed(agent._run.step, True, "")
     return Resumed(
         agent._run.step, False,
         f"where it stood, but JAX computes with {here} threads here and had {before}, so results may differ in their last "
-        f"bits; resume in a new process, with the environment variable {compilation.THREADS}={before} if JAX is used before",
+        f"bits; resume in a new process, with the environment variable {xla.THREADS}={before} if JAX is used before",
     )  # fmt: skip
 
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rejeu import compilation
-from rejeu.loops import host
-from rejeu.loops.host import Episode
+from rejeu import xla
+from rejeu.loops.run import Episode, time_shares
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
@@ -44,9 +43,9 @@ def row(agent: Agent) -> dict[str, float]:
     numbers["time/episodes"] = run.episode
     numbers["time/steps_per_second"] = float(agent.steps_per_second)
     numbers["time/seconds"] = run.seconds["total"]
-    for part, share in host.time_shares(run.seconds).items():
+    for part, share in time_shares(run.seconds).items():
         numbers[f"time/{part}_share"] = share
-    numbers["time/compile_seconds"] = compilation.seconds()
+    numbers["time/compile_seconds"] = xla.seconds()
     numbers["train/n_updates"] = run.n_updates
     if agent._compiled.skips:
         numbers["train/skipped_updates"] = run.watch.n_skipped

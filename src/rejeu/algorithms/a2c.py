@@ -39,11 +39,12 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardised,
 )
+from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ppo import descend
-from rejeu.config import number, with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_action, leaves
+from rejeu.validation import number
 
 RMSPROP_DECAY = 0.99
 """Share of RMSprop's running mean of squared gradients that stays at each step (the paper's alpha)."""

@@ -13,7 +13,7 @@ which are distributed otherwise, in another. Here they go through together and s
 
 and every ``policy_delay``-th time, after the critics, the actor takes a step and with it the temperature, whose loss is
 SAC's (:mod:`rejeu.algorithms.sac`). A network goes by the batch's statistics, and its running ones move on, only while
-its own loss is taken (:mod:`rejeu.normalisation`): the policy acts, draws ``a'`` and is judged by the critics with
+its own loss is taken (:mod:`rejeu.networks.batch_renorm`): the policy acts, draws ``a'`` and is judged by the critics with
 running statistics. Adam's first moment forgets faster, ``b_1 = 1/2``, except for the temperature.
 
 As in Stable-Baselines3 Contrib, the critics are 1024 wide by default, where the paper's are 2048.
@@ -31,8 +31,8 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.sac import LOG_STD_RANGE, initial_temperature, temperature_loss
-from rejeu.config import OffPolicyConfig, number, whole
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -47,10 +47,11 @@ from rejeu.core import (
 )
 from rejeu.distributions import TanhNormal
 from rejeu.networks import PolicyConfig, Widths
-from rejeu.normalisation import RenormalisedNetwork, with_statistics
-from rejeu.randomness import nth
+from rejeu.networks.batch_renorm import RenormalisedNetwork, with_statistics
+from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.validation import number, whole
 
 ACTOR_LAYERS = (256, 256)
 """Default widths of the actor."""

@@ -25,8 +25,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, whole, with_widths
+from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -44,6 +43,8 @@ from rejeu.core import (
 from rejeu.networks import Actor, Critic, Widths
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.validation import whole
+from rejeu.xla import outlined
 
 HIDDEN_LAYERS = (400, 300)
 """Default widths of actor and critic but on images, those of the paper."""

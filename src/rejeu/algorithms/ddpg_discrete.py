@@ -21,9 +21,8 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, Config
-from rejeu.compilation import outlined
-from rejeu.config import with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -41,6 +40,7 @@ from rejeu.core import (
 from rejeu.networks import Actor
 from rejeu.schedules import at
 from rejeu.spaces import leaves
+from rejeu.xla import outlined
 
 ENTROPY_COEFFICIENT = 0.01
 """Weight of the actor's entropy in nats, in the unit of rewards."""

@@ -30,8 +30,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, number, whole, with_widths
+from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -49,6 +48,8 @@ from rejeu.exploration.noise import ActionNoise
 from rejeu.networks import MLP, Actor, Encoder, Linear, PolicyConfig, Torso, Widths, make_torso
 from rejeu.schedules import Exponential, Linear as LinearSchedule, Schedule, at
 from rejeu.spaces import Leaf, leaves
+from rejeu.validation import number, whole
+from rejeu.xla import outlined
 
 HIDDEN_LAYERS = (64, 64)
 """Default widths of the network but on images, those of Stable-Baselines3."""

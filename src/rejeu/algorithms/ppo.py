@@ -1,7 +1,7 @@
 """Proximal policy optimisation: several epochs over each rollout, the policy held near the one that collected it.
 
 Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms" (arXiv 1707.06347, equations 7 and 9), with the
-advantages of Schulman et al. 2016 (see :mod:`rejeu.replay.rollout`). With the policy ``pi``, the one that collected the
+advantages of Schulman et al. 2016 (see :mod:`rejeu.buffers.rollout`). With the policy ``pi``, the one that collected the
 rollout ``pi_old``, advantages ``A``, value ``V`` and its targets ``R = A + V_old``, over minibatches::
 
     ratio    = pi(a | s) / pi_old(a | s)
@@ -48,11 +48,12 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardised,
 )
-from rejeu.config import number, whole, with_widths
+from rejeu.algorithms.config import with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
-from rejeu.randomness import nth
+from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_action, leaves
+from rejeu.validation import number, whole
 
 ADAM_EPSILON = 1e-5
 """Added to Adam's denominator, as in the authors' code."""

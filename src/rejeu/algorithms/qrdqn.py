@@ -26,6 +26,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.algorithms.dqn import (
     HIDDEN_LAYERS,
     check_discrete_action,
@@ -39,12 +40,12 @@ from rejeu.algorithms.dqn import (
     moves_due,
     taken,
 )
-from rejeu.config import OffPolicyConfig, whole, with_widths
+from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, weighted_mean
 from rejeu.networks import Actor, Widths
-from rejeu.quantiles import quantile_huber_loss
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import leaves
+from rejeu.validation import whole
 
 
 @dataclass(frozen=True, kw_only=True)

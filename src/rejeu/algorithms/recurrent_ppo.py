@@ -37,14 +37,15 @@ from rejeu.algorithms.actor_critic import (
     orthogonal,
     unmasked,
 )
+from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
-from rejeu.config import nested, whole, with_widths
+from rejeu.buffers.rollout import advantages
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew
 from rejeu.networks import Encoder
-from rejeu.randomness import nth
-from rejeu.replay.rollout import advantages
+from rejeu.prng import nth
 from rejeu.spaces import Leaf, check_action, leaves
+from rejeu.validation import nested, whole
 
 
 @dataclass(frozen=True)

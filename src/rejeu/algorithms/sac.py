@@ -28,8 +28,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, number, whole
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -47,9 +46,11 @@ from rejeu.core import (
 )
 from rejeu.distributions import TanhNormal
 from rejeu.networks import Actor, Critic, action_values
-from rejeu.randomness import nth
+from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.validation import number, whole
+from rejeu.xla import outlined
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""

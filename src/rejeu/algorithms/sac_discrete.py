@@ -23,7 +23,6 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.sac import HIDDEN_LAYERS, Config, State, initial_temperature
-from rejeu.compilation import outlined
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -42,6 +41,7 @@ from rejeu.core import (
 from rejeu.networks import Actor
 from rejeu.schedules import at
 from rejeu.spaces import leaves
+from rejeu.xla import outlined
 
 TARGET_ENTROPY_SHARE = 0.3
 """Automatic target entropy as a share of the uniform policy's."""

@@ -24,9 +24,8 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, actor_loss, policy
-from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, number, whole, with_widths
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -42,9 +41,11 @@ from rejeu.core import (
     weighted_mean,
 )
 from rejeu.networks import Actor, Critic, Widths, action_values
-from rejeu.randomness import nth
+from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.validation import number, whole
+from rejeu.xla import outlined
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,9 +24,9 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac import HIDDEN_LAYERS, State, initial_temperature, policy, temperature_loss
-from rejeu.compilation import outlined
-from rejeu.config import OffPolicyConfig, number, whole
 from rejeu.core import (
     TD_ERROR,
     Algorithm,
@@ -43,10 +43,11 @@ from rejeu.core import (
     weighted_mean,
 )
 from rejeu.networks import Actor, Critic
-from rejeu.quantiles import quantile_huber_loss
-from rejeu.randomness import nth
+from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.validation import number, whole
+from rejeu.xla import outlined
 
 
 @dataclass(frozen=True, kw_only=True)

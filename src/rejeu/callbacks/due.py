@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rejeu.loops.host import Progress
+from rejeu.loops.run import Progress
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

@@ -11,11 +11,11 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.due import crossed, step_before
-from rejeu.config import whole
 from rejeu.envs.auto_reset import identities
-from rejeu.envs.vector import VectorEnv, make_vector
-from rejeu.evaluation import Evaluation
-from rejeu.loops.host import Progress
+from rejeu.envs.make import VectorEnv, make_vector
+from rejeu.loops.run import Progress
+from rejeu.reporting.evaluation import Evaluation
+from rejeu.validation import whole
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

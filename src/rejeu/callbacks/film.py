@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from rejeu.callbacks.due import crossed, step_before
-from rejeu.config import whole
-from rejeu.loops.host import Progress
+from rejeu.loops.run import Progress
+from rejeu.validation import whole
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent
@@ -77,7 +77,7 @@ class Film:
             assert self.every_episodes is not None
             due = crossed(episodes_before, self._n_episodes, self.every_episodes)
         if due:
-            from rejeu.video import record_video
+            from rejeu.reporting.video import record_video
 
             path = self.folder / f"step_{progress.step:0{DIGITS}}.mp4"
             film = partial(record_video, agent, path, self.env, self.episodes, self.max_steps, self.seed)

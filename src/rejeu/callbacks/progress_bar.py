@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from rejeu.callbacks.due import step_before
-from rejeu.loops.host import Progress, time_shares
-from rejeu.notebook import Display
+from rejeu.loops.run import Progress, time_shares
+from rejeu.reporting.notebook import Display
 
 if TYPE_CHECKING:
     from rich.console import Console

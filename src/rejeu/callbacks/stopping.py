@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rejeu.config import whole
-from rejeu.loops.host import Episode, Progress
+from rejeu.loops.run import Episode, Progress
+from rejeu.validation import whole
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent, Callback

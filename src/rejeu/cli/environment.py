@@ -25,7 +25,7 @@ from rejeu.errors import CheckpointError
 if TYPE_CHECKING:
     import gymnasium as gym
 
-    from rejeu.envs.vector import VectorEnv
+    from rejeu.envs.make import VectorEnv
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +73,8 @@ class Environment:
         Raises:
             ValueError: for ``envpool`` with wrappers or keyword arguments, which it does not take.
         """
+        from rejeu.envs.make import make_vector
         from rejeu.envs.registry import maker
-        from rejeu.envs.vector import make_vector
 
         if not self.wrappers:
             return make_vector(
@@ -91,7 +91,7 @@ class Environment:
         Raises:
             ValueError: if it cannot.
         """
-        from rejeu.video import make_drawing
+        from rejeu.reporting.video import make_drawing
 
         return make_drawing(self.make, self.env_id)
 

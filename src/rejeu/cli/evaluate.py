@@ -36,7 +36,7 @@ class Evaluate(RunOptions):
 def run(arguments: Evaluate) -> int:
     """Evaluates, prints one line, and returns the exit status."""
     from rejeu import load
-    from rejeu.config import number, whole
+    from rejeu.validation import number, whole
 
     episodes, minutes = arguments.episodes, arguments.minutes
     if minutes is not None:

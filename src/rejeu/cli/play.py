@@ -13,7 +13,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from rejeu.cli import run_folder, settings
 from rejeu.cli.environment import EnvironmentOptions, named
 from rejeu.cli.run_folder import Which
-from rejeu.text import counted
+from rejeu.reporting.text import counted
 
 if TYPE_CHECKING:
     from rejeu.play import Game

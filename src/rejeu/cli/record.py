@@ -32,9 +32,9 @@ class Record(RunOptions):
 def run(arguments: Record) -> int:
     """Films, prints where, and returns the exit status."""
     from rejeu import load
-    from rejeu.config import whole
-    from rejeu.text import counted
-    from rejeu.video import record_video
+    from rejeu.reporting.text import counted
+    from rejeu.reporting.video import record_video
+    from rejeu.validation import whole
 
     episodes = whole("--episodes", arguments.episodes, least=1)
     model = run_folder.find_model(arguments.run, arguments.which)

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from rejeu.agents.interrupt import Interrupt
 from rejeu.cli import run_folder
 from rejeu.cli.environment import RunOptions
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.running import Limits, Session, Watch, carry_out, has_reached_goal, make_evaluation_env
 from rejeu.cli.telling import say
-from rejeu.interrupt import Interrupt
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent
@@ -40,8 +40,8 @@ def run(arguments: Resume) -> int:
     """Trains and returns the exit status, as ``rejeu train`` does."""
     watch = Watch()
     from rejeu import AGENTS
-    from rejeu.config import number, whole
     from rejeu.errors import CheckpointError
+    from rejeu.validation import number, whole
 
     if arguments.steps is not None and arguments.minutes is not None:
         raise ValueError("--steps and --minutes exclude each other; give one of them")

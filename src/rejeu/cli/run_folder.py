@@ -11,10 +11,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from rejeu import atomic
 from rejeu.cli import environment
 from rejeu.cli.environment import Environment, RunOptions
 from rejeu.errors import CheckpointError
+from rejeu.io import atomic
 
 Which = Literal["best", "last"]
 MOST_ENVS = 4096
@@ -199,7 +199,7 @@ LATER = ("env_argument", "env_kwargs", "wrappers")
 def check_ranges(config: RunConfig) -> None:
     """Raises ``ValueError`` for numbers that no run can have, and for those that would take all of memory or time."""
     from rejeu.agents import whole_seed
-    from rejeu.config import number, whole
+    from rejeu.validation import number, whole
 
     whole_seed(config.seed)
     whole("n_envs", config.n_envs, least=1, most=MOST_ENVS)
@@ -285,7 +285,7 @@ def recorded_id(model: Path) -> Any:
     Raises:
         CheckpointError: if the file is no model.
     """
-    from rejeu import checkpoint
+    from rejeu.io import checkpoint
 
     return checkpoint.read_header(model, "agent").get("env_id")
 

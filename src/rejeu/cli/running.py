@@ -8,16 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rejeu.agents.interrupt import Interrupt, leaving
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.cli.telling import reporter, say, summary
-from rejeu.interrupt import Interrupt, leaving
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent
     from rejeu.callbacks import Evaluate
-    from rejeu.envs.vector import VectorEnv
-    from rejeu.loops.host import Progress
+    from rejeu.envs.make import VectorEnv
+    from rejeu.loops.run import Progress
 
 VIDEO_EPISODES = 3
 VIDEO_STEPS = 600
@@ -54,15 +54,15 @@ class Watch:
     """Measures what a command takes, from when it is made."""
 
     def __init__(self) -> None:
-        from rejeu import compilation
+        from rejeu import xla
 
-        self._began, self._compiled = time.perf_counter(), compilation.seconds()
+        self._began, self._compiled = time.perf_counter(), xla.seconds()
 
     def seconds(self) -> tuple[float, float]:
         """Returns wall time, and how much of it went into compiling."""
-        from rejeu import compilation
+        from rejeu import xla
 
-        return time.perf_counter() - self._began, compilation.seconds() - self._compiled
+        return time.perf_counter() - self._began, xla.seconds() - self._compiled
 
 
 def make_agent(config: RunConfig, env: VectorEnv) -> Agent:
@@ -122,8 +122,8 @@ def train(session: Session, stop: Interrupt) -> tuple[Evaluate, bool]:
     """
     from rejeu import errors
     from rejeu.callbacks import Checkpoint, Evaluate, Film
-    from rejeu.failed_writes import RetryingSink
-    from rejeu.logging import CsvFile
+    from rejeu.io.failed_writes import RetryingSink
+    from rejeu.reporting.logging import CsvFile
 
     agent, config, folder, limits = session.agent, session.config, session.folder, session.limits
     agent.report_folder = folder.path
@@ -196,7 +196,7 @@ def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:
 
 def draw(session: Session, evaluate: Evaluate) -> None:
     """Draws the curve, or says why not."""
-    from rejeu import plots
+    from rejeu.reporting import plots
 
     title = f"{session.environment.env_id}, {session.config.algorithm}"
     try:
@@ -210,7 +210,7 @@ def film(session: Session) -> None:
     import gymnasium
 
     from rejeu import load
-    from rejeu.video import record_video
+    from rejeu.reporting.video import record_video
 
     folder = session.folder
     try:

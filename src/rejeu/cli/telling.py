@@ -7,16 +7,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
+from rejeu.agents.interrupt import NAMES
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
-from rejeu.interrupt import NAMES
-from rejeu.text import counted
+from rejeu.reporting.text import counted
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent
     from rejeu.callbacks import Evaluate, Evaluated
     from rejeu.cli.running import Session
-    from rejeu.logging import Sink
+    from rejeu.reporting.logging import Sink
 
 say = partial(print, flush=True)
 

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from rejeu.agents.interrupt import Interrupt
 from rejeu.cli import run_folder, settings
 from rejeu.cli.environment import Environment, EnvironmentOptions, named
 from rejeu.cli.run_folder import RunConfig
 from rejeu.cli.running import Limits, Session, Watch, carry_out, make_agent, make_evaluation_env
 from rejeu.cli.telling import header, say
-from rejeu.interrupt import Interrupt
 
 if TYPE_CHECKING:
-    from rejeu.envs.vector import VectorEnv
+    from rejeu.envs.make import VectorEnv
     from rejeu.presets import Preset
 
 
@@ -94,7 +94,7 @@ def make_env(arguments: Train, environment: Environment, preset: Preset | None, 
 def check(arguments: Train) -> None:
     """Raises ValueError or OSError for what is wrong before anything is made."""
     from rejeu.agents import whole_seed
-    from rejeu.config import number, whole
+    from rejeu.validation import number, whole
 
     if arguments.steps is not None and arguments.minutes is not None:
         raise ValueError("--steps and --minutes exclude each other; give one of them")
@@ -168,7 +168,8 @@ def plan(
     """
     from gymnasium import spaces
 
-    from rejeu import AGENTS, config as configs, presets
+    from rejeu import AGENTS, presets, validation
+    from rejeu.algorithms import config as configs
 
     base = presets.default(environment.env_id, algorithm) if preset is None else preset
     given = settings.apply(chain.from_iterable(arguments.assignments), base.hyperparameters)
@@ -180,7 +181,7 @@ def plan(
         wrappers=environment.wrapper_names,
         algorithm=algorithm,
         preset=preset is not None,
-        hyperparameters=configs.to_json(configs.build(AGENTS[algorithm].algorithm.Config, given)),
+        hyperparameters=configs.to_json(validation.build(AGENTS[algorithm].algorithm.Config, given)),
         policy="MultiInputPolicy" if nested else "MlpPolicy",
         seed=seed,
         n_envs=env.n_envs,

@@ -18,8 +18,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from rejeu.config import whole
 from rejeu.spaces import action_scaler, check_env_actions, random_action
+from rejeu.validation import whole
 
 STEP, STEP_SOME, RESET, RESET_SOME = range(4)
 BLOCK = 2**20
@@ -106,7 +106,7 @@ class ActionLog:
             self._open = bytearray()
 
     def to_plain(self) -> dict[str, Any]:
-        """Returns the log as plain data (see :mod:`rejeu.plain`)."""
+        """Returns the log as plain data (see :mod:`rejeu.io.plain`)."""
         return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
 
     def operations(self, saved: dict[str, Any]) -> Iterator[Operation]:

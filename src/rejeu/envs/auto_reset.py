@@ -17,13 +17,13 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs import answers, conversions, faults
-from rejeu.envs.contract import VectorEnv
+from rejeu.envs.base import VectorEnv
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.masks import MaskedVector
 from rejeu.envs.vec_env import Indices, StepResult, VecEnv, VecEnvWrapper, is_wrapped, tile
 from rejeu.errors import BadEnvironmentError
-from rejeu.video import VideoFile, check_renders, rgb_frame
+from rejeu.reporting.video import VideoFile, check_renders, rgb_frame
 
 
 class DummyVecEnv(VecEnv):

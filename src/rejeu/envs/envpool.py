@@ -10,14 +10,14 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.config import whole
+from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
-from rejeu.envs.contract import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
+from rejeu.envs.base import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
 from rejeu.envs.registry import in_envpool, make_env, newer_version, provider, register, unknown_environment
 from rejeu.envs.seeds import END, Seed, checked
-from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import cast, leaves
+from rejeu.validation import whole
 
 NO_LIMIT = 2**31 - 1
 """What EnvPool says of the length of episodes that have no time limit."""

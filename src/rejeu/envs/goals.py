@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs.faults import described
 from rejeu.errors import BadEnvironmentError
-from rejeu.replay.hindsight import GoalFunctions
 
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
 """Weights of x, y, vx, vy, cos h, sin h in highway-env's ``parking-v0`` (1.12, default configuration)."""

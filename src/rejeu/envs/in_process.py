@@ -11,13 +11,13 @@ import jax
 import numpy as np
 from numpy import ndarray
 
-from rejeu.envs import answers, faults, goals as goals_module, state
-from rejeu.envs.contract import Step, VectorEnv, describe_spec, success_of
+from rejeu.buffers.hindsight import GoalFunctions
+from rejeu.envs import answers, faults, goals as goals_module, snapshot
+from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, reward_of
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError
-from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import leaves, structure
 
 
@@ -131,17 +131,17 @@ class InProcess(VectorEnv):
         return goals_module.goal_functions(self.envs[0])
 
     def snapshot(self) -> list[Any] | None:
-        states = [state.state_of(env) for env in self.envs]
+        states = [snapshot.state_of(env) for env in self.envs]
         return None if any(one is None for one in states) else states
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
-        state.check_count(saved, self.n_envs)
+        snapshot.check_count(saved, self.n_envs)
         for env, one in zip(self.envs, saved, strict=True):
-            state.restore(env, one)
+            snapshot.restore(env, one)
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf
         self._seed = None  # they have been reset, in another process
-        return [i for i, env in enumerate(self.envs) if state.is_over(env)]
+        return [i for i, env in enumerate(self.envs) if snapshot.is_over(env)]
 
     def close(self) -> None:
         for env in self.envs:

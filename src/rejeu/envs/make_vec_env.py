@@ -9,11 +9,11 @@ from typing import Any
 
 import gymnasium as gym
 
-from rejeu.config import whole
 from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.monitor import Monitor
 from rejeu.envs.registry import make_env
 from rejeu.envs.vec_env import VecEnv
+from rejeu.validation import whole
 
 
 def make_vec_env(

@@ -10,14 +10,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.core import Masked
+from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
 from rejeu.envs.mask_wrapper import MASK, OBSERVATION, MaskInObservation, n_choices
 from rejeu.envs.registry import maker
 from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv
-from rejeu.envs.vector import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
-from rejeu.envs.workers import TIMEOUT
-from rejeu.replay.hindsight import GoalFunctions
+from rejeu.envs.workers.pool import TIMEOUT
 from rejeu.spaces import Leaf
 
 

@@ -31,10 +31,10 @@ import numpy as np
 import platformdirs
 from gymnasium.vector.utils import batch_space
 
-from rejeu.envs import workers
+from rejeu.envs.workers import pool
 
 if TYPE_CHECKING:
-    from rejeu.envs.contract import VectorEnv
+    from rejeu.envs.base import VectorEnv
 
 PREFERENCE = ("envpool", "gymnasium", "gymnasium-async")
 """What can be chosen; each against the one before only if it is faster by ``MARGIN``."""
@@ -216,7 +216,7 @@ def why_no_workers() -> str | None:
     """Returns why worker processes cannot be tried, None if they can."""
     if multiprocessing.parent_process() is not None:
         return "this is itself a worker process"
-    again = workers.main_runs_again()
+    again = pool.main_runs_again()
     if again is None:
         return "it cannot be told whether workers could import the main script; this may be another thread"
     if again:

@@ -13,8 +13,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from rejeu import atomic
-from rejeu.failed_writes import FailedWrites
+from rejeu.io import atomic
+from rejeu.io.failed_writes import FailedWrites
 
 SUFFIX = "monitor.csv"
 

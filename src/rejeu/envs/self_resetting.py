@@ -8,15 +8,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.auto_reset import AutoResetView, DummyVecEnv
-from rejeu.envs.contract import Step, VectorEnv, success_of
+from rejeu.envs.base import Step, VectorEnv, success_of
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv, is_vecenv_wrapped
 from rejeu.envs.vec_normalize import VecNormalize
 from rejeu.errors import BadEnvironmentError
-from rejeu.replay.hindsight import GoalFunctions
 from rejeu.spaces import leaves, plain
 
 TERMINAL = "terminal_observation"

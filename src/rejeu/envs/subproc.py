@@ -11,8 +11,8 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs.faults import blamed
 from rejeu.envs.vec_env import Indices, StepResult, VecEnv
-from rejeu.envs.worker_process import Failure
-from rejeu.envs.workers import RESTARTED, TIMEOUT, Restarted, Workers
+from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
+from rejeu.envs.workers.process import Failure
 from rejeu.errors import BadEnvironmentError, WorkerError
 
 

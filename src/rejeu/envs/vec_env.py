@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.errors import MissingExtra
-from rejeu.text import counted
+from rejeu.reporting.text import counted
 
 Indices = int | Iterable[int] | None
 """Which environments: one, several, or None for all."""

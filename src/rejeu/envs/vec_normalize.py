@@ -1,7 +1,7 @@
 """Observations and rewards scaled by running statistics, outside the agent, as Stable-Baselines3's ``VecNormalize`` does.
 
 It is for scripts that come from there: the agent learns on what it is shown, and whoever predicts must show it the same.
-``normalize=True`` keeps the statistics inside the agent and its file (:mod:`rejeu.running_stats`), so that nothing can be
+``normalize=True`` keeps the statistics inside the agent and its file (:mod:`rejeu.normalization`), so that nothing can be
 forgotten; new code should use that.
 
 Moments are merged as in Chan, Golub and LeVeque 1983, "Algorithms for Computing the Sample Variance"; the count begins
@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import checkpoint
-from rejeu.config import number
 from rejeu.envs.vec_env import StepResult, VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
+from rejeu.validation import number
 
 KIND = "vec_normalize"
 """What its files call themselves."""

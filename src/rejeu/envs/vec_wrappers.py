@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import atomic
 from rejeu.envs.monitor import Monitor, csv_line, monitor_path
 from rejeu.envs.vec_env import StepResult, VecEnv, VecEnvWrapper
 from rejeu.errors import BadEnvironmentError
-from rejeu.failed_writes import FailedWrites
+from rejeu.io import atomic
+from rejeu.io.failed_writes import FailedWrites
 
 LAST = "terminal_observation"
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from rejeu.envs.vec_env import VecEnv
-from rejeu.logging import Logger
+from rejeu.reporting.logging import Logger
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

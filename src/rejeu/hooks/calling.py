@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rejeu.hooks.base import BaseCallback, CallbackList
-from rejeu.loops.host import Progress
+from rejeu.loops.run import Progress
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent, Callback

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from rejeu import atomic
-from rejeu.checkpoint import SUFFIX
-from rejeu.config import whole
 from rejeu.envs.auto_reset import around, identities
 from rejeu.envs.masks import make_masked
 from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.vec_normalize import sync_envs_normalization
-from rejeu.evaluation import evaluate_policy
 from rejeu.hooks.base import BaseCallback, EventCallback, hooked
+from rejeu.io import atomic
+from rejeu.io.checkpoint import SUFFIX
+from rejeu.reporting.evaluation import evaluate_policy
+from rejeu.validation import whole
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rejeu.checkpoint import SUFFIX
-from rejeu.config import whole
 from rejeu.hooks.base import BaseCallback, EventCallback
+from rejeu.io.checkpoint import SUFFIX
+from rejeu.validation import whole
 
 
 class CheckpointCallback(BaseCallback):

@@ -23,10 +23,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jax import Array
 
-from rejeu.config import OffPolicyConfig
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Clock
-from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import (
+from rejeu.loops.learner import Compiled
+from rejeu.loops.run import (
     Progress,
     Run,
     book,
@@ -134,7 +134,7 @@ def begin_episodes(run: Run) -> None:
 
 
 def choose_or_draw(run: Run, compiled: Compiled, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
-    """Returns random actions at first, then the exploring policy's; see :func:`rejeu.loops.host.choose`."""
+    """Returns random actions at first, then the exploring policy's; see :func:`rejeu.loops.run.choose`."""
     if run.step < config.learning_starts:
         return random_action(run.env.action_space, run.env.n_envs, run.rng)
     return choose(run, compiled, clock)

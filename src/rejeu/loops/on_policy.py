@@ -18,9 +18,9 @@ import numpy as np
 
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.core import PyTree
-from rejeu.envs.vector import Step
-from rejeu.loops.compiled import Compiled
-from rejeu.loops.host import (
+from rejeu.envs.make import Step
+from rejeu.loops.learner import Compiled
+from rejeu.loops.run import (
     Progress,
     Run,
     book,

@@ -16,17 +16,17 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import Agent
-from rejeu.config import number, whole
+from rejeu.agents.interrupt import Interrupt
 from rejeu.envs.faults import id_of
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
-from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Pace, Player
 from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for
 from rejeu.play.recording import Recording
 from rejeu.play.window import Window
-from rejeu.video import DEFAULT_FPS, make_drawing
+from rejeu.reporting.video import DEFAULT_FPS, make_drawing
+from rejeu.validation import number, whole
 
 __all__ = ["Game", "Player", "play", "watch"]
 

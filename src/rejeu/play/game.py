@@ -11,10 +11,10 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from rejeu.envs.contract import success_of
+from rejeu.envs.base import success_of
 from rejeu.play.keys import CONTROLS
 from rejeu.play.recording import Recording
-from rejeu.video import rgb_frame
+from rejeu.reporting.video import rgb_frame
 
 Act = Callable[[Any, frozenset[str], int], Any]
 """Takes the observation, the keys held and the step of the episode, from 0; returns the action, or None to wait."""

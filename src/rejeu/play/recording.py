@@ -16,8 +16,8 @@ import numpy as np
 
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
-from rejeu.text import counted
-from rejeu.video import HOLD_SECONDS, VideoFile, ffmpeg
+from rejeu.reporting.text import counted
+from rejeu.reporting.video import HOLD_SECONDS, VideoFile, ffmpeg
 
 VIDEO_NAME = "video.mp4"
 

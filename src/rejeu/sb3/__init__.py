@@ -9,7 +9,7 @@ and a few adaptations; what rejeu does not have cannot be imported. The algorith
 """
 
 from rejeu.agents import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
-from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.buffers.hindsight import HerReplayBuffer
 
 __all__ = [
     "A2C",

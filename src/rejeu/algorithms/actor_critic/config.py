@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from rejeu import finite, running_stats, schedules
-from rejeu.config import nested, number, whole
+from rejeu import normalization, schedules
+from rejeu.loops import finite
 from rejeu.networks import PolicyConfig, Widths, convolutions
-from rejeu.running_stats import NormalizationConfig
+from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
+from rejeu.validation import nested, number, whole
 
 HIDDEN_LAYERS = (64, 64)
 """Default widths of policy and value."""
@@ -146,7 +147,7 @@ class OnPolicyConfig:
         put("sde_sample_freq", whole("sde_sample_freq", self.sde_sample_freq, least=-1))
         if self.sde_sample_freq == 0:
             raise ValueError("sde_sample_freq=0 would draw no noise; use 1 or more, or -1 for once an episode")
-        put("normalize", running_stats.parse(self.normalize))
+        put("normalize", normalization.parse(self.normalize))
         put("nonfinite", finite.parse(self.nonfinite))
         put("policy_kwargs", nested("policy_kwargs", ActorCriticConfig, self.policy_kwargs))
         if self.critic_learning_rate is not None and self.policy_kwargs.share_layers:

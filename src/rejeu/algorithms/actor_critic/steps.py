@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution
+from rejeu.buffers.rollout import advantages
 from rejeu.core import PyTree, Rollout
 from rejeu.distributions import TanhNormal, sum_of
-from rejeu.replay.rollout import advantages
 
 
 class Samples(NamedTuple):

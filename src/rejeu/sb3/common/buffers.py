@@ -1,5 +1,5 @@
 """Replay buffers."""
 
-from rejeu.replay.uniform import ReplayBuffer
+from rejeu.buffers.uniform import ReplayBuffer
 
 __all__ = ["ReplayBuffer"]

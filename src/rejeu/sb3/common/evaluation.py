@@ -1,5 +1,5 @@
 """Measuring a policy."""
 
-from rejeu.evaluation import evaluate_policy
+from rejeu.reporting.evaluation import evaluate_policy
 
 __all__ = ["evaluate_policy"]

@@ -1,5 +1,5 @@
 """Where numbers go."""
 
-from rejeu.logging import Logger, configure
+from rejeu.reporting.logging import Logger, configure
 
 __all__ = ["Logger", "configure"]

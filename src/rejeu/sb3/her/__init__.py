@@ -1,5 +1,5 @@
 """Hindsight experience replay."""
 
-from rejeu.replay.hindsight import GoalSelectionStrategy, HerReplayBuffer
+from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
 
 __all__ = ["GoalSelectionStrategy", "HerReplayBuffer"]

@@ -1,5 +1,5 @@
 """Where the goals of hindsight come from."""
 
-from rejeu.replay.hindsight import GoalSelectionStrategy
+from rejeu.buffers.hindsight import GoalSelectionStrategy
 
 __all__ = ["GoalSelectionStrategy"]

@@ -1,5 +1,5 @@
 """The buffer of hindsight replay."""
 
-from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.buffers.hindsight import HerReplayBuffer
 
 __all__ = ["HerReplayBuffer"]

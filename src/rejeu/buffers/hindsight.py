@@ -1,0 +1,251 @@
+"""Hindsight experience replay: past steps, relabelled with goals that the agent did reach.
+
+Source: Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). Relabelling happens when a batch is
+drawn: of every batch the share ``k / (k + 1)`` gets, in place of its own goal, an achieved goal from (section 4.5)
+
+- ``future``: a later moment of the same episode,
+- ``final``: the episode's last moment,
+- ``episode``: any moment of the same episode,
+- ``random``: any moment in the buffer,
+
+and the reward that the environment gives for it. Episodes that still run, or whose beginning the ring has forgotten, are
+used as far as they are kept. ``terminated`` is computed again where the environment offers ``compute_terminated`` and
+kept as it was elsewhere: a crash remains a crash.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rejeu.buffers.prioritized import Draw, Priorities
+from rejeu.buffers.ring import TERMINATED, Ring, Rows
+from rejeu.buffers.uniform import (
+    batch,
+    begin,
+    bootstrap_discount,
+    discounted,
+    discounted_sum,
+    discounts_by_kind,
+    draw,
+    look_ahead,
+)
+from rejeu.core import Transition
+
+
+class GoalSelectionStrategy(str, Enum):
+    """Where the goals of hindsight come from; the strings do as well."""
+
+    FUTURE = "future"
+    FINAL = "final"
+    EPISODE = "episode"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class HindsightConfig:
+    """Settings of hindsight replay (Stable-Baselines3's ``replay_buffer_kwargs``)."""
+
+    n_sampled_goal: int = 4
+    """Relabelled transitions per original one. Raising it learns more from failures and less from the real goals."""
+    goal_selection_strategy: str = "future"
+    """``future``, ``final``, ``episode`` or ``random``, or a ``GoalSelectionStrategy``."""
+    copy_info_dict: bool = False
+    """Accepted for Stable-Baselines3's sake; rejeu computes rewards without info, so only False is possible."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
+            raise ValueError(f"n_sampled_goal={self.n_sampled_goal!r} must be a whole number of at least 0")
+        try:
+            strategy = GoalSelectionStrategy(self.goal_selection_strategy)
+        except ValueError:
+            known = ", ".join(s.value for s in GoalSelectionStrategy)
+            raise ValueError(
+                f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}"
+            ) from None
+        object.__setattr__(self, "goal_selection_strategy", strategy.value)
+        if self.copy_info_dict:
+            raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
+
+
+def counters(config: HindsightConfig | None) -> tuple[str, ...]:
+    """Returns the counters that the ring must keep of every row for these settings, None being no hindsight.
+
+    >>> counters(HindsightConfig(goal_selection_strategy="future"))
+    ('until_end',)
+    """
+    if config is None or config.goal_selection_strategy == "random":
+        return ()
+    return ("since_start", "until_end") if config.goal_selection_strategy == "episode" else ("until_end",)
+
+
+class GoalFunctions(NamedTuple):
+    """The environment's own view of its goals, vectorised: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
+
+    reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """None where the environment does not say; steps then keep their own."""
+
+
+class HerReplayBuffer:
+    """Draws transitions from a :class:`Ring`, uniformly or by priority, and gives most of them a goal that was reached."""
+
+    def __init__(
+        self,
+        ring: Ring,
+        gamma: float,
+        config: HindsightConfig,
+        goals: GoalFunctions,
+        n_steps: int = 1,
+        priorities: Priorities | None = None,
+        each_reward: bool = False,
+    ) -> None:
+        """Takes a ring that keeps the ``counters`` of ``config``; ``each_reward`` is as for :class:`ReplayBuffer`.
+
+        Raises:
+            ValueError: if it does not.
+        """
+        if missing := [name for name in counters(config) if name not in ring.counters]:
+            raise ValueError(
+                f"goal_selection_strategy={config.goal_selection_strategy!r} needs a ring that keeps "
+                f"{' and '.join(missing)}; make it with Ring(..., counters={counters(config)})"
+            )
+        self.ring = ring
+        self.gamma = gamma
+        self.config = config
+        self.goals = goals
+        self.n_steps = n_steps
+        self.priorities = priorities
+        self.each_reward = each_reward and n_steps > 1
+        self._discounts = discounts_by_kind(gamma)
+        paths = [leaf.path for leaf in ring.obs_leaves]
+        self.achieved = paths.index("achieved_goal")
+        self.desired = paths.index("desired_goal")
+
+    def size(self) -> int:
+        """Returns the number of transitions kept."""
+        return len(self.ring)
+
+    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
+        """Starts episodes; see :meth:`Ring.begin`."""
+        begin(self.ring, self.priorities, obs, envs)
+
+    def add(
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        next_obs: Any,
+        envs: np.ndarray | None = None,
+    ) -> None:
+        """Records one step of each environment; see :meth:`Ring.add`."""
+        index, following = self.ring.add(action, reward, terminated, next_obs, envs)
+        if self.priorities is not None:
+            self.priorities.add(index, following)
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
+        """Returns transitions, every leaf ``(*shape, ...)``, the last axis of ``shape`` being one batch.
+
+        Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances, ``progress`` anneals the weights.
+        """
+        return self.draw(rng, shape, progress)[0]
+
+    def draw(
+        self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
+    ) -> tuple[Transition, Draw | None]:
+        """Returns what :meth:`sample` does and, with priorities, what :meth:`reprioritise` takes; None without."""
+        ring, k = self.ring, self.config.n_sampled_goal
+        rows, weight, drawn = draw(ring, self.priorities, rng, math.prod(shape), progress)
+        step, obs = ring.read(rows.position)
+        relabelled = relabelled_positions(shape, k)
+
+        goal_index = self._goal_index(rng, rows.env[relabelled], rows.time[relabelled], step[relabelled])
+        goal = ring.read_leaf(self.achieved, goal_index)
+        steps: int | np.ndarray = 1
+        rewards = None
+        if self.n_steps > 1:
+            rewards, steps, terminated = self._n_step(rows, relabelled, goal)
+            reward = discounted_sum(rewards, self.gamma)
+            discount = bootstrap_discount(self.gamma, steps, terminated)
+        _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
+        if self.n_steps == 1:
+            reward, discount = step["reward"], self._discounts.take(rows.kind)
+            if len(goal):
+                reached = next_obs[self.achieved][relabelled]
+                reward[relabelled] = self.goals.reward(reached, goal)
+                if self.goals.terminated is not None:
+                    discount[relabelled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
+        obs[self.desired][relabelled] = goal
+        next_obs[self.desired][relabelled] = goal
+        rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
+        return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight, rewards), drawn
+
+    def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+        """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
+        if self.priorities is not None:
+            self.priorities.update(td_errors)
+
+    def _goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Returns where in the ring new goals for rows stand: observations after a step, by the strategy.
+
+        The rows are given by environment and time, ``(n,)``; ``step`` is what the ring holds of them, records ``(n,)``.
+        """
+        ring, strategy = self.ring, self.config.goal_selection_strategy
+        if strategy == "random":
+            other = ring.draw(rng, len(step))
+            return ring.index(other.env, other.time + 1)
+        until_end = step["until_end"]
+        head = ring.head[env] if ring.n_envs > 1 else ring.head[0]
+        ahead = np.where(until_end, until_end, head - time)
+        if strategy == "final":
+            return ring.index(env, time + ahead)
+        if strategy == "episode":
+            behind = np.minimum(step["since_start"], time - ring.oldest()[env])
+            time, ahead = time - behind, ahead + behind
+        return ring.index(env, time + 1 + (rng.random(len(time)) * ahead).astype(np.int64))
+
+    def _n_step(
+        self, rows: Rows, relabelled: slice | np.ndarray, goal: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns rewards ``(batch, n)``, number of steps and ``terminated``, for the new goals where there are any."""
+        ring = self.ring
+        window = look_ahead(ring, rows, self.n_steps)
+        rewards, valid = ring.reward[window.position], window.valid.copy()
+        terminal = (ring.kind[window.position] == TERMINATED) & valid
+        following = ring.index(rows.env[relabelled, None], rows.time[relabelled, None] + 1 + np.arange(self.n_steps))
+        reached = ring.obs[self.achieved][following].reshape(-1, *goal.shape[1:])
+        goals = np.repeat(goal, self.n_steps, axis=0)
+        rewards[relabelled] = self.goals.reward(reached, goals).reshape(-1, self.n_steps)
+        if self.goals.terminated is not None:
+            ends = self.goals.terminated(reached, goals).reshape(-1, self.n_steps) & valid[relabelled]
+            terminal[relabelled] = ends
+            valid[relabelled, 1:] &= ~np.logical_or.accumulate(ends, axis=1)[:, :-1]
+            terminal &= valid
+        return np.where(valid, rewards, np.float32(0.0)), valid.sum(axis=1), terminal.any(axis=1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns everything kept, as named arrays; goals are drawn anew each time, so nothing else is needed."""
+        return self.ring.arrays()
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`."""
+        self.ring.restore(arrays)
+        if self.priorities is not None:
+            self.priorities.restore()
+
+
+@cache
+def relabelled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
+    """Returns which of the flattened transitions of ``shape`` get a new goal: the first ``k / (k + 1)`` of each batch."""
+    n = int(shape[-1] * k / (k + 1))
+    if math.prod(shape) == shape[-1]:
+        return slice(n)
+    chosen = np.zeros(shape, bool)
+    chosen[..., :n] = True
+    return np.flatnonzero(chosen)

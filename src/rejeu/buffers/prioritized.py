@@ -1,0 +1,201 @@
+"""Prioritised replay: steps are drawn in proportion to how wrong the critic was about them.
+
+Source: Schaul et al. 2015, "Prioritized Experience Replay" (arXiv 1511.05952), the proportional variant. A step with TD
+error ``delta`` has priority ``p = (|delta| + epsilon)^alpha`` and is drawn with probability ``P = p / sum p``; its loss is
+weighted by ``(N P)^-beta``, divided by the largest weight of its batch, with ``beta`` rising to 1 over the run. New steps get
+the largest priority so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rejeu import schedules
+from rejeu.buffers.ring import LAST, Ring, Rows
+from rejeu.schedules import Schedule
+
+
+@dataclass(frozen=True)
+class PriorityConfig:
+    """Settings of prioritised replay; the defaults are the paper's (table 3, proportional)."""
+
+    alpha: float = 0.6
+    """How strongly priorities differ: 0 is uniform, 1 is in proportion to the TD error."""
+    beta: float | Schedule = schedules.Linear(0.4, 1.0)
+    """How far importance weights undo the bias; 1 wholly."""
+    epsilon: float = 1e-6
+    """Added to every TD error, so that no step is forgotten; positive."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "beta", schedules.parse("beta", self.beta))
+        if not 0 <= self.alpha <= 1:
+            raise ValueError(f"alpha={self.alpha!r} must be from 0 to 1")
+        if not self.epsilon > 0:
+            raise ValueError(f"epsilon={self.epsilon!r} must be positive")
+
+
+class Draw(NamedTuple):
+    """Which steps a batch was made of: what their TD errors are given back with."""
+
+    position: np.ndarray
+    """Their positions in the ring, ``int64 (n,)``."""
+    time: np.ndarray
+    """Their absolute times, ``int64 (n,)``, which tell whether they have been overwritten since."""
+    version: int
+    """:attr:`Ring.version` when they were drawn; in a ring that was restored since, other steps are there."""
+
+
+class SumTree:
+    """Non-negative numbers by position; setting and drawing take time in the logarithm of their count."""
+
+    def __init__(self, n: int) -> None:
+        self.n_leaves = 1 << max(n - 1, 1).bit_length()
+        self.nodes = np.zeros(2 * self.n_leaves, np.float64)
+        """Node 1 is the root and holds the sum; the children of node i are 2 i and 2 i + 1."""
+
+    @property
+    def total(self) -> float:
+        """The sum of all numbers."""
+        return float(self.nodes[1])
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.nodes[self.n_leaves + index]
+
+    def set(self, index: np.ndarray, value: Any) -> None:
+        """Puts ``value`` at the positions ``index``, ``(n,)`` or one; where one is repeated, its last value counts."""
+        node = index + self.n_leaves
+        self.nodes[node] = value
+        for _ in range(self.n_leaves.bit_length() - 1):
+            node = node >> 1
+            self.nodes[node] = self.nodes[2 * node] + self.nodes[2 * node + 1]
+
+    def fill(self, values: np.ndarray) -> None:
+        """Puts ``values`` ``(n,)`` at the positions from 0 on, and 0 at the others."""
+        self.nodes[:] = 0.0
+        self.nodes[self.n_leaves : self.n_leaves + len(values)] = values
+        first = self.n_leaves
+        while first > 1:
+            half = first // 2
+            self.nodes[half:first] = self.nodes[first : 2 * first : 2] + self.nodes[first + 1 : 2 * first : 2]
+            first = half
+
+    def find(self, mass: np.ndarray) -> np.ndarray:
+        """Returns for each ``mass`` in [0, total) the position where the running sum first exceeds it, ``int64 (n,)``."""
+        node = np.ones(len(mass), np.int64)
+        mass = mass.copy()
+        while node[0] < self.n_leaves:
+            left = 2 * node
+            weight = self.nodes[left]
+            goes_right = (mass >= weight) & (self.nodes[left + 1] > 0)
+            mass -= np.where(goes_right, weight, 0.0)
+            node = left + goes_right
+        return node - self.n_leaves
+
+
+class Priorities:
+    """The priorities of the steps of a :class:`Ring`. Mutable."""
+
+    def __init__(self, ring: Ring, config: PriorityConfig) -> None:
+        self.ring = ring
+        self.config = config
+        self.tree = SumTree(ring.rows * ring.n_envs)
+        self.largest = 1.0
+        """The largest priority so far, which new steps get."""
+
+    def add(self, index: np.ndarray, following: np.ndarray) -> None:
+        """Notes new steps at ``index``, and that the rows ``following`` are heads, which cannot be drawn."""
+        self.tree.set(following, 0.0)
+        self.tree.set(index, self.largest)
+
+    def draw(self, rng: np.random.Generator, n: int, progress: float) -> tuple[Rows, np.ndarray, Draw]:
+        """Returns ``n`` steps, one from each of ``n`` equal parts of the total priority, and weights ``float32 (n,)``.
+
+        Nothing is remembered of it: the third value is what :meth:`update` takes beside the TD errors of these steps.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        tree, ring = self.tree, self.ring
+        if not len(ring):
+            raise ValueError("the replay buffer is empty: take some environment steps before sampling from it")
+        index = tree.find((np.arange(n) + rng.random(n)) * (tree.total / n))
+        rng.shuffle(index)
+        env = index // ring.rows
+        head = ring.head[env]
+        time = head - (head - index % ring.rows) % ring.rows
+        probability = tree[index] / tree.total
+        weight = (len(ring) * probability) ** -float(schedules.at(self.config.beta, progress))
+        rows = Rows(env, time, index, ring.kind.take(index))
+        return rows, weight.astype(np.float32), Draw(index, time, ring.version)
+
+    def update(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+        """Sets the priorities of drawn steps by their absolute TD errors, ``(n,)`` in any shape of that size.
+
+        TD errors of steps that were overwritten since are ignored. So are those that are not finite: such a step keeps
+        the priority that it has, because one NaN would make all sums NaN.
+        """
+        for (index, time, version), td_error in td_errors:
+            if version != self.ring.version:
+                continue
+            priority = (np.asarray(td_error, np.float64).ravel() + self.config.epsilon) ** self.config.alpha
+            head = self.ring.head[index // self.ring.rows]
+            finite = np.isfinite(priority)
+            kept = (time > head - self.ring.rows) & (self.tree[index] > 0) & finite
+            if kept.any():
+                self.tree.set(index[kept], priority[kept])
+            self.largest = max(self.largest, float(priority.max(where=finite, initial=0.0)))
+
+    def state(self) -> dict[str, Any]:
+        """Returns everything, for :meth:`restore`."""
+        n = self.ring.rows * self.ring.n_envs
+        return {"values": self.tree[np.arange(n)], "largest": self.largest}
+
+    def restore(self, state: Mapping[str, Any] | None = None) -> None:
+        """Puts back what :meth:`state` returned, or gives every step of the ring the largest priority.
+
+        Raises:
+            KeyError, ValueError: if the state is damaged, or of another ring.
+        """
+        if state is not None:
+            values = state["values"]
+            steps = self._step_positions()
+            if values.shape != (self.ring.rows * self.ring.n_envs,) or values.dtype != np.float64:
+                raise ValueError("the priorities are of another replay buffer")
+            largest = float(state["largest"])
+            most = float(np.finfo(np.float64).max) / self.tree.n_leaves  # so that their sum is finite
+            if not ((values >= 0) & (values <= most)).all() or not 0 < largest <= most:
+                raise ValueError("the priorities are not finite, or not positive")
+            if not np.array_equal(np.flatnonzero(values > 0), np.sort(steps)):
+                raise ValueError("the priorities do not belong to the steps of this replay buffer")
+            self.tree.fill(values)
+            self.largest = largest
+            return
+        self.tree = SumTree(self.ring.rows * self.ring.n_envs)
+        steps = self._step_positions()
+        if len(steps):
+            self.tree.set(steps, self.largest)
+
+    def draw_of(self, index: np.ndarray, time: np.ndarray) -> Draw:
+        """Returns a draw from this ring as it is now, from the positions and times of a file.
+
+        Raises:
+            ValueError: if they are no positions in this ring.
+        """
+        good = index.dtype == time.dtype == np.int64 and index.shape == time.shape == (index.size,)
+        if not good or not ((index >= 0) & (index < self.ring.rows * self.ring.n_envs)).all():
+            raise ValueError("the priorities are of another replay buffer")
+        return Draw(index, time, self.ring.version)
+
+    def _step_positions(self) -> np.ndarray:
+        """Returns the positions of the ring that hold steps, environment after environment."""
+        ring = self.ring
+        found = []
+        for env in range(ring.n_envs):
+            times = np.arange(ring.oldest()[env], ring.head[env])
+            index = ring.index(np.full(len(times), env), times)
+            found.append(index[ring.kind[index] != LAST])
+        return np.concatenate(found)

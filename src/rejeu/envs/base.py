@@ -1,0 +1,228 @@
+"""The contract of vector environments: what agents step, whatever it is that steps the environments.
+
+The contract hides nothing: after a step the observation is the true successor, also where the episode ended, and ended
+environments stay ended until :meth:`VectorEnv.reset_done` is called.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import jax
+import numpy as np
+
+from rejeu.buffers.hindsight import GoalFunctions
+from rejeu.envs.seeds import Seed
+from rejeu.envs.vec_env import VecEnv
+from rejeu.errors import BadEnvironmentError
+
+SUCCESS_KEYS = ("is_success", "success")
+"""Where an info says whether the goal was reached; the first that is there counts."""
+
+
+class DivergedError(RuntimeError):
+    """Environments did not repeat what was recorded, so a run cannot be resumed in the middle of their episodes."""
+
+
+class Step(NamedTuple):
+    """What one step of all environments returned."""
+
+    obs: Any
+    """True successors, a pytree of arrays ``(n_envs, ...)``; valid until the next call."""
+    reward: np.ndarray
+    """``float32 (n_envs,)``."""
+    terminated: np.ndarray
+    """Whether the MDP ended, ``bool (n_envs,)``."""
+    truncated: np.ndarray
+    """Whether a time limit ended the episode, ``bool (n_envs,)``."""
+    info: Any
+    """The backend's own info; read it with :meth:`VectorEnv.success`."""
+    returns: np.ndarray | None = None
+    """The return of each episode that ended, as a ``Monitor`` beneath wrappers that change rewards counted it, ``(n_envs,)``,
+    NaN elsewhere; None where the sum of the rewards is the return."""
+
+    def return_of(self, env: int, total: float) -> float:
+        """Returns the return of the episode that ended in environment ``env`` and whose rewards sum up to ``total``."""
+        counted = math.nan if self.returns is None else float(self.returns[env])
+        return float(total) if math.isnan(counted) else counted
+
+
+class Description(NamedTuple):
+    """What an environment is registered as."""
+
+    env_id: str
+    """The id, or the name of its class if it has none."""
+    max_episode_steps: int | None
+    """The time limit, where it is known."""
+    reward_threshold: float | None
+    """The return at which it counts as solved, where it declares one."""
+
+
+class VectorEnv(ABC):
+    """``n_envs`` environments of one kind."""
+
+    n_envs: int
+    observation_space: gym.Space
+    """Of one environment."""
+    action_space: gym.Space
+    """Of one environment."""
+    backend: str
+    """Which backend steps them."""
+    measured: Mapping[str, float] = MappingProxyType({})
+    """Steps per second of each backend, over all environments, by which ``"auto"`` chose this one; empty if it had not to."""
+    passed_over: Mapping[str, str] = MappingProxyType({})
+    """Why ``"auto"`` could not measure a backend."""
+    env_id: str
+    """The id they are registered under, or the class name of what was given."""
+    made_from: tuple[str, Mapping[str, Any]] | None = None
+    """The id and the keyword arguments that :func:`make_vector` made these of; None for what was given otherwise."""
+    max_episode_steps: int | None = None
+    """The time limit, where it is known."""
+    reward_threshold: float | None = None
+    """The return at which the environment counts as solved, where it declares one."""
+    venv: VecEnv | None = None
+    """The vector environment with automatic resets that these are or came from, if there is one."""
+    _obs: Any
+    """The observations last returned."""
+
+    seeds: Seed = None
+    """One seed for each environment, with which a run begins in place of its own; None where there are none."""
+
+    @abstractmethod
+    def reset(self, seed: Seed = None) -> Any:
+        """Starts an episode in every environment and returns the observations ``(n_envs, ...)``.
+
+        Args:
+            seed: a number, after which environment i takes the i-th, or a sequence of one number for each. None lets the
+                random numbers go on, at first from the seed that the environments were made with.
+        """
+
+    def step(self, action: np.ndarray, active: np.ndarray | None = None) -> Step:
+        """Steps every environment, or only the ``active`` ones.
+
+        Those left out keep their observation, get the reward 0 and have not ended. A Gymnasium vector environment can only
+        be stepped as a whole, so there they move on unseen; on any backend, reset them before they are stepped again.
+
+        Args:
+            action: in the environment's own range, ``(n_envs, ...)``; the rows of those left out are ignored.
+            active: ``bool (n_envs,)``; None for all.
+
+        Raises:
+            ValueError: if ``active`` is no such array, or leaves out every environment.
+
+        >>> from rejeu.envs.make import make_vector
+        >>> vector = make_vector("Pendulum-v1", 2, "gymnasium", seed=0)
+        >>> obs = vector.reset().copy()
+        >>> step = vector.step(np.ones((2, 1)), active=np.array([True, False]))
+        >>> (step.obs == obs).all(axis=1).tolist(), (step.reward == 0.0).tolist()
+        ([False, True], [False, True])
+        """
+        if active is None:
+            return self._step_all(action)
+        if not isinstance(active, np.ndarray) or active.dtype != bool or active.shape != (self.n_envs,):
+            raise ValueError(f"active={active!r} must be a bool array of shape ({self.n_envs},), or None for all")
+        if not active.any():
+            raise ValueError("active leaves out every environment, so there is nothing to step")
+        return self._step_all(action) if active.all() else self._step_some(action, active)
+
+    @abstractmethod
+    def _step_all(self, action: np.ndarray) -> Step:
+        """Steps every environment."""
+
+    @abstractmethod
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        """Steps those that are ``active``, which are neither none nor all."""
+
+    @abstractmethod
+    def reset_done(self, done: np.ndarray) -> Any:
+        """Starts new episodes where ``done``, ``bool (n_envs,)``; returns the observations of all environments."""
+
+    @abstractmethod
+    def success(self, step: Step, env: int) -> float:
+        """Returns 1.0 or 0.0 for whether environment ``env`` reached its goal in ``step``, NaN if it does not say."""
+
+    def judge(self, step: Step, env: int, episode_return: float, threshold: float | None) -> float:
+        """Returns 1.0 or 0.0 for whether the episode that ``step`` ended in environment ``env`` succeeded.
+
+        Where the environment does not say so itself, an episode succeeds whose return is at least ``threshold``, or the
+        environment's own reward threshold if that is None; NaN where there is neither.
+        """
+        own = self.success(step, env)
+        threshold = self.reward_threshold if threshold is None else threshold
+        return own if threshold is None or not math.isnan(own) else float(episode_return >= threshold)
+
+    @abstractmethod
+    def goals(self) -> GoalFunctions | None:
+        """Returns the goal functions, or None for environments without goals."""
+
+    @property
+    def must_reset(self) -> bool:
+        """Whether the next call must be :meth:`reset`; an agent begins new episodes then."""
+        return False
+
+    def snapshot(self) -> Any:
+        """Returns the state of the running environments as plain data (see :mod:`rejeu.io.plain`).
+
+        None where the backend or an environment does not offer it.
+        """
+        return None
+
+    def restore(self, saved: Any, obs: Any) -> list[int]:
+        """Restores what :meth:`snapshot` returned, into environments of the same kind.
+
+        Args:
+            saved: the snapshot.
+            obs: the observations at that moment, a pytree of arrays ``(n_envs, ...)``.
+
+        Returns:
+            Which environments must be reset before they can be stepped, as far as they say so.
+
+        Raises:
+            ValueError: if the snapshot is damaged or of other environments.
+            DivergedError: if the environments do not repeat what was recorded.
+        """
+        raise ValueError(f"there is no snapshot of environments of the {self.backend} backend")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Releases the environments."""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.n_envs} x {self.env_id}, backend {self.backend!r}>"
+
+
+def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
+    """Returns id, time limit and reward threshold of a Gymnasium environment or vector environment."""
+    if env.spec is None:
+        return Description(type(env.unwrapped).__name__, None, None)
+    limit = env.spec.max_episode_steps
+    if limit is None and env.spec.id.startswith("parking-"):  # which ends its episodes itself, after so many seconds
+        config = env.unwrapped.config  # type: ignore[union-attr]
+        limit = round(config["duration"] * config["policy_frequency"])
+    return Description(env.spec.id, limit, env.spec.reward_threshold)
+
+
+def success_of(info: dict[str, Any]) -> float:
+    """Returns 1.0 or 0.0 as an info dict says under ``is_success`` or ``success``, NaN if it says neither.
+
+    Raises:
+        BadEnvironmentError: if the info is no dict.
+    """
+    if not isinstance(info, dict):
+        raise BadEnvironmentError(
+            f"step returned the info {info!r:.80}, expected a dict; return {{}} if it says nothing"
+        )
+    value = info.get("is_success", info.get("success"))
+    return float("nan") if value is None else float(np.all(value))
+
+
+def replaced(batch: Any, rows: np.ndarray, part: Any) -> Any:
+    """Returns a copy of a batch in which ``rows``, indices or a mask, are those of ``part``."""
+    batch = jax.tree.map(np.copy, batch)
+    jax.tree.map(lambda whole, new: whole.__setitem__(rows, new), batch, part)
+    return batch

@@ -1,0 +1,187 @@
+"""Environments that each step in a worker process of their own, with their observations in shared memory."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import jax
+import numpy as np
+
+from rejeu.buffers.hindsight import GoalFunctions
+from rejeu.envs import faults, goals as goals_module, snapshot
+from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
+from rejeu.envs.seeds import Seed, for_each
+from rejeu.envs.workers import process
+from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
+from rejeu.envs.workers.process import Failure
+from rejeu.errors import BadEnvironmentError, WorkerError
+from rejeu.spaces import leaves, structure
+
+
+class InWorkers(VectorEnv):
+    """Environments in worker processes, stepped at the same time.
+
+    Where a worker that was lost is replaced, its episode ends as by a time limit: the step has the reward 0 and
+    ``truncated``, the observation before it is repeated as the successor, and its info says why under
+    ``"worker_restarted"``.
+
+    Args:
+        make_one: makes an environment; it is sent to the workers, and called once here.
+        n_envs: how many.
+        seed: of the first reset. A worker that is started anew draws a seed from that and its number.
+        worker_timeout: seconds that the workers have for a step or a reset; None: for ever.
+        restart_workers: how many lost workers are replaced, over all of them.
+
+    Raises:
+        TypeError: if ``make_one`` cannot be sent.
+        WorkerError: if a worker cannot be started, or fails to make its environment.
+    """
+
+    backend = "gymnasium-async"
+
+    def __init__(
+        self,
+        make_one: Callable[[], gym.Env],
+        n_envs: int,
+        seed: Seed = None,
+        worker_timeout: float | None = TIMEOUT,
+        restart_workers: int = 0,
+    ) -> None:
+        one = make_one()
+        self.observation_space, self.action_space = one.observation_space, one.action_space
+        self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(one)
+        one.close()
+        self.n_envs = n_envs
+        self.n_steps = 0
+        """How often the vector was stepped."""
+        self._lost: dict[int, Restarted] = {}
+        """Environments whose process was replaced between two steps; the next step says so."""
+        self._anew: set[int] = set()
+        """Environments in new processes, which were not reset yet."""
+        self._make_one = make_one
+        self._seed = seed
+        self._seeds: list[int | None] = [None] * n_envs
+        """What each environment was last seeded with."""
+        self._leaves = leaves(self.observation_space)
+        self._stores = [np.zeros((n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
+        self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
+        self.workers = Workers([make_one] * n_envs, None, worker_timeout, restart_workers, self._share)
+        for i, made in enumerate(self.workers.descriptions):
+            if (made.observation_space, made.action_space) != (self.observation_space, self.action_space):
+                self.close()
+                raise BadEnvironmentError(
+                    f"{self.env_id}, environment {i}: its spaces are {made.observation_space} and {made.action_space}, "
+                    f"those of the first are {self.observation_space} and {self.action_space}; all must be the same"
+                )
+
+    def _share(self, context: Any) -> tuple[list[Any], int]:
+        """Makes the memory that the observations are shared in, and returns what each worker needs to write to it."""
+        buffers = [context.RawArray(ctypes.c_byte, max(self.n_envs * leaf.nbytes, 1)) for leaf in self._leaves]
+        self._rows = process.rows(self.observation_space, buffers, self.n_envs)
+        return buffers, self.n_envs
+
+    def reset(self, seed: Seed = None) -> Any:
+        seed = self._seed if seed is None else seed
+        self._seed = None
+        return self._reset(dict(enumerate(for_each(seed, self.n_envs))))
+
+    def reset_done(self, done: np.ndarray) -> Any:
+        return self._reset(dict.fromkeys(np.flatnonzero(done).tolist()))
+
+    def _reset(self, seeds: Mapping[int, int | None]) -> Any:
+        """Resets the environments that are the keys; again where a worker was lost at that."""
+        for i, seed in seeds.items():
+            self._lost.pop(i, None)
+            if seed is not None:
+                self._seeds[i] = seed
+        waiting = {i: ("reset", self._next_seed(i) if seed is None else seed) for i, seed in seeds.items()}
+        while waiting:
+            said = self._heard(self.workers.ask(waiting), "reset")
+            done = [i for i, answer in said.items() if not isinstance(answer, Restarted)]
+            self._take(done)
+            waiting = {i: ("reset", self._next_seed(i)) for i in said if i not in done}
+        return self._obs
+
+    def _next_seed(self, i: int) -> int | None:
+        """Returns the seed of a new process's environment, for which there is none but the old one's; else None."""
+        if i not in self._anew:
+            return None
+        self._anew.discard(i)
+        before = self._seeds[i]
+        if before is None:
+            return None
+        seed = self._seeds[i] = int(np.random.SeedSequence([before, 1]).generate_state(1)[0])
+        return seed
+
+    def _step_all(self, action: np.ndarray) -> Step:
+        return self._step_each(range(self.n_envs), action)
+
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        return self._step_each(np.flatnonzero(active).tolist(), action)
+
+    def _step_each(self, which: Sequence[int], action: np.ndarray) -> Step:
+        reward = np.zeros(self.n_envs, np.float32)
+        terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
+        info: list[dict[str, Any]] = [{}] * self.n_envs
+        self.n_steps += 1
+        lost = {i: self._lost.pop(i) for i in which if i in self._lost}
+        asked = {i: ("step", action[i]) for i in which if i not in lost}
+        said = {**self._heard(self.workers.ask(asked), "step"), **lost}
+        stepped = []
+        for i, answer in said.items():
+            if isinstance(answer, Restarted):
+                truncated[i], info[i] = True, {RESTARTED: answer.why}
+            else:
+                reward[i], terminated[i], truncated[i], info[i] = answer
+                stepped.append(i)
+        self._take(stepped)
+        return Step(self._obs, reward, terminated, truncated, info)
+
+    def _take(self, which: Sequence[int]) -> None:
+        """Copies observations out of shared memory, to which a worker that was given up may still have written."""
+        rows: Any = slice(None) if len(which) == self.n_envs else which
+        for store, shared in zip(self._stores, self._rows, strict=True):
+            store[rows] = shared[rows]
+
+    def _heard(self, said: dict[int, Any], what: str) -> dict[int, Any]:
+        """Returns the answers, none of which is a failure."""
+        self._anew.update(i for i, answer in said.items() if isinstance(answer, Restarted))
+        failed = {i: answer for i, answer in said.items() if isinstance(answer, Failure)}
+        if not failed:
+            return said
+        first, failure = next(iter(failed.items()))
+        if failure.kind == "bad answer":
+            raise BadEnvironmentError(faults.blamed(self.env_id, first, self.n_steps, failure.message))
+        which = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
+        raise WorkerError(f"{which} failed in a worker process, at a {what}:\n{failure.trace}")
+
+    def success(self, step: Step, env: int) -> float:
+        return success_of(step.info[env])
+
+    def goals(self) -> GoalFunctions | None:
+        return goals_module.goal_functions(self._make_one())
+
+    def snapshot(self) -> list[Any] | None:
+        said = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
+        self._lost |= {i: answer for i, answer in said.items() if isinstance(answer, Restarted)}
+        known = all(isinstance(one, list) for one in said.values())  # None: not offered
+        return [said[i] for i in range(self.n_envs)] if known else None
+
+    def restore(self, saved: Any, obs: Any) -> list[int]:
+        snapshot.check_count(saved, self.n_envs)
+        answers = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
+        for i, answer in answers.items():
+            if not isinstance(answer, bool):
+                why = answer.message if isinstance(answer, Failure) else answer.why
+                raise ValueError(f"environment {i} cannot be restored: {why}")
+        for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
+            store[...] = leaf
+        self._seed = None
+        return [i for i, is_over in answers.items() if is_over]
+
+    def close(self) -> None:
+        """Ends the processes; a second call does nothing."""
+        self.workers.close()

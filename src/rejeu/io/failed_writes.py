@@ -1,0 +1,166 @@
+"""Writes that may fail without ending training: warned of at once, tried again, and reported at the end."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+from rejeu.reporting.logging import Sink
+
+RETRY_SECONDS = 60.0
+"""Seconds between two attempts at a write that failed."""
+MOST_ROWS = 10_000
+"""Most rows of one table that wait to be written; beyond it the oldest are dropped."""
+
+
+class Failure(NamedTuple):
+    """A write that failed."""
+
+    reason: str
+    """Why, in words."""
+    written: bool
+    """Whether it succeeded later."""
+
+
+class FailedWrites:
+    """The writes of a run that failed. Mutable; every agent has one, ``agent.failed_writes``.
+
+    A full disk must not end a training run of days, so what ``learn`` writes goes through :meth:`attempt`. Only ``OSError`` is
+    handled; every other exception is a defect and propagates.
+
+    >>> import warnings
+    >>> failed = FailedWrites()
+    >>> def write():
+    ...     raise OSError("No space left on device")
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore")
+    ...     failed.attempt("the table", write)
+    False
+    >>> failed.summary()
+    'not written (No space left on device): the table'
+    """
+
+    def __init__(self) -> None:
+        self.failures: dict[str, Failure] = {}
+        """What failed in the last ``learn``, by name."""
+        self._retries: dict[str, Callable[[], object]] = {}
+        self._waiting: dict[str, deque[tuple[Any, ...]]] = {}
+        self._dropped: dict[str, int] = {}
+        self._retry_at = math.inf
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything is written, be it late."""
+        return all(failure.written for failure in self.failures.values())
+
+    def attempt(self, what: str, write: Callable[[], object], retry: bool = True) -> bool:
+        """Calls ``write`` and returns whether it succeeded; if not, warns unless that is known already.
+
+        Args:
+            what: what is written, in words; a later attempt of the same name replaces an earlier one.
+            write: raises ``OSError`` where it fails, and may then be called again.
+            retry: whether :meth:`retry` calls it again; False where the caller does.
+        """
+        try:
+            write()
+        except OSError as error:
+            text = " ".join((error.strerror or str(error)).split())
+            self._note(
+                what,
+                write if retry else None,
+                os.strerror(error.errno) if error.errno else text,
+                f"{what}: {text}; training continues, and the write is tried again",
+            )
+            return False
+        self._retries.pop(what, None)
+        if what in self.failures:
+            self.failures[what] = self.failures[what]._replace(written=True)
+        return True
+
+    def put(self, what: str, write: Callable[..., object], *row: Any) -> None:
+        """Writes a row, after those of the same name that still wait, or lets it wait with them.
+
+        Args:
+            what: the rows of which table, in words.
+            write: takes ``row``; raises ``OSError`` if it could not write it, and must then have written no part of it.
+            row: what is written.
+        """
+        rows = self._waiting.setdefault(what, deque())
+        if len(rows) == MOST_ROWS:
+            rows.popleft()
+            self._dropped[what] = self._dropped.get(what, 0) + 1
+        rows.append(row)
+        self.attempt(what, partial(self._flush, what, write))
+
+    def retry(self) -> bool:
+        """Tries again what failed, and returns whether everything is written."""
+        self._retry_at = math.inf
+        for what, write in list(self._retries.items()):
+            self.attempt(what, write)
+        return self.complete
+
+    def retry_if_due(self) -> None:
+        """Does the same where the last failure is ``RETRY_SECONDS`` old."""
+        if time.monotonic() >= self._retry_at:
+            self.retry()
+
+    def forget_written(self) -> None:
+        """Forgets failures that succeeded later."""
+        self.failures = {what: failure for what, failure in self.failures.items() if not failure.written}
+
+    def summary(self) -> str:
+        """Returns what failed, in words; empty if nothing did."""
+        parts = []
+        for title, written in (("not written", False), ("written late", True)):
+            by_reason: dict[str, list[str]] = {}
+            for what, one in self.failures.items():
+                if one.written == written:
+                    by_reason.setdefault(one.reason, []).append(what)
+            parts += [f"{title} ({reason}): {', '.join(names)}" for reason, names in by_reason.items()]
+        return "; ".join(parts)
+
+    def warn(self) -> None:
+        """Warns of everything that failed, if anything did."""
+        if text := self.summary():
+            warnings.warn(text, UserWarning, stacklevel=2)
+
+    def _flush(self, what: str, write: Callable[..., object]) -> None:
+        rows = self._waiting[what]
+        while rows:
+            write(*rows[0])
+            rows.popleft()
+        if n := self._dropped.pop(what, 0):
+            lost = f"the first {n:,} {what} that failed"
+            self._note(lost, None, f"only {MOST_ROWS:,} wait", f"{lost} are not written, for only {MOST_ROWS:,} wait")
+
+    def _note(self, what: str, write: Callable[[], object] | None, reason: str, text: str) -> None:
+        is_new = what not in self.failures or self.failures[what].written
+        self.failures[what] = Failure(reason, written=False)
+        if write is not None:
+            self._retries[what] = write
+            self._retry_at = min(self._retry_at, time.monotonic() + RETRY_SECONDS)
+        if is_new:
+            warnings.warn(text, UserWarning, stacklevel=3)
+
+
+class RetryingSink:
+    """A sink whose rows wait, in their order, while they cannot be written."""
+
+    def __init__(self, sink: Sink, failed: FailedWrites) -> None:
+        self.sink = sink
+        self._what = f"rows of {sink}"
+        self._failed = failed
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Takes the metrics of environment step ``step``."""
+        self._failed.put(self._what, self.sink.write, step, dict(metrics))
+
+    def close(self) -> None:
+        """Closes the sink."""
+        self._failed.attempt(self._what, self.sink.close, retry=False)

@@ -1,0 +1,1 @@
+"""What training came to: tables, curves, evaluations, videos."""

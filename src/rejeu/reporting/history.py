@@ -1,0 +1,249 @@
+"""The record of a training run: one row an episode, as data and as a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rejeu.io import atomic
+from rejeu.loops.run import Episode
+from rejeu.reporting.text import counted
+from rejeu.validation import whole
+
+if TYPE_CHECKING:
+    from rejeu.reporting.figures import Picture
+
+LAST_EPISODES = 20
+"""How many the representation sums up."""
+COLUMNS = ("step", "env", "return", "length", "success", "seconds")
+
+
+class History:
+    """A growing table of episodes, 48 bytes each."""
+
+    def __init__(self, episodes: Iterable[Episode] = ()) -> None:
+        self._values = array("d")
+        self._records = array("q")
+        """Rows of the episodes that returned more than all before them."""
+        self.best_return = -math.inf
+        """The highest return of an episode; minus infinity before the first."""
+        for episode in episodes:
+            self.append(episode)
+
+    def __len__(self) -> int:
+        return len(self._values) // len(COLUMNS)
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        """Returns one column, ``(n_episodes,)``: step, env, return, length, success or seconds.
+
+        Raises:
+            KeyError: for another name.
+        """
+        if column not in COLUMNS:
+            raise KeyError(f"{column!r} is no column; there are {', '.join(COLUMNS)}")
+        return np.array(self._values[COLUMNS.index(column) :: len(COLUMNS)], np.float64)
+
+    def __repr__(self) -> str:
+        n = min(len(self), LAST_EPISODES)
+        if not n:
+            return "<History: no episodes>"
+        means = {column: float(np.mean(self[column][-n:])) for column in ("return", "length", "success")}
+        text = f"return {means['return']:,.2f}, length {means['length']:,.1f}"
+        if math.isfinite(means["success"]):
+            text += f", success {means['success']:.0%}"
+        steps = int(self["step"][-1])
+        return f"<History: {counted(len(self), 'episode')} in {counted(steps, 'step')}; mean of the last {n}: {text}>"
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """All episodes, oldest first; a list made anew."""
+        return self.last(len(self))
+
+    def last(self, n: int) -> list[Episode]:
+        """Returns the last ``n`` episodes, or all if there are fewer, oldest first."""
+        return [self._episode(row) for row in range(max(len(self) - n, 0), len(self))]
+
+    def records(self) -> list[Episode]:
+        """Returns the episodes that returned more than all before them, oldest first; the first episode is one.
+
+        >>> history = History(Episode(10 * i, 0, value, 10, math.nan, i) for i, value in enumerate([1.0, 5.0, 5.0, 7.0]))
+        >>> [episode.episode_return for episode in history.records()]
+        [1.0, 5.0, 7.0]
+        """
+        return [self._episode(row) for row in self._records]
+
+    @property
+    def record_rows(self) -> np.ndarray:
+        """Where in the table :meth:`records` stand, ``int64 (n_records,)``."""
+        return np.array(self._records, np.int64)
+
+    def _episode(self, row: int) -> Episode:
+        width = len(COLUMNS)
+        step, env, value, length, success, seconds = self._values[row * width : (row + 1) * width]
+        return Episode(int(step), int(env), value, int(length), success, seconds)
+
+    def summary(self, window: int = 100) -> Summary:
+        """Returns what the run came to, over all episodes and over the last ``window``; printed, it is a small table.
+
+        Raises:
+            ValueError: if ``window`` is below 1.
+        """
+        return Summary.of(self, whole("window", window, least=1))
+
+    def append(self, episode: Episode) -> None:
+        """Adds one episode at the end."""
+        if episode.episode_return > self.best_return:
+            self.best_return = episode.episode_return
+            self._records.append(len(self))
+        self._values.extend(episode)
+
+    def table(self) -> np.ndarray:
+        """Returns everything as one array, ``float64 (n_episodes, 6)``, its columns in the order of ``COLUMNS``."""
+        return np.array(self._values, np.float64).reshape(-1, len(COLUMNS))
+
+    def replace(self, table: np.ndarray) -> None:
+        """Puts what :meth:`table` returned in place of everything.
+
+        Raises:
+            ValueError: if it is no such table.
+        """
+        if table.dtype != np.float64 or table.shape[1:] != (len(COLUMNS),):
+            raise ValueError(f"a history is float64[n, {len(COLUMNS)}], got {table.dtype}{list(table.shape)}")
+        for column in ("step", "env", "length"):
+            if not np.isfinite(table[:, COLUMNS.index(column)]).all():
+                raise ValueError(f"the column {column!r} of a history must be finite")
+        self._values = array("d", table.ravel())
+        best = np.fmax.accumulate([-np.inf, *table[:, COLUMNS.index("return")]])
+        self._records = array("q", np.flatnonzero(best[1:] > best[:-1]).tolist())
+        self.best_return = float(best[-1])
+
+    def moving_average(self, column: str = "return", window: int = 50) -> np.ndarray:
+        """Returns the mean of each value and up to ``window - 1`` before it, NaN left out, ``(n_episodes,)``."""
+        values = self[column]
+        known = np.isfinite(values)
+        sums = np.cumsum(np.where(known, values, 0.0))
+        counts = np.cumsum(known)
+        sums[window:] = sums[window:] - sums[:-window]
+        counts[window:] = counts[window:] - counts[:-window]
+        return sums / np.where(counts, counts, np.nan)
+
+    def write_csv(self, path: str | Path) -> None:
+        """Writes the table with a header line; an older file is replaced only once the new one is complete."""
+        text = io.StringIO()
+        writer = csv.writer(text)
+        writer.writerow(COLUMNS)
+        writer.writerows(self.episodes)
+        with atomic.replacing(Path(path)) as file:
+            file.write(text.getvalue().encode())
+
+    def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
+        """Returns a matplotlib figure of returns and, where known, success; a notebook shows it by itself.
+
+        Args:
+            path: of a file to write, whose suffix says the format; None for none.
+            against: ``"step"`` or ``"seconds"``.
+            window: episodes in the moving average; None: a fifth of the run, at least 3 and at most 50.
+
+        Raises:
+            MissingExtra: if matplotlib is not installed.
+        """
+        from rejeu.reporting import plots
+
+        return plots.learning_curve(self, path, against, window)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the columns as arrays, ready for ``pandas.DataFrame``."""
+        return {column: self[column] for column in COLUMNS}
+
+
+@dataclass(frozen=True)
+class Averages:
+    """What a number of episodes came to; NaN where there is none, or where nothing is known."""
+
+    n: int
+    """How many."""
+    mean_return: float
+    std_return: float
+    """Standard deviation over episodes, dividing by n."""
+    mean_length: float
+    """In steps."""
+    std_length: float
+    success_rate: float
+    """Share of those that are known to have succeeded or not."""
+
+    @classmethod
+    def of(cls, returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray) -> Averages:
+        """Returns those of episodes, ``(n,)`` each."""
+        if not len(returns):
+            return cls(0, math.nan, math.nan, math.nan, math.nan, math.nan)
+        known = successes[np.isfinite(successes)]
+        rate = float(known.mean()) if len(known) else math.nan
+        return cls(
+            n=len(returns),
+            mean_return=float(np.mean(returns)),
+            std_return=float(np.std(returns)),
+            mean_length=float(np.mean(lengths)),
+            std_length=float(np.std(lengths)),
+            success_rate=rate,
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Summary:
+    """What a run came to; ``print`` shows it as a table, and so do a notebook and the interactive interpreter."""
+
+    steps: int
+    """Environment steps taken when the last episode ended."""
+    seconds: float
+    """Wall time of training when the last episode ended."""
+    all: Averages
+    """Over all episodes."""
+    last: Averages
+    """Over the last ``window``, or all if there are fewer."""
+    records: int
+    """How many episodes returned more than all before them."""
+    best: Episode | None
+    """The episode of the highest return, the first of equals; None before the first."""
+
+    @classmethod
+    def of(cls, history: History, window: int) -> Summary:
+        """Returns that of a history; see :meth:`History.summary`."""
+        columns = [history[column] for column in ("return", "length", "success")]
+        records = history.records()
+        return cls(
+            steps=int(history["step"][-1]) if len(history) else 0,
+            seconds=float(history["seconds"][-1]) if len(history) else 0.0,
+            all=Averages.of(*columns),
+            last=Averages.of(*(column[-window:] for column in columns)),
+            records=len(records),
+            best=records[-1] if records else None,
+        )
+
+    def __repr__(self) -> str:
+        head = f"{counted(self.all.n, 'episode')} in {counted(self.steps, 'step')}, {self.seconds:,.1f} s"
+        if self.best is None:
+            return head
+        parts = (self.all, self.last)
+        spread = "{:,.2f} \N{PLUS-MINUS SIGN} {:,.2f}".format
+        rows = [
+            ["", "all", f"last {self.last.n:,}"],
+            ["return", *(spread(part.mean_return, part.std_return) for part in parts)],
+            ["length", *(spread(part.mean_length, part.std_length) for part in parts)],
+        ]
+        if not math.isnan(self.all.success_rate):
+            rates = ("-" if math.isnan(part.success_rate) else f"{part.success_rate:.1%}" for part in parts)
+            rows.append(["success", *rates])
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        table = [
+            "   ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        ]
+        best = f"best return {self.best.episode_return:,.2f} at step {self.best.step:,} ({counted(self.records, 'record')})"
+        return "\n".join([head, *table, best])

@@ -1,0 +1,149 @@
+"""The learning curve: returns and successes of a run against steps or seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rejeu.reporting.evaluation import Evaluation
+from rejeu.reporting.plots import style
+from rejeu.validation import whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.history import History
+
+EPISODES = "episodes"
+AXIS_LABELS = {"step": "environment steps", "seconds": "seconds of training"}
+MOST_WINDOW = 50
+"""Most episodes in the moving average that is drawn by default."""
+ROOM_AT_THE_RIGHT = 0.02
+"""Of the horizontal axis, beyond the last episode, so that its dot is drawn whole."""
+
+
+def learning_curve(
+    history: History,
+    path: str | Path | None = None,
+    against: str = "step",
+    window: int | None = None,
+    evaluations: Iterable[tuple[int, Evaluation]] = (),
+    title: str = "",
+) -> Picture:
+    """Draws the return of every episode, its moving average, the records and, where known, the success rate below.
+
+    A record is an episode that returned more than all before it.
+
+    Args:
+        history: the episodes; may be empty.
+        path: of a file to write, whose suffix says the format (``.png``, ``.svg``, ``.pdf``); None for none.
+        against: ``"step"`` or ``"seconds"``.
+        window: episodes in the moving average; None: a fifth of the run, at least 3 and at most 50. The legend says it.
+        evaluations: ``(step, Evaluation)`` pairs, such as ``Evaluate.results``, drawn as points with 95 % intervals.
+        title: over the picture; long ones are wrapped. Empty for none.
+
+    Raises:
+        MissingExtra: if matplotlib is not installed.
+        ValueError: for another ``against`` or a ``window`` below 1.
+    """
+    if against not in AXIS_LABELS:
+        raise ValueError(f"against={against!r} must be one of {', '.join(AXIS_LABELS)}")
+    window = default_window(len(history)) if window is None else whole("window", window, least=1)
+    evaluations = list(evaluations)
+    x, returns, successes = history[against], history["return"], history["success"]
+    steps = np.array([step for step, _ in evaluations], np.float64)
+    at = steps if against == "step" or not len(x) else np.interp(steps, history["step"], x)
+    has_success = bool(np.isfinite(successes).any())
+
+    figure = style.blank("drawing a learning curve", height=6.4 if has_success else 4.2)
+    panels = figure.subplots(1 + has_success, sharex=True, squeeze=False, height_ratios=[3, 2][: 1 + has_success])[:, 0]
+    means = [evaluation.mean_return for _, evaluation in evaluations]
+    _episodes(panels[0], x, returns)
+    _records(panels[0], x, returns, history.record_rows)
+    _line(panels[0], x, history.moving_average("return", window), window)
+    _points(panels[0], at, means, [evaluation.return_interval for _, evaluation in evaluations])
+    _fit(panels[0], returns, [*means, history.best_return])
+    panels[0].set_ylabel("return")
+    panels[0].yaxis.set_major_formatter(style.thousands)
+    if has_success:
+        rates = [evaluation.success_rate for _, evaluation in evaluations]
+        _line(panels[1], x, history.moving_average("success", window), window)
+        _points(panels[1], at, rates, [evaluation.success_interval for _, evaluation in evaluations])
+        panels[1].set_ylim(-0.03, 1.03)
+        panels[1].set_ylabel("success rate")
+        panels[1].yaxis.set_major_formatter(lambda share, _: f"{share:.0%}")
+    for panel in panels:
+        style.dress(panel)
+    panels[-1].set_xlabel(AXIS_LABELS[against])
+    panels[-1].xaxis.set_major_formatter(style.thousands)
+    panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]) * (1 + ROOM_AT_THE_RIGHT))
+    style.head(panels[0], title)
+    _enlarge_dots(panels[0])
+    return style.write(figure, path)
+
+
+def default_window(n_episodes: int) -> int:
+    """Returns the episodes in the moving average of a run: few in a short one, whose line would lag behind otherwise.
+
+    >>> [default_window(n) for n in (4, 30, 100, 1000)]
+    [3, 6, 20, 50]
+    """
+    return min(max(n_episodes // 5, 3), MOST_WINDOW)
+
+
+def _enlarge_dots(panel: Axes) -> None:
+    """Draws the dot of the legend in one size, whatever that of the episodes is."""
+    legend = panel.get_legend()
+    for line in legend.get_lines() if legend is not None else ():
+        if line.get_label() == EPISODES:
+            line.set(markersize=5, alpha=0.8)
+
+
+def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    """Draws each episode as a dot, smaller and lighter the more there are."""
+    if not len(x):
+        return
+    size = float(np.clip(60 / math.sqrt(len(x)), 2.4, 5.0))
+    opacity = float(np.clip(600 / len(x), 0.3, 0.6))
+    panel.plot(x, y, "o", markersize=size, color=style.DOT_COLOR, alpha=opacity, markeredgewidth=0, label=EPISODES)
+
+
+def _records(panel: Axes, x: np.ndarray, returns: np.ndarray, rows: np.ndarray) -> None:
+    """Marks the episodes that returned more than all before them."""
+    if len(rows):
+        panel.plot(x[rows], returns[rows], "^", markersize=4.5, color=style.GOOD_COLOR, label="records", zorder=3)
+
+
+def _line(panel: Axes, x: np.ndarray, y: np.ndarray, window: int) -> None:
+    if len(x):
+        panel.plot(x, y, label=f"mean of {window} episodes", **style.LINE)
+
+
+def _points(panel: Axes, x: np.ndarray, y: list[float], intervals: list[tuple[float, float]]) -> None:
+    """Draws evaluations as points with their intervals as bars; an unknown interval has no bar."""
+    if not len(x) or not np.isfinite(y).any():
+        return
+    low, high = np.array(intervals).T
+    reach = np.nan_to_num(np.stack([np.array(y) - low, high - np.array(y)]).clip(0))
+    panel.errorbar(x, y, reach, fmt="none", ecolor=style.ACCENT_COLOR, elinewidth=1.2, alpha=0.6, zorder=3)
+    form: dict[str, Any] = {
+        "color": style.ACCENT_COLOR,
+        "markeredgecolor": "white",
+        "markeredgewidth": 0.8,
+        "zorder": 4,
+    }
+    panel.plot(x, y, "o", markersize=5, label="evaluation, 95 % interval", clip_on=False, **form)
+
+
+def _fit(panel: Axes, returns: np.ndarray, further: list[float]) -> None:
+    """Fits the height to all but the lowest half percent of returns, and to what else is to be seen."""
+    shown = np.concatenate([np.quantile(returns, [0.005, 0.995]) if len(returns) else [], further])
+    shown = shown[np.isfinite(shown)]
+    if len(shown):
+        margin = 0.05 * (np.ptp(shown) or 1.0)
+        panel.set_ylim(shown.min() - margin, shown.max() + margin)

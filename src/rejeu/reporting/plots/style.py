@@ -1,0 +1,74 @@
+"""What all pictures have in common: colors, fonts, grid, the place of title and legend."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rejeu.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rejeu.reporting.figures import Picture
+
+INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
+DOT_COLOR, LINE_COLOR, ACCENT_COLOR, GOOD_COLOR, BAD_COLOR = "#63a4e0", "#1d4f91", "#dd6b20", "#26966a", "#cd3e34"
+LINE: dict[str, Any] = {"color": LINE_COLOR, "linewidth": 1.8, "solid_capstyle": "round", "solid_joinstyle": "round"}
+TITLE_WIDTH = 72
+"""Characters of a title's line: what fits the width of the picture in the title's font."""
+
+
+def blank(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
+    """Returns an empty figure of so many inches, which a notebook shows by itself.
+
+    Raises:
+        MissingExtra: if matplotlib is not installed; ``what`` says for what it is needed.
+    """
+    try:
+        import matplotlib.figure  # noqa: F401 - also where our own module was imported before
+
+        from rejeu.reporting.figures import Picture
+    except ImportError:
+        raise MissingExtra(what, "matplotlib", "plot") from None
+    return Picture(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
+
+
+def write(figure: Picture, path: str | Path | None) -> Picture:
+    """Writes the figure to ``path`` if there is one, whose suffix says the format, and returns the figure."""
+    if path is not None:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    return figure
+
+
+def dress(panel: Axes) -> None:
+    """Gives a panel its grid, spines and font sizes."""
+    panel.grid(color=GRID, linewidth=0.8)
+    panel.set_axisbelow(True)
+    panel.spines[["top", "right", "left"]].set_visible(False)
+    panel.spines["bottom"].set_color(MUTED)
+    panel.tick_params(colors=MUTED, labelcolor=INK, labelsize=9, length=0, pad=6)
+    panel.xaxis.label.set(color=INK, fontsize=10)
+    panel.yaxis.label.set(color=INK, fontsize=10)
+
+
+def head(panel: Axes, title: str) -> None:
+    """Writes the legend above a panel and the title above the legend, so that neither limits the other's length."""
+    has_legend = bool(panel.get_legend_handles_labels()[0])
+    if title:
+        text = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
+        panel.set_title(text, loc="left", color=INK, fontsize=12, fontweight="bold", pad=25 if has_legend else 9)
+    if has_legend:
+        style = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2, "columnspacing": 1.4}
+        panel.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=4, borderaxespad=0.2, **style)
+
+
+def thousands(value: float, _: float | None = None) -> str:
+    """Returns a number with thousands separators and a true minus sign.
+
+    >>> thousands(12500.0)
+    '12,500'
+    """
+    return f"{value:,.10g}".replace("-", "\N{MINUS SIGN}")

@@ -1,0 +1,131 @@
+"""The course of one episode: a coordinate against time, the plane, or the plane beside every coordinate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rejeu.reporting.plots import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from rejeu.reporting.figures import Picture
+
+MOST_COORDINATES = 10
+"""Most coordinates that are drawn against time beside the plane."""
+MARGIN = 0.08
+"""What is seen beyond the bounds, as a share of their distance."""
+
+
+def trajectory(
+    positions: ArrayLike,
+    path: str | Path | None = None,
+    *,
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
+    title: str = "",
+) -> Picture:
+    """Draws the course of one episode.
+
+    One coordinate is drawn against steps, two as a plane, more as the plane of the first two beside every coordinate
+    against steps (the first ten).
+
+    Args:
+        positions: positions or observations, oldest first, ``(n, dimension)``, or ``(n,)`` for one coordinate.
+        path: of a file to write, whose suffix says the format (``.png``, ``.svg``, ``.pdf``); None for none.
+        low: lower bound of each coordinate, a number or ``(dimension,)``, drawn as a wall where it is finite; None: none.
+        high: upper bounds, likewise.
+        names: of the coordinates; None: x1, x2 and so on.
+        title: over the picture; empty for none.
+
+    Raises:
+        MissingExtra: if matplotlib is not installed.
+        ValueError: if the positions are not ``(n, dimension)`` with at least one row, or names are missing.
+    """
+    points = np.asarray(positions, np.float64)
+    points = points[:, None] if points.ndim == 1 else points
+    if points.ndim != 2 or 0 in points.shape:
+        raise ValueError(f"positions have the shape {points.shape}, expected (n, dimension) with at least one row")
+    dimension = points.shape[1]
+    names = [f"x{i + 1}" for i in range(dimension)] if names is None else list(names)
+    if len(names) != dimension:
+        raise ValueError(f"names={names} must name all {dimension} coordinates")
+    lows = np.broadcast_to(np.asarray(-np.inf if low is None else low, np.float64), dimension)
+    highs = np.broadcast_to(np.asarray(np.inf if high is None else high, np.float64), dimension)
+
+    what = "drawing a trajectory"
+    if dimension == 1:
+        figure = style.blank(what)
+        panel = figure.subplots()
+        _course(panel, points[:, 0], lows[0], highs[0], names[0])
+        panel.set_xlabel("step")
+        style.head(panel, title)
+    elif dimension == 2:
+        figure = style.blank(what, 5.6, 5.6)
+        _plane(figure.subplots(), points, lows, highs, names, title)
+    else:
+        figure = style.blank(what, 10.0, 5.6)
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[5.6, 4.4])[0]
+        _plane(left.subplots(), points, lows, highs, names, title)
+        shown = min(dimension, MOST_COORDINATES)
+        panels = right.subplots(shown, 1, sharex=True)
+        for i, panel in enumerate(panels):
+            _course(panel, points[:, i], lows[i], highs[i], names[i])
+        panels[-1].set_xlabel("step" if shown == dimension else f"step (the first {shown} of {dimension} coordinates)")
+    return style.write(figure, path)
+
+
+def _plane(
+    panel: Axes, points: np.ndarray, lows: np.ndarray, highs: np.ndarray, names: Sequence[str], title: str
+) -> None:
+    """Draws the first two coordinates against each other, the box, the start and the end."""
+    x, y = points[:, 0], points[:, 1]
+    if np.isfinite([lows[:2], highs[:2]]).all():
+        corners = (lows[0], lows[1]), highs[0] - lows[0], highs[1] - lows[1]
+        from matplotlib.patches import Rectangle
+
+        panel.add_patch(Rectangle(*corners, fill=False, edgecolor=style.INK, linewidth=1.2))
+    panel.plot(x, y, ".-", color=style.LINE_COLOR, linewidth=0.7, markersize=3, alpha=0.6)
+    _ends(panel, x, y)
+    panel.set_xlim(*_limits(x, lows[0], highs[0]))
+    panel.set_ylim(*_limits(y, lows[1], highs[1]))
+    panel.set_box_aspect(1)
+    panel.set_xlabel(names[0])
+    panel.set_ylabel(names[1])
+    style.dress(panel)
+    style.head(panel, title)
+
+
+def _course(panel: Axes, values: np.ndarray, low: float, high: float, name: str) -> None:
+    """Draws one coordinate against steps, its bounds, the start and the end."""
+    for wall in (low, high):
+        if np.isfinite(wall):
+            panel.axhline(wall, color=style.INK, linewidth=1.2)
+    steps = np.arange(len(values))
+    panel.plot(steps, values, color=style.LINE_COLOR, linewidth=1.0)
+    _ends(panel, steps, values)
+    panel.xaxis.set_major_formatter(style.thousands)
+    panel.set_ylim(*_limits(values, low, high))
+    panel.set_ylabel(name)
+    style.dress(panel)
+
+
+def _ends(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    panel.plot(x[:1], y[:1], "o", markersize=6, color="white", markeredgecolor=style.MUTED, label="start", zorder=4)
+    panel.plot(x[-1:], y[-1:], "o", markersize=7, color=style.ACCENT_COLOR, label="end", zorder=5, clip_on=False)
+
+
+def _limits(values: np.ndarray, low: float, high: float) -> tuple[float, float]:
+    """Returns what is to be seen of a coordinate: its bounds and all its values, with a margin."""
+    finite = values[np.isfinite(values)]
+    shown = np.array([*finite, *(wall for wall in (low, high) if np.isfinite(wall))])
+    if not len(shown):
+        return -1.0, 1.0
+    margin = MARGIN * (float(np.ptp(shown)) or 1.0)
+    return float(shown.min()) - margin, float(shown.max()) + margin

@@ -1,0 +1,466 @@
+"""Videos of a policy at work: H.264 in mp4 files, recorded without a display, shown in a notebook."""
+
+from __future__ import annotations
+
+import base64
+import ctypes.util
+import dataclasses
+import html
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.agents.interrupt import Interrupt
+from rejeu.envs.make import InProcess
+from rejeu.envs.masks import shown_to
+from rejeu.envs.registry import make_env, provider, register
+from rejeu.envs.vec_env import VecEnvWrapper
+from rejeu.errors import MissingExtra
+from rejeu.validation import number, whole
+
+DEFAULT_FPS = 30.0
+"""Frames per second of environments that declare none."""
+PLEASANT_FPS = {"parking-v0": 15.0}
+"""Environments whose own figure is too slow to watch: 5 decisions a second, declared as 10 frames per second."""
+RECORDER = "gymnasium.wrappers.rendering:RecordVideo"
+"""Entry point of the wrapper that records training episodes."""
+HOLD_SECONDS = 0.5
+"""How long the last frame of an episode stays before the next episode begins, so that its outcome can be seen."""
+
+
+def record_video(
+    agent: Any,
+    path: str | Path,
+    env: Any = None,
+    episodes: int = 3,
+    max_steps: int = 1500,
+    seed: int | None = None,
+    fps: float | None = None,
+) -> Path:
+    """Plays the agent's deterministic policy, writes what it looks like to an mp4 file, and returns the file's path.
+
+    Every episode gives the frame after its reset and one frame a step; its last frame stays for half a second. A file
+    that is already there is replaced only once the new one is complete.
+
+    Args:
+        agent: anything with ``predict(obs, state, deterministic=True) -> (action, state)``.
+        path: of the file; ``.mp4`` is added to a path without a suffix, missing folders are made.
+        env: an id; an environment made with ``render_mode="rgb_array"``, which is left open; a function that makes one;
+            or None: a new environment like the agent's own.
+        episodes: how many.
+        max_steps: environment steps after which recording ends, over all episodes together.
+        seed: of the environment's first reset; None draws one.
+        fps: frames per second of the file; None: as the environment declares, 15 for parking-v0 (three times real
+            time), 30 where nothing is declared.
+
+    Raises:
+        MissingExtra: if imageio-ffmpeg is not installed.
+        ValueError: if the environment does not give pictures.
+        TypeError: if ``env`` is none of the above.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM; nothing is left of the new file.
+
+    >>> import rejeu, tempfile
+    >>> from rejeu.reporting.video import record_video
+    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     record_video(agent, folder + "/pendulum", episodes=1, max_steps=10).name
+    'pendulum.mp4'
+    """
+    episodes, steps_left = whole("episodes", episodes, least=1), whole("max_steps", max_steps, least=1)
+    fps = None if fps is None else number("fps", fps, above=0)
+    ffmpeg()
+    given = isinstance(env, gym.Env)
+    playing = shown_to(agent, env if given else rendering_env(agent, env))
+    try:
+        check_renders(playing)
+        with Interrupt() as stop, VideoFile(path, natural_fps(playing) if fps is None else fps) as video:
+            for _ in range(episodes):
+                obs, _ = playing.reset(seed=seed)
+                seed, done, memory = None, False, None
+                video.write(rgb_frame(playing))
+                while not done and steps_left:
+                    stop.check()
+                    action, memory = agent.predict(obs, memory, deterministic=True)
+                    obs, _, terminated, truncated, _ = playing.step(action)
+                    frame = rgb_frame(playing)
+                    video.write(frame)
+                    steps_left -= 1
+                    done = terminated or truncated
+                if not steps_left:
+                    break
+                for _ in range(round(HOLD_SECONDS * video.fps)):
+                    video.write(frame)
+    finally:
+        if not given:
+            playing.close()
+    return video.path
+
+
+def rendering_env(agent: Any, env: Any) -> gym.Env:
+    """Returns a new environment that renders to arrays, of an id, of a function, or like the agent's own if None."""
+    if isinstance(env, str):
+        return _make_rendering(env)
+    if env is not None:
+        made = env() if callable(env) else env
+        if not isinstance(made, gym.Env):
+            raise TypeError(
+                "env must be an id, a Gymnasium environment, a function that makes one or None, got "
+                f"{type(made).__name__}"
+            )
+        return made
+    vector = agent.env
+    if vector is None:
+        raise ValueError("this agent has no environment; give one: record_video(agent, path, env='parking-v0')")
+    if isinstance(vector.venv, VecEnvWrapper):
+        raise ValueError(
+            f"the agent's own environments are wrapped in {type(vector.venv).__name__}, which a new one would lack; step "
+            "them in a VecVideoRecorder, or give env="
+        )
+    spec = vector.envs[0].spec if isinstance(vector, InProcess) else None
+    if spec is None and provider(vector.env_id) is None and not register(vector.env_id):
+        raise ValueError(
+            f"the agent's own environment {vector.env_id} is not registered, so no second one can be made; give "
+            "env=, made with render_mode='rgb_array'"
+        )
+    try:
+        return _make_rendering(vector.env_id if spec is None else _without_recorder(spec))
+    except ValueError as error:
+        if "RecordConstructorArgs" not in str(error):
+            raise
+        raise ValueError(
+            f"the wrappers of the agent's own environment {vector.env_id} cannot be made a second time ({error}); give "
+            "env=, made with render_mode='rgb_array' and wrapped alike"
+        ) from None
+
+
+def _without_recorder(spec: gym.envs.registration.EnvSpec) -> gym.envs.registration.EnvSpec:
+    """Returns a spec without ``RecordVideo``, which would write its own videos again, over those of the first environment."""
+    wrappers = tuple(one for one in spec.additional_wrappers if one.entry_point != RECORDER)
+    return dataclasses.replace(spec, additional_wrappers=wrappers)
+
+
+def _make_rendering(source: str | gym.envs.registration.EnvSpec) -> gym.Env:
+    """Makes the environment twice: first plainly, since ``gymnasium.make`` only warns of a render mode it lacks."""
+
+    def make(**kwargs: Any) -> gym.Env:
+        if isinstance(source, str):
+            return make_env(source, **kwargs)
+        return gym.make(source, disable_env_checker=True, **kwargs)
+
+    pinned = not isinstance(source, str) and "render_mode" in source.kwargs
+    return make_drawing(make, source if isinstance(source, str) else source.id, {"render_mode": None} if pinned else {})
+
+
+def make_drawing(
+    make: Callable[..., gym.Env], env_id: str, plainly: Mapping[str, Any] = MappingProxyType({})
+) -> gym.Env:
+    """Returns what ``make(render_mode="rgb_array")`` makes: an environment that draws to arrays.
+
+    Args:
+        make: makes environments.
+        env_id: for messages.
+        plainly: keyword arguments with which ``make`` makes one that draws nothing.
+
+    Raises:
+        ValueError: if it has no such render mode, of which ``gymnasium.make`` would only warn.
+    """
+    plain = make(**plainly)
+    modes = plain.metadata.get("render_modes") or []
+    plain.close()
+    if "rgb_array" not in modes:
+        raise ValueError(
+            f"{env_id} cannot be drawn: it has the render modes {list(modes)}, which lack 'rgb_array'; give env= with an "
+            "environment that has it"
+        )
+    return make(render_mode="rgb_array")
+
+
+def check_renders(env: Any) -> None:
+    """Raises ValueError unless ``env``, an environment or a vector of them, was made to render to arrays."""
+    if env.render_mode != "rgb_array":
+        raise ValueError(
+            f"an environment made with render_mode={env.render_mode!r} cannot be recorded; make it with "
+            "gymnasium.make(id, render_mode='rgb_array')"
+        )
+
+
+def natural_fps(env: gym.Env) -> float:
+    """Returns the frames per second at which an environment is to be watched."""
+    if env.spec is not None and env.spec.id in PLEASANT_FPS:
+        return PLEASANT_FPS[env.spec.id]
+    return float(env.metadata.get("render_fps") or DEFAULT_FPS)
+
+
+def rgb_frame(env: gym.Env) -> np.ndarray:
+    """Returns what an environment renders, ``uint8 (height, width, 3)``; needs no display.
+
+    Raises:
+        ValueError: if it renders anything else, or if MuJoCo finds nothing to draw with.
+    """
+    with display_for_pygame(), said_of_mujoco(env):
+        frame = env.render()
+    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3:
+        got = f"an array of shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
+        raise ValueError(
+            f"{env} cannot be recorded: render() gave {got}, expected an array (height, width, 3); make it with "
+            "render_mode='rgb_array'"
+        )
+    return frame
+
+
+@contextmanager
+def display_for_pygame() -> Iterator[None]:
+    """Lets pygame draw where there is no display, by SDL's ``dummy`` driver; the process's environment is put back.
+
+    highway-env draws nothing, and so gives black frames, while ``SDL_VIDEODRIVER=dummy`` is set: pygame's display is
+    therefore opened under that setting, and the setting hidden from whoever draws on it.
+    """
+    before = os.environ.get("SDL_VIDEODRIVER")
+    driver = "dummy" if before is None and is_headless() else before
+    try:
+        if driver == "dummy":
+            os.environ["SDL_VIDEODRIVER"] = driver
+            if "pygame" in sys.modules:
+                display = sys.modules["pygame"].display
+                if not display.get_init():
+                    display.init()
+                del os.environ["SDL_VIDEODRIVER"]
+        yield
+    finally:
+        if before is None:
+            os.environ.pop("SDL_VIDEODRIVER", None)
+        else:
+            os.environ["SDL_VIDEODRIVER"] = before
+
+
+@contextmanager
+def mujoco_without_screen() -> Iterator[None]:
+    """Lets MuJoCo draw where there is no display, by EGL or else OSMesa, unless ``MUJOCO_GL`` is set; it is put back."""
+    if "mujoco" not in sys.modules or "MUJOCO_GL" in os.environ or not is_headless():
+        yield
+        return
+    libraries = {"egl": "EGL", "osmesa": "OSMesa"}
+    driver = next((name for name, library in libraries.items() if ctypes.util.find_library(library)), None)
+    try:
+        if driver is not None:
+            os.environ["MUJOCO_GL"] = driver
+        yield
+    finally:
+        os.environ.pop("MUJOCO_GL", None)
+
+
+def is_headless() -> bool:
+    """Returns whether this is a Linux without a display."""
+    return sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+
+
+@contextmanager
+def said_of_mujoco(env: gym.Env) -> Iterator[None]:
+    """Raises ``ValueError``, which names the fix, where MuJoCo cannot draw for want of a screen."""
+    try:
+        with mujoco_without_screen(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"\(\d+\) b'")  # GLFW's, of which the error below tells
+            yield
+    except Exception as error:
+        kind = type(error)
+        if (kind.__module__, kind.__name__) != ("mujoco", "FatalError"):
+            raise
+        chosen = os.environ.get("MUJOCO_GL")
+        fix = "set the environment variable MUJOCO_GL=egl (or osmesa) before starting Python"
+        if chosen is None:
+            fix = f"install EGL (on Debian and Ubuntu libegl1) or OSMesa (libosmesa6), or {fix}"
+        raise ValueError(
+            f"{env} cannot be drawn: MuJoCo got no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a screen or "
+            f"drawing without one; {fix}"
+        ) from error
+
+
+def ffmpeg() -> str:
+    """Returns the path of the ffmpeg program.
+
+    Raises:
+        MissingExtra: if imageio-ffmpeg, which brings it, is not installed.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise MissingExtra("recording a video", "imageio-ffmpeg", "video") from None
+    return imageio_ffmpeg.get_ffmpeg_exe()
+
+
+class VideoFile:
+    """An mp4 file that grows by a frame at a time and stands at its path once it is closed.
+
+    H.264, yuv420p; odd heights and widths get a black line. As a context manager it is closed at the end, or given up
+    if an error ends the block. ffmpeg is spoken to directly because ``imageio_ffmpeg.write_frames`` forks in a way
+    that JAX warns of (``preexec_fn``) and leaves a half-written file behind after an error.
+
+    Args:
+        path: of the file; ``.mp4`` is added to a path without a suffix.
+        fps: frames per second.
+    """
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        path = Path(path)
+        if path.suffix not in ("", ".mp4"):
+            raise ValueError(f"path={str(path)!r} must end in .mp4, the one format that is written")
+        self.path = (path if path.suffix else path.with_name(path.name + ".mp4")).absolute()
+        self.fps = fps
+        self.n_frames = 0
+        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}.partial.mp4")
+        self._program = ffmpeg()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._shape: tuple[int, ...] = ()
+
+    def write(self, frame: np.ndarray) -> None:
+        """Adds one frame, ``uint8 (height, width, 3)``; all must have one shape."""
+        if self._process is None:
+            self._start(frame.shape)
+        if frame.shape != self._shape or frame.dtype != np.uint8:
+            raise ValueError(
+                f"frame {self.n_frames} is {frame.dtype} of shape {frame.shape}, expected uint8 of shape {self._shape}"
+            )
+        assert self._process is not None
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(np.ascontiguousarray(frame).data)
+        except OSError:
+            self._fail()
+        self.n_frames += 1
+
+    def close(self) -> Path:
+        """Completes the file, puts it in place and returns its path.
+
+        Raises:
+            OSError: if it could not be written; what stood there before is then untouched.
+            ValueError: if no frame was written.
+        """
+        if self._process is None:
+            raise ValueError(f"{self.path} was given no frame")
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.close()
+        except OSError:
+            self._fail()
+        if self._process.wait() != 0:
+            self._fail()
+        self._errors.close()
+        os.replace(self._partial, self.path)
+        return self.path
+
+    def discard(self) -> None:
+        """Gives the file up."""
+        if self._process is None:
+            return
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdin is not None
+        with suppress(OSError):  # what was still to be written has no reader any more
+            self._process.stdin.close()
+        self._errors.close()
+        self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
+
+    def _start(self, shape: tuple[int, ...]) -> None:
+        self._shape = shape
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the video
+        height, width = shape[:2]
+        self._process = subprocess.Popen(
+            [
+                *(self._program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"),
+                *("-s", f"{width}x{height}", "-r", str(self.fps), "-i", "-", "-an"),
+                *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
+                *("-movflags", "+faststart", str(self._partial)),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            # Ctrl-C is for us: whoever catches it still closes the file
+            process_group=0 if os.name == "posix" else None,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        )
+
+    def _fail(self) -> None:
+        assert self._process is not None
+        self._process.wait()
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        self.discard()
+        raise OSError(f"{self.path} could not be written; ffmpeg says: {lines[-1] if lines else 'nothing'}")
+
+
+@dataclass(frozen=True)
+class Html:
+    """HTML text for where IPython, whose class this stands for, is not installed."""
+
+    data: str
+
+    def _repr_html_(self) -> str:
+        return self.data
+
+
+def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
+    """Returns the mp4 files of a folder as one piece of HTML that a notebook shows; it prints nothing.
+
+    They are in the order of the numbers in their names. The videos themselves are in the text, so they stay in the
+    notebook when the files are gone. If there is none, the text says so. Outside a notebook the text is in ``.data``.
+
+    Args:
+        folder: where to look, not below it.
+        prefix: only files whose name begins so.
+
+    >>> show_videos("no-such-folder").data
+    '<p>No mp4 file in no-such-folder.</p>'
+    """
+    files = [path for path in Path(folder).glob("*.mp4") if path.name.startswith(prefix) and path.name[0] != "."]
+    files.sort(key=lambda path: by_number(path.name))
+    text = "\n".join(_player(path) for path in files)
+    if not files:
+        named = f" whose name begins with {prefix}" if prefix else ""
+        text = f"<p>No mp4 file{html.escape(named)} in {html.escape(str(folder))}.</p>"
+    try:
+        from IPython.display import HTML
+    except ImportError:
+        return Html(text)
+    return HTML(text)
+
+
+def by_number(name: str) -> list[tuple[int, int, str]]:
+    """Returns a key that sorts the numbers in names by their values.
+
+    >>> sorted(["episode-10.mp4", "episode-9.mp4", "a.mp4"], key=by_number)
+    ['a.mp4', 'episode-9.mp4', 'episode-10.mp4']
+    """
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in re.split(r"(\d+)", name)]
+
+
+def _player(path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    return (
+        f"<figure><video title='{html.escape(path.name)}' autoplay loop muted controls style='height: 400px;'>"
+        f"<source src='data:video/mp4;base64,{data}' type='video/mp4'></video>"
+        f"<figcaption>{html.escape(path.name)}</figcaption></figure>"
+    )

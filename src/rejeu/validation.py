@@ -1,0 +1,144 @@
+"""Checks of what users write, and the docstrings of configurations."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import difflib
+import inspect
+import math
+import textwrap
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Any, TypeVar
+
+C = TypeVar("C")
+
+
+def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
+    """Returns ``value`` as an int; ``1e6`` is accepted.
+
+    Raises:
+        ValueError: if it is not a whole number from ``least`` to ``most``.
+    """
+    good = (
+        isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
+    )
+    if not good or not least <= value <= most:
+        raise ValueError(
+            f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * (most < 2**63 - 1)
+        )
+    return int(value)
+
+
+def whole_exact(value: Any) -> int:
+    """Returns ``value`` if it is an int in [0, 2^128), as the state of a NumPy generator is.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**128:
+        raise ValueError(f"{value!r} must be a whole number from 0 to 2**128 - 1")
+    return value
+
+
+def number(key: str, value: Any, least: float = -math.inf, above: float = -math.inf, most: float = math.inf) -> float:
+    """Returns ``value`` as a finite float within ``[least, most]`` and greater than ``above``.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not (good and least <= value <= most and value > above):
+        bounds = [f"above {above}"] * (above > -math.inf) + [f"at least {least}"] * (least > -math.inf)
+        bounds += [f"at most {most}"] * (most < math.inf)
+        raise ValueError(f"{key}={value!r} must be a finite number" + (", " + " and ".join(bounds) if bounds else ""))
+    return float(value)
+
+
+def nested(key: str, kind: type[C], value: Any) -> C:
+    """Returns a sub-configuration of class ``kind`` from itself or from a mapping of its fields."""
+    if isinstance(value, kind):
+        return value
+    if value is None:
+        return kind()
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{key}={value!r} must be a dict with the keys {', '.join(field_names(kind))}")
+    return build(kind, value, f"{key} of ")
+
+
+def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
+    """Returns ``kind(**given)``.
+
+    Raises:
+        TypeError: for a name that is no field, suggesting the nearest that is.
+    """
+    names = field_names(kind)
+    for key in given:
+        if key not in names:
+            raise TypeError(unknown_name(key, names, f"{context}{getattr(kind, 'name', '') or kind.__name__}"))
+    return kind(**given)
+
+
+ELSEWHERE = {
+    "lr": "the step size is called learning_rate",
+    "hidden_sizes": "the widths of the layers are policy_kwargs=dict(net_arch=[64, 64])",
+    "net_arch": "it is in policy_kwargs: policy_kwargs=dict(net_arch=[64, 64]), or --set policy_kwargs.net_arch=[64,64]",
+    "use_sde": "state-dependent exploration (use_sde) is for PPO and A2C with continuous actions",
+    "features_extractor_class": "networks of your own are given as policy_kwargs=dict(torso=...)",
+    "features_extractor_kwargs": "networks of your own are given as policy_kwargs=dict(torso=...)",
+    "optimizer_class": "the optimizer is Adam; its step size is learning_rate",
+    "optimize_memory_usage": "observations are stored once anyway",
+    "n_envs": "give make_vector(id, n_envs=...) as env, or --envs",
+    "total_timesteps": "it is an argument of learn(), or --steps",
+}
+"""Where to find what goes by another name elsewhere; only asked for names that are unknown."""
+
+
+def unknown_name(key: str, names: Iterable[str], owner: str) -> str:
+    """Returns the sentence for a misspelt name, with the nearest known one."""
+    if key in ELSEWHERE:
+        return f"{owner} has no setting {key!r}; {ELSEWHERE[key]}"
+    near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
+    return f"{owner} has no setting {key!r}; {hint}"
+
+
+def field_names(kind: type) -> list[str]:
+    """Returns the names of a dataclass's fields, in order."""
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+def _definition(kind: type) -> ast.ClassDef:
+    """Returns the source of a class, parsed; parsing a module once is quicker than finding each class's own lines."""
+    for node in _parsed(inspect.getmodule(kind)).body:
+        if isinstance(node, ast.ClassDef) and node.name == kind.__qualname__:
+            return node
+    alone = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    assert isinstance(alone, ast.ClassDef)
+    return alone
+
+
+@cache
+def _parsed(module: Any) -> ast.Module:
+    return ast.parse(inspect.getsource(module))
+
+
+@cache
+def field_docs(kind: type) -> dict[str, str]:
+    """Returns the attribute docstring of each field of a dataclass, its bases' included, each on one line."""
+    docs: dict[str, str] = {}
+    for owner in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(owner):
+            continue
+        body = _definition(owner)
+        for statement, following in zip(body.body, body.body[1:], strict=False):
+            if (
+                isinstance(statement, ast.AnnAssign)
+                and isinstance(statement.target, ast.Name)
+                and isinstance(following, ast.Expr)
+                and isinstance(following.value, ast.Constant)
+                and isinstance(following.value.value, str)
+            ):
+                docs[statement.target.id] = " ".join(following.value.value.split())
+    return {key: docs[key] for key in field_names(kind) if key in docs}

@@ -1,0 +1,118 @@
+"""Ctrl-C and SIGTERM: requests while training, the end of the command everywhere else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rejeu
+from rejeu.agents import interrupt
+from rejeu.agents.interrupt import Interrupt
+from tests.cli.test_cli import TINY
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+SOURCE = Path(interrupt.__file__)
+
+
+def raise_signal(number=signal.SIGTERM):
+    os.kill(os.getpid(), number)
+
+
+def test_an_interrupt_within_another_tells_it():
+    with Interrupt() as outer, Interrupt() as inner:
+        raise_signal()
+        assert (inner.signal, outer.signal) == (signal.SIGTERM, signal.SIGTERM)
+
+
+def test_the_second_signal_acts_at_once():
+    with Interrupt() as outer, Interrupt() as inner:
+        raise_signal()
+        with pytest.raises(KeyboardInterrupt):
+            raise_signal(signal.SIGINT)
+    assert (inner.signal, outer.signal) == (signal.SIGTERM, signal.SIGTERM)
+
+
+def test_handlers_are_put_back():
+    before = signal.getsignal(signal.SIGTERM)
+    with Interrupt(), interrupt.leaving():
+        assert signal.getsignal(signal.SIGTERM) != before
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_swallowed(number, status):
+    script = f"""if True:
+        import gc, importlib.util, os, signal
+        spec = importlib.util.spec_from_file_location("interrupt", {str(SOURCE)!r})
+        interrupt = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(interrupt)
+        with interrupt.leaving("stopped"):
+            gc.callbacks.append(lambda phase, info: os.kill(os.getpid(), signal.{number}))
+            gc.collect()
+            print("swallowed")
+    """
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", "rejeu: stopped\n")
+
+
+@pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_during_imports_is_one_line(number, status, tmp_path):
+    (tmp_path / "jax.py").write_text(f"import os, signal\nos.kill(os.getpid(), signal.{number})\nprint('went on')\n")
+    path = os.pathsep.join([str(tmp_path), str(SOURCE.parents[1])])
+    command = [sys.executable, "-m", "rejeu", "list"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", "rejeu: interrupted\n")
+
+
+def test_importing_the_package_elsewhere_leaves_signals_alone():
+    assert not interrupt.is_command()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_after_training_ends_the_command_with_its_status_and_keeps_the_models(tmp_path):
+    script = """if True:
+        import os, signal, sys
+        import rejeu.reporting.video
+        rejeu.reporting.video.record_video = lambda *arguments: os.kill(os.getpid(), signal.SIGTERM)
+        from rejeu.cli import main
+        sys.exit(main(sys.argv[1:]))
+    """
+    argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1"]
+    argv += ["--out", str(tmp_path / "run"), "--set", *TINY]
+    done = subprocess.run([sys.executable, "-c", script, *argv], capture_output=True, text=True)
+    assert done.returncode == 143
+    assert done.stderr == f"rejeu: interrupted after training; the models are saved in {tmp_path / 'run'}\n"
+    files = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"agent.safetensors", "best.safetensors", "checkpoints", "curve.png", "episodes.csv"} <= files
+
+
+class Still:
+    """Does nothing, and sends a signal at its third action."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def predict(self, obs, state=None, deterministic=True):
+        self.calls += 1
+        if self.calls == 3:
+            raise_signal()
+        return 0, None
+
+
+def test_a_signal_while_filming_leaves_nothing_of_the_file(tmp_path):
+    with pytest.raises(interrupt.Stopped) as stopped:
+        rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
+    assert stopped.value.signal == signal.SIGTERM
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_film_made_while_training_is_completed_after_a_signal(tmp_path):
+    with Interrupt() as training:
+        path = rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
+    assert training.requested
+    assert [*tmp_path.iterdir()] == [path]

@@ -1,0 +1,543 @@
+"""What Stable-Baselines3 shipped wrong and mended later, by its changelog from 0.9 to 2.9, and the test of each here.
+
+Hindsight
+- a full buffer was an IndexError (0.11.0): ``buffers/test_hindsight.py::test_samples_agree_with_a_brute_force_relabeller``
+- ``action_noise`` was ignored with hindsight (0.11.0):
+  ``agents/test_regressions.py::test_action_noise_is_added_with_hindsight_too``
+- ``final`` never drew the final goal (1.6.0):
+  ``buffers/test_hindsight.py::test_every_allowed_goal_is_drawn_and_equally_often``
+- achieved and desired goal were swapped (2.0.0): ``envs/test_goals.py::test_the_reward_receives_achieved_before_desired``,
+  ``buffers/test_hindsight.py::test_samples_agree_with_a_brute_force_relabeller`` by a reward that is not symmetric
+- ``truncate_last_trajectory`` was wrong (2.0.0):
+  ``agents/test_regressions.py::test_an_episode_cut_short_by_saving_is_not_joined_to_the_next``,
+  ``buffers/test_hindsight.py::test_a_restored_buffer_relabels_like_the_original``
+
+Final observations
+- off-policy agents stored the wrong one (0.11.0): ``envs/test_make.py::test_the_successor_of_every_step_is_the_true_one``,
+  ``agents/test_agent.py::test_stored_transitions_are_consecutive_moments_of_one_episode``
+- wrappers left it as it was (0.11.0, 1.4.0, 2.0.0):
+  ``agents/test_regressions.py::test_wrappers_change_final_observations_like_all_others``
+
+Advantages
+- generalised advantages were off by one (0.10.0), explained variance had its arguments swapped (0.11.0), time limits
+  did not bootstrap on-policy (1.4.0): does not apply, there is no on-policy algorithm yet; off-policy the last is
+  ``algorithms/probes/test_off_policy_probes.py::test_the_critic_bootstraps_through_a_time_limit``
+
+Targets
+- the target shared its feature extractor (0.10.0):
+  ``agents/test_regressions.py::test_networks_and_targets_encode_images_each_by_themselves``,
+  ``algorithms/test_every_algorithm.py::test_targets_start_as_copies_and_move_by_themselves``
+- the target's batch statistics stood still (1.6.1): does not apply, CrossQ alone has them and no target:
+  ``algorithms/test_crossq.py::test_there_is_no_target_network_and_no_tau``
+- TD3's delay was off by one (0.11.0):
+  ``algorithms/test_td3.py::test_the_actor_and_all_targets_change_exactly_at_every_policy_delay_th_update``,
+  ``algorithms/test_crossq.py::test_actor_and_temperature_learn_every_policy_delay_th_update_and_the_critics_at_each``
+- DQN's optimizer held the target's parameters (2.4.0):
+  ``agents/test_regressions.py::test_optimizers_hold_the_networks_that_learn_and_no_targets``
+- ``target_update_interval`` changed by loading (2.0.0):
+  ``agents/test_regressions.py::test_settings_are_the_same_after_any_number_of_savings``
+
+Entropy
+- the temperature was not learnt after loading (1.1.0):
+  ``algorithms/test_every_algorithm.py::test_a_loaded_agent_predicts_the_same_bits_and_goes_on_learning_all_its_parts``,
+  ``agents/test_agent.py::test_a_gradient_step_after_loading_still_moves_the_temperature``
+- SBX descended in the temperature instead of its logarithm (2.4.0):
+  ``algorithms/test_sac.py::test_parameters_after_an_update_equal_stable_baselines3``,
+  ``algorithms/test_sac_discrete.py::test_three_updates_equal_numpy``,
+  ``algorithms/test_tqc.py::test_an_update_uses_the_mathematics_above_in_the_documented_order``,
+  ``algorithms/test_crossq.py::test_an_update_uses_the_mathematics_above_in_the_documented_order``
+
+Numbers of environments
+- loading with another number (1.6.1):
+  ``agents/test_regressions.py::test_a_loaded_agent_learns_with_any_number_of_environments``
+- one environment given several times (1.7.0):
+  ``envs/test_make.py::test_one_environment_given_several_times_is_refused``
+- QR-DQN's update interval (2.0.0):
+  ``agents/test_regressions.py::test_targets_move_at_environment_steps_whatever_their_number``,
+  ``algorithms/test_qrdqn.py::test_target_network_moves_at_multiples_of_environment_steps``
+
+Not a number
+- batches of one (1.1.0, 1.6.1, PPO's): ``algorithms/test_every_algorithm.py::test_batches_of_one_transition_are_learnt_from``,
+  ``algorithms/test_every_on_policy.py::test_one_step_at_a_time_is_learnt_from``
+- the checker of environments did not reset them (2.0.0): does not apply, there is none; a reward that is no number ends
+  training: ``agents/test_bad_input.py::test_a_reward_that_is_no_number_ends_training_with_its_place``
+- MaskablePPO's probabilities did not add up to 1 in float32 (2.8.0): does not apply, there is no MaskablePPO;
+  probabilities of 0 are in ``algorithms/test_sac_discrete.py::test_a_certain_policy_has_finite_losses_and_gradients``
+
+Dtypes
+- float64 actions (2.1.0):
+  ``algorithms/test_every_algorithm.py::test_float64_actions_reach_the_environment_as_such_within_their_bounds``,
+  ``algorithms/test_every_algorithm.py::test_an_agent_of_float64_actions_goes_on_after_loading``
+- dtypes of Dict buffers (1.1.0):
+  ``agents/test_regressions.py::test_every_part_of_a_dict_observation_keeps_its_dtype_and_value``
+- rollout buffers forced float32 (2.7.1): ``buffers/test_rollout.py::test_what_goes_into_the_buffer_comes_out``
+
+Files
+- models beyond 2 GB (1.6.0) and buffers beyond 4 GB (0.11.0):
+  ``agents/test_regressions.py::test_a_file_of_more_than_4_gigabytes_comes_back``, marked slow
+- an object that could not be read was replaced by another (1.7.0):
+  ``io/test_no_code_from_files.py::test_no_source_runs_or_looks_up_what_a_file_names``,
+  ``networks/test_networks.py::test_a_saved_torso_must_be_given_again``
+- functions as schedules crashed on other platforms (2.7.0):
+  ``test_schedules.py::test_what_is_no_schedule_is_refused_by_name``,
+  ``test_schedules.py::test_a_schedule_survives_json``
+- ``net_arch=None`` (2.4.0): ``agents/test_regressions.py::test_net_arch_none_is_the_default_before_and_after_saving``
+- prefixes of ``torch.compile`` in parameters' names (2.8.0), the device of a loaded buffer (2.2.1): do not apply, names
+  come from the modules' fields and the buffer is in the host's memory
+
+Memory
+- loading leaked (2.4.0): ``agents/test_regressions.py::test_loading_a_hundred_times_keeps_no_memory``
+- the video recorder kept its frames (2.7.1): ``agents/test_regressions.py::test_a_recording_does_not_keep_its_frames``
+
+Logging
+- evaluations were logged at the wrong step (1.1.0):
+  ``callbacks/test_callbacks.py::test_evaluate_counts_environment_steps_whatever_the_number_of_environments``
+- names cut to the same length collided (1.5.0):
+  ``agents/test_regressions.py::test_long_names_that_begin_alike_are_all_logged``
+- steps per second divided by zero (1.6.1): ``agents/test_regressions.py::test_a_clock_that_stands_still_does_not_end_a_run``
+- ``n_updates`` after an early stop (1.8.0, 2.8.0):
+  ``algorithms/test_ppo.py::test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them``,
+  ``agents/test_regressions.py::test_updates_are_counted_where_a_callback_stops``,
+  ``algorithms/test_every_algorithm.py::test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe``
+
+Buffers
+- ``optimize_memory_usage`` was unsound with time limits (forbidden since 1.6.0):
+  ``buffers/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept``,
+  ``buffers/test_uniform.py::test_a_time_limit_bootstraps_and_a_termination_does_not``,
+  ``networks/test_images.py::test_an_agent_replays_the_stacks_of_gymnasiums_wrapper``
+
+Interface
+- a callback that returned None stopped training (2.2.0): ``agents/test_agent.py::test_only_false_stops_training``
+
+State-dependent exploration
+- on-policy agents with it could not be saved (1.1.0) and drew it too often (2.4.0): does not apply, there is none; what
+  there is, is in ``agents/test_regressions.py::test_every_kind_of_noise_survives_saving``
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import re
+import time
+import tracemalloc
+from pathlib import Path
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import rejeu
+from rejeu import spaces
+from rejeu.agents import AGENTS
+from rejeu.algorithms import config as configs
+from rejeu.buffers.ring import Ring
+from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.envs.auto_reset import DummyVecEnv, VecVideoRecorder
+from rejeu.envs.make import InProcess
+from rejeu.exploration.parameter_space import ParameterNoise
+from rejeu.io import checkpoint
+from rejeu.reporting.logging import Console, CsvFile
+from tests.algorithms.probes.environments import Probe
+from tests.environments import Counter, Reach, Sampled
+from tests.every_agent import KINDS, env_of, shared_functions, small
+from tests.helpers import assert_same_parameters, count_updates, small_sac
+from tests.reporting.test_video import Lamp
+
+NEVER = 10**6
+HERE = Path(__file__).parents[1]
+every_algorithm = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def test_every_test_named_above_exists():
+    named = re.findall(r"``([\w/]+\.py)::(\w+)``", __doc__)
+    assert len(named) > 40
+    for file, test in named:
+        assert f"\ndef {test}(" in (HERE / file).read_text(), f"{file}::{test}"
+
+
+# Hindsight.
+
+
+def test_action_noise_is_added_with_hindsight_too():
+    """A mean of 3 takes every action to its upper bound."""
+    noise = rejeu.NormalActionNoise([3.0], [0.1])
+    agent = small_sac(Reach(), replay_buffer_class=rejeu.HerReplayBuffer, learning_starts=0, action_noise=noise)
+    count_updates(agent)
+    actions = agent.learn(12).replay_buffer.sample(np.random.default_rng(0), (100,)).action
+    np.testing.assert_array_equal(actions, 1.0)
+
+
+class Pilgrim(gym.Env):
+    """Episodes of 10 steps that each have a number of their own; what is achieved is (that number, the time)."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = gym.spaces.Dict(
+        {key: gym.spaces.Box(-np.inf, np.inf, (2,)) for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def __init__(self, first: int) -> None:
+        self.number = first - 1
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.number, self.time = self.number + 1, 0
+        return self.see(), {}
+
+    def step(self, action):
+        self.time += 1
+        return self.see(), 0.0, False, self.time == 10, {}
+
+    def see(self):
+        where = np.float32([self.number, self.time])
+        return {"observation": where, "achieved_goal": where, "desired_goal": np.full(2, -1.0, np.float32)}
+
+    def compute_reward(self, achieved, desired, info):
+        return np.zeros(np.shape(achieved)[:-1], np.float32)
+
+
+def test_an_episode_cut_short_by_saving_is_not_joined_to_the_next(tmp_path):
+    """Saved after 4 steps of its second episode, the buffer goes on in an agent that is within its own episode 100."""
+    settings = {"replay_buffer_class": rejeu.HerReplayBuffer, "learning_starts": NEVER}
+    path = small_sac(Pilgrim(0), **settings).learn(14).save_replay_buffer(tmp_path / "buffer")
+    agent = small_sac(Pilgrim(100), **settings).learn(6)
+    agent.load_replay_buffer(path)
+    agent.learn(13)
+    batch = agent.replay_buffer.sample(np.random.default_rng(0), (2000,))
+    obs, following, goal = (
+        leaf.astype(int)
+        for leaf in (batch.obs["observation"], batch.next_obs["observation"], batch.obs["desired_goal"])
+    )
+    kept = {(0, t) for t in range(10)} | {(1, t) for t in range(4)} | {(101, t) for t in range(10)}
+    assert set(map(tuple, obs.tolist())) == kept | {(102, t) for t in range(3)}
+    np.testing.assert_array_equal(following, obs + np.array([0, 1]))
+    relabelled = goal[:, 0] >= 0
+    assert relabelled.sum() == 1600
+    np.testing.assert_array_equal(goal[relabelled, 0], obs[relabelled, 0])
+    assert (goal[relabelled, 1] > obs[relabelled, 1]).all()
+    assert set(goal[relabelled][obs[relabelled, 0] == 1, 1].tolist()) == {1, 2, 3, 4}
+    np.testing.assert_array_equal(batch.discount, np.float32(0.99))
+
+
+# Final observations.
+
+
+def doubled(lengths):
+    return lambda: gym.wrappers.TransformObservation(Counter(lengths), lambda obs: 2 * obs, Counter.observation_space)
+
+
+def in_process():
+    return InProcess([doubled((3,))(), doubled((2, 4))()], seed=0)
+
+
+def inside(mode):
+    return lambda: SyncVectorEnv([doubled((3,)), doubled((2, 4))], autoreset_mode=mode)
+
+
+def outside(mode):
+    def make():
+        plain = SyncVectorEnv([lambda: Counter((3,)), lambda: Counter((2, 4))], autoreset_mode=mode)
+        return gym.wrappers.vector.TransformObservation(plain, lambda obs: 2 * obs, plain.observation_space)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        in_process,
+        *(inside(mode) for mode in AutoresetMode),
+        outside(AutoresetMode.NEXT_STEP),
+        outside(AutoresetMode.DISABLED),
+    ],
+)
+def test_wrappers_change_final_observations_like_all_others(make):
+    """The wrapper doubles (episode, time, a number drawn once an episode), so all successors are 2 later in time."""
+    agent = small_sac(make(), learning_starts=NEVER).learn(30)
+    batch = agent.replay_buffer.sample(np.random.default_rng(0), (400,))
+    np.testing.assert_array_equal(batch.next_obs - batch.obs, np.tile(np.float32([0.0, 2.0, 0.0]), (400, 1)))
+    assert set(batch.next_obs[:, 1].tolist()) == {2.0, 4.0, 6.0, 8.0}
+    np.testing.assert_array_equal(batch.reward, 50 * batch.obs[:, 0] + batch.obs[:, 1] / 2)
+
+
+# Targets.
+
+PICTURE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
+
+
+def parameter_names(kind, observation_space):
+    """The names of everything in a state, by the part they belong to: ``{"critics": {...}, "target_critics": {...}}``."""
+    module = kind.agent.algorithm
+    config = module.Config(policy_kwargs={"net_arch": [4]})
+    init = module.make(config, observation_space, env_of(kind).action_space).init
+    found = {}
+    for name in checkpoint.names(jax.eval_shape(init, jax.ShapeDtypeStruct((2,), jnp.uint32))):
+        part, _, rest = name.partition(".")
+        found.setdefault(part, set()).add(rest)
+    return found
+
+
+@every_algorithm
+def test_networks_and_targets_encode_images_each_by_themselves(kind):
+    names = parameter_names(kind, PICTURE)
+    parts = {part for part in names if part.removeprefix("target_") in ("actor", "critic", "critics", "network")}
+    assert len(parts) > 1
+    for part in parts:
+        assert names[part] == names[part.removeprefix("target_")]
+        assert any("encoder.images" in name for name in names[part]), part
+
+
+@every_algorithm
+def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
+    names = parameter_names(kind, Probe.observation_space)
+    optimizers = {part for part in names if part.endswith("optimizer")}
+    learning = {part for part in ("actor", "critic", "critics", "network", "log_alpha") if part in names}
+    assert len(optimizers) == len(learning)
+    for part in learning:
+        optimizer = {"log_alpha": "alpha_optimizer", "network": "optimizer"}.get(part, f"{part}_optimizer")
+        moments = {f"{moment}.{name}".rstrip(".") for moment in ("mu", "nu") for name in names[part]}
+        assert names[optimizer] == moments | {"count"}
+
+
+@pytest.mark.parametrize("name", ["SAC", "TQC", "DQN", "QRDQN"])
+def test_settings_are_the_same_after_any_number_of_savings(name, tmp_path):
+    kind = KINDS[name]
+    make = lambda n: InProcess([env_of(kind) for _ in range(n)])  # noqa: E731
+    agent = small(kind, make(3), target_update_interval=12, train_freq=6)
+    path, config = agent.save(tmp_path / "model"), agent.config
+    for n_envs in (3, 1, 8):
+        with shared_functions(kind):
+            loaded = rejeu.load(path, env=make(n_envs))
+        assert loaded.config == config
+        assert loaded.config.target_update_interval == 12
+        path = loaded.save(tmp_path / f"model {n_envs}")
+
+
+# Numbers of environments.
+
+
+@every_algorithm
+def test_a_loaded_agent_learns_with_any_number_of_environments(kind, tmp_path):
+    make = lambda n: InProcess([env_of(kind) for _ in range(n)])  # noqa: E731
+    path = small(kind, make(3), learning_starts=16, train_freq=8).learn(40).save(tmp_path / "model")
+    for n_envs in (1, 8):
+        with shared_functions(kind):
+            loaded = rejeu.load(path, env=make(n_envs), learning_starts=8)
+        assert loaded.n_envs == n_envs
+        loaded.learn(8 + 17)
+        assert (loaded.num_timesteps, loaded.replay_buffer.size(), loaded.n_updates) == (25, 25, 3 + 2)
+
+
+@pytest.mark.parametrize("name", ["DQN", "QRDQN"])
+@pytest.mark.parametrize(("n_envs", "expected"), [(1, [12, 24, 36]), (3, [12, 24, 36]), (8, [16, 24, 40])])
+def test_targets_move_at_environment_steps_whatever_their_number(name, n_envs, expected):
+    """Every 12 steps, or as soon after as there is a gradient step, of which there is one a turn."""
+    kind, moved = KINDS[name], []
+    agent = small(
+        kind,
+        InProcess([env_of(kind) for _ in range(n_envs)]),
+        learning_starts=0,
+        train_freq=n_envs,
+        target_update_interval=12,
+    )
+    biases = [agent.get_parameters()]
+
+    def watch(agent, progress):
+        biases.append(agent.get_parameters())
+        if any((biases[-1][key] != biases[-2][key]).any() for key in biases[-1] if key.startswith("target_")):
+            moved.append(progress.step)
+
+    agent.learn(40, callback=watch)
+    assert moved == expected
+
+
+# Dtypes.
+
+
+def test_every_part_of_a_dict_observation_keeps_its_dtype_and_value():
+    """All numbers are such that a detour through float32 or a narrower integer would change them."""
+    space = gym.spaces.Dict(
+        {
+            "pixels": gym.spaces.Box(0, 255, (2, 2, 1), np.uint8),
+            "small": gym.spaces.Box(-(2**15), 2**15 - 1, (1,), np.int16),
+            "large": gym.spaces.Box(-(2**31), 2**31 - 1, (1,), np.int64),
+            "real": gym.spaces.Box(-1.0, 1.0, (1,), np.float32),
+            "choice": gym.spaces.Discrete(2**24 + 3),
+        }
+    )
+    shown = {
+        "pixels": np.uint8([[[255], [254]], [[1], [0]]]),
+        "small": np.int16([-32767]),
+        "large": np.int64([2**24 + 1]),
+        "real": np.float32([1 / 3]),
+        "choice": np.int64(2**24 + 1),
+    }
+
+    class Exhibition(Sampled):
+        def reset(self, *, seed=None, options=None):
+            super().reset()
+            return shown, {}
+
+        def step(self, action):
+            return shown, *super().step(action)[1:]
+
+    vector = InProcess([Exhibition(space), Exhibition(space)])
+    replay = ReplayBuffer(Ring(20, 2, spaces.leaves(space), spaces.structure(space), (1,), np.float32), 0.9)
+    replay.begin(vector.reset())
+    step = vector.step(np.zeros((2, 1), np.float32))
+    replay.add(np.zeros((2, 1), np.float32), step.reward, step.terminated, step.obs)
+    batch = replay.sample(np.random.default_rng(0), (3,))
+    for obs in (batch.obs, batch.next_obs):
+        kept = {key: obs[key].dtype.name for key in sorted(shown)}
+        assert kept == {"choice": "int32", "large": "int32", "pixels": "uint8", "real": "float32", "small": "int16"}
+        for key, value in shown.items():
+            np.testing.assert_array_equal(obs[key], np.stack([value] * 3), err_msg=key)
+
+
+# Files.
+
+
+@pytest.mark.slow
+def test_a_file_of_more_than_4_gigabytes_comes_back(tmp_path):
+    array = np.zeros(2**32 + 16, np.uint8)
+    array[[0, 2**31, 2**32, -1]] = [1, 2, 3, 4]
+    path = checkpoint.write(tmp_path / "large", "replay", {"obs": array, "tail": np.arange(3.0)}, {})
+    assert path.stat().st_size > 2**32
+    _, arrays = checkpoint.read(path, "replay")
+    path.unlink()
+    assert arrays["obs"].shape == array.shape
+    np.testing.assert_array_equal(arrays["obs"][[0, 1, 2**31, 2**32, -1]], [1, 0, 2, 3, 4])
+    np.testing.assert_array_equal(arrays["tail"], [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_net_arch_none_is_the_default_before_and_after_saving(name):
+    kind = AGENTS[name].algorithm.Config
+    for policy_kwargs in ({"net_arch": None}, {}, None):
+        config = kind(policy_kwargs=policy_kwargs)
+        assert config == kind()
+        assert config.policy_kwargs.critic_widths((7, 5)) == config.policy_kwargs.actor_widths((7, 5)) == (7, 5)
+        saved = json.loads(json.dumps(configs.to_json(config)))
+        assert configs.rebuild(kind, saved, {}) == kind()
+        assert configs.rebuild(kind, saved, {"policy_kwargs": {"net_arch": None}}) == kind()
+
+
+# Memory.
+
+
+def test_loading_a_hundred_times_keeps_no_memory(tmp_path):
+    agent = small_sac(Counter((5,)), learning_starts=NEVER, buffer_size=3000).learn(3000)
+    model, buffer = agent.save(tmp_path / "model"), agent.save_replay_buffer(tmp_path / "buffer")
+
+    def load(times):
+        for _ in range(times):
+            agent.set_parameters(model)
+            agent.load_replay_buffer(buffer)
+
+    load(3)
+    n_arrays = len(jax.live_arrays())
+    tracemalloc.start()
+    try:
+        load(5)
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        load(100)
+        gc.collect()
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert len(jax.live_arrays()) <= n_arrays
+    assert grown < 3 * buffer.stat().st_size
+
+
+def test_a_recording_does_not_keep_its_frames(tmp_path):
+    """Sixty pictures of 480,000 bytes each go to the file one by one."""
+
+    class Large(Lamp):
+        def render(self):
+            return np.full((400, 400, 3), 40 * self.time, np.uint8)
+
+    recorder = VecVideoRecorder(DummyVecEnv([lambda: Large("rgb_array")]), tmp_path, lambda step: step == 0, 60)
+    recorder.reset()
+    recorder.step(np.zeros((1, 1)))
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(50):
+            recorder.step(np.zeros((1, 1)))
+        assert recorder.recording
+        during = tracemalloc.get_traced_memory()[0] - before
+        for _ in range(20):
+            recorder.step(np.zeros((1, 1)))
+        assert not recorder.recording
+        after = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+        recorder.close()
+    assert max(during, after) < 5 * 480_000
+
+
+# Logging.
+
+
+def test_long_names_that_begin_alike_are_all_logged(tmp_path, capsys):
+    metrics = {f"train/{'very_' * 8}long_name_{i}": 0.25 * i for i in (1, 2, 3)}
+    table = CsvFile(tmp_path / "metrics.csv")
+    table.write(7, metrics)
+    table.close()
+    header, row = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert header.split(",") == ["step", *metrics]
+    assert row.split(",") == ["7", "0.25", "0.5", "0.75"]
+    Console().write(7, metrics)
+    printed = capsys.readouterr().out
+    assert [line.split()[-1] for line in printed.splitlines() if "very" in line] == ["0.25", "0.5", "0.75"]
+
+
+def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
+    agent = small_sac(Counter((5,)), learning_starts=NEVER)
+    now = time.perf_counter()
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    agent.learn(12)
+    assert agent.num_timesteps == 12
+    assert len(agent.history) == 2
+
+
+def test_updates_are_counted_where_a_callback_stops():
+    """After 8 steps without updates there is one a step, until the 13th says that it is enough."""
+    agent = small_sac(Counter((5,)))
+    calls = count_updates(agent)
+    agent.learn(40, callback=lambda agent, progress: progress.step < 13)
+    assert agent.n_updates == sum(calls) == 5
+    assert agent.statistics()["train/n_updates"] == 5
+    agent.learn(4, reset_num_timesteps=False)
+    assert agent.n_updates == sum(calls) == 9
+
+
+# Exploration.
+
+NOISES = {
+    "normal": rejeu.NormalActionNoise([0.1], [0.3]),
+    "Ornstein-Uhlenbeck": rejeu.OrnsteinUhlenbeckActionNoise([0.0], [0.3], theta=0.2, repulsive=1e-3),
+    "parameters": ParameterNoise(),
+}
+
+
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+def test_every_kind_of_noise_survives_saving(noise, tmp_path):
+    """Loaded, it is the same noise: two agents that go on from the same file take the same noisy actions."""
+    kind, path = KINDS["DDPG"], tmp_path / "model"
+    agent = small(kind, env_of(kind), action_noise=noise, learning_starts=4).learn(8)
+    agent.save(path)
+    runs = []
+    for _ in range(2):
+        with shared_functions(kind):
+            loaded = rejeu.load(path, env=env_of(kind), learning_starts=0)
+        assert_same_parameters(agent, loaded)
+        assert loaded.config.action_noise == noise
+        runs.append(loaded.learn(10))
+    actions = [run.replay_buffer.arrays()["action"] for run in runs]
+    np.testing.assert_array_equal(*actions)
+    assert len(np.unique(actions[0])) > 5

@@ -1,0 +1,81 @@
+"""Every off-policy algorithm solves the probe environments on each kind of action that it takes.
+
+SAC on continuous actions does so in ``test_sac_probes``.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.algorithms.probes.environments import ByAction, BySight, BySightAndAction, Constant, Endless, Later
+from tests.every_agent import KINDS, env_of, small
+
+GAMMA = 0.5
+NAMES = [name for name in KINDS if name != "SAC"]
+every_algorithm = pytest.mark.parametrize("name", NAMES)
+
+
+def solve(name, probe):
+    kind = KINDS[name]
+    return small(kind, env_of(kind, probe()), gamma=GAMMA).learn(700)
+
+
+def tolerances(name):
+    """Of values and of actions. CrossQ's critics see every batch normalised by itself, and are never as exact."""
+    return (0.15, 0.25) if name == "CrossQ" else (0.05, 0.12)
+
+
+def best_actions(agent, sights):
+    """What the agent does without exploring, in the probes' terms: numbers from 0 to 2, ``(n,)``."""
+    action, _ = agent.predict(np.float32(sights)[:, None], deterministic=True)
+    return action / 2.0 if action.ndim == 1 else action[:, 0]
+
+
+def values(agent, sights):
+    """What the critics say, on average, of those actions, which are what is learnt best; ``(n,)``."""
+    obs, action, state = jnp.array(sights, jnp.float32)[:, None], best_actions(agent, sights), agent.state
+    if hasattr(state, "critics"):
+        critics = state.critics
+    else:
+        only = state.network if hasattr(state, "network") else state.critic
+        critics = jax.tree.map(lambda leaf: leaf[None], only)
+    if action.dtype == np.float64:  # of Discrete actions 1, 2 and 3, which stand for 0.5, 1 and 1.5
+        of_each = np.mean(jax.vmap(lambda critic: critic(obs))(critics), axis=0)
+        return of_each[np.arange(len(sights)), (2.0 * action).astype(int) - 1]
+    inside = jnp.array(action - 1.0)[:, None]  # bounds 0 and 2 to -1 and 1
+    return np.mean(jax.vmap(lambda critic: critic(obs, inside))(critics), axis=(0, 2))
+
+
+@every_algorithm
+def test_the_critic_learns_a_constant(name):
+    assert values(solve(name, Constant), [0.0]) == pytest.approx([1.0], abs=tolerances(name)[0])
+
+
+@every_algorithm
+def test_the_critic_bootstraps_through_a_time_limit(name):
+    expected = [1.0 / (1.0 - GAMMA)]
+    assert values(solve(name, Endless), [0.0]) == pytest.approx(expected, abs=2 * tolerances(name)[0])
+
+
+@every_algorithm
+def test_the_critic_uses_the_observation(name):
+    assert values(solve(name, BySight), [-1.0, 1.0]) == pytest.approx([-1.0, 1.0], abs=tolerances(name)[0])
+
+
+@every_algorithm
+def test_the_critic_discounts_what_comes_later(name):
+    assert values(solve(name, Later), [0.0, 1.0]) == pytest.approx([GAMMA, 1.0], abs=tolerances(name)[0])
+
+
+@every_algorithm
+def test_the_best_action_is_found(name):
+    assert best_actions(solve(name, ByAction), [0.0]) == pytest.approx([1.5], abs=tolerances(name)[1])
+
+
+@every_algorithm
+def test_the_best_action_depends_on_the_observation(name):
+    action = best_actions(solve(name, BySightAndAction), [-1.0, 1.0])
+    assert action == pytest.approx([0.5, 1.5], abs=tolerances(name)[1])

@@ -1,0 +1,176 @@
+"""Hyper-parameters: what may be written, what is kept, and how mistakes are named."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+
+import pytest
+
+import rejeu
+from rejeu import validation
+from rejeu.algorithms import config as configs
+from rejeu.algorithms.sac import Config
+from rejeu.buffers.hindsight import HindsightConfig
+from rejeu.schedules import Linear
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("lr", "the step size is called learning_rate"),
+        ("use_sde", r"is for PPO and A2C"),
+        ("features_extractor_class", r"policy_kwargs=dict\(torso"),
+    ],
+)
+def test_a_setting_of_another_name_elsewhere_is_explained(name, hint):
+    with pytest.raises(TypeError, match=f"SAC has no setting '{name}'; .*{hint}"):
+        rejeu.SAC("MlpPolicy", "Pendulum-v1", **{name: 1})
+
+
+def test_the_defaults_are_those_of_stable_baselines3():
+    """The signature of ``stable_baselines3.SAC.__init__`` in version 2.9.2, where we have the parameter."""
+    theirs = {
+        "learning_rate": 3e-4,
+        "buffer_size": 1_000_000,
+        "learning_starts": 100,
+        "batch_size": 256,
+        "tau": 0.005,
+        "gamma": 0.99,
+        "train_freq": 1,
+        "gradient_steps": 1,
+        "action_noise": None,
+        "ent_coef": "auto",
+        "target_update_interval": 1,
+        "target_entropy": "auto",
+        "n_steps": 1,
+    }
+    ours = Config()
+    assert {key: getattr(ours, key) for key in theirs} == theirs
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"learning_rate": "lin_3e-4", "train_freq": (2, "episode"), "gradient_steps": -1},
+        {"learning_rate": rejeu.Exponential(1e-3, 1e-4, 0.5), "ent_coef": 0.2, "target_entropy": -3},
+        {"replay_buffer_class": rejeu.HerReplayBuffer, "replay_buffer_kwargs": {"n_sampled_goal": 2}},
+        {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [9, 9]}, "activation_fn": "tanh", "layer_norm": True}},
+        {"action_noise": rejeu.OrnsteinUhlenbeckActionNoise([0.0, 0.0], [0.1, 0.2], theta=0.3)},
+        {"priorities": {"alpha": 0.5, "beta": Linear(0.1, 1.0)}, "n_steps": 3},
+    ],
+)
+def test_a_config_survives_json(settings):
+    config = Config(**settings)
+    text = json.dumps(configs.to_json(config), allow_nan=False)
+    again = validation.build(Config, json.loads(text))
+    assert again == config
+    assert hash(again) == hash(config)
+
+
+def test_a_config_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().gamma = 0.5
+
+
+def test_numbers_that_are_whole_may_be_written_as_floats():
+    config = Config(buffer_size=1e6, learning_starts=1e2, train_freq=4.0)
+    assert (config.buffer_size, config.learning_starts, config.train_freq) == (1_000_000, 100, 4)
+    assert all(type(n) is int for n in (config.buffer_size, config.learning_starts, config.train_freq))
+
+
+def test_a_frequency_in_steps_is_a_number():
+    assert Config(train_freq=(4, "step")).train_freq == 4
+    assert Config(train_freq=[2, "episode"]).train_freq == (2, "episode")
+
+
+@pytest.mark.parametrize("given", [rejeu.HerReplayBuffer, "HerReplayBuffer"])
+def test_a_replay_buffer_is_given_by_class_or_name(given):
+    assert Config(replay_buffer_class=given).hindsight == HindsightConfig()
+
+
+@pytest.mark.parametrize("given", [rejeu.ReplayBuffer, "ReplayBuffer", None])
+def test_a_plain_replay_buffer_has_no_hindsight(given):
+    assert Config(replay_buffer_class=given).hindsight is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"batch_size": 0}, "batch_size=0 must be a whole number of at least 1"),
+        ({"batch_size": 2.5}, "batch_size=2.5 must be a whole number"),
+        ({"batch_size": True}, "batch_size=True must be a whole number"),
+        ({"batch_size": "64"}, "batch_size='64' must be a whole number"),
+        ({"buffer_size": float("inf")}, "buffer_size=inf must be a whole number"),
+        ({"learning_starts": -1}, "learning_starts=-1 must be a whole number of at least 0"),
+        ({"tau": 0}, "tau=0 must be a finite number, above 0 and at most 1"),
+        ({"tau": 1.1}, "tau=1.1 must be a finite number"),
+        ({"gamma": float("nan")}, "gamma=nan must be a finite number, at least 0 and at most 1"),
+        ({"gamma": -0.1}, "gamma=-0.1 must be"),
+        ({"train_freq": 0}, "train_freq=0 must be a whole number of at least 1"),
+        ({"train_freq": (1, "epoch")}, r"train_freq=\(1, 'epoch'\) must be .* \(n, 'episode'\)"),
+        ({"gradient_steps": 0}, "gradient_steps=0 would never learn"),
+        ({"gradient_steps": -2}, "gradient_steps=-2 must be a whole number of at least -1"),
+        ({"n_critics": 0}, "n_critics=0 must be a whole number of at least 1"),
+        ({"target_update_interval": 0}, "target_update_interval=0 must be"),
+        ({"target_entropy": "high"}, "target_entropy='high' must be a finite number"),
+        ({"n_steps": 0}, "n_steps=0 must be a whole number of at least 1"),
+        (
+            {"batch_size": 256, "buffer_size": 100},
+            "batch_size=256 must not exceed buffer_size=100; try buffer_size=10000 or batch_size=100",
+        ),
+        (
+            {"replay_buffer_class": "HerBuffer"},
+            "replay_buffer_class='HerBuffer' is unknown; choose one of ReplayBuffer",
+        ),
+        (
+            {"replay_buffer_kwargs": {"n_sampled_goal": 4}},
+            "has no meaning for ReplayBuffer; did you forget replay_buffer_class=HerReplayBuffer",
+        ),
+    ],
+)
+def test_an_impossible_value_is_named_with_what_is_possible(settings, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        Config(**settings)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"policy_kwargs": {"net_arc": [8]}}, "policy_kwargs of PolicyConfig has no setting 'net_arc'; .*net_arch"),
+        ({"policy_kwargs": [8]}, "policy_kwargs=.* must be a dict with the keys net_arch"),
+        (
+            {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": {"n_sampled_goals": 4}},
+            "no setting 'n_sampled_goals'; did you mean n_sampled_goal",
+        ),
+        ({"learning_rate": lambda progress: 1e-3}, "learning_rate=.*a function cannot be saved with the model"),
+        ({"action_noise": [0.1]}, r"action_noise=\[0.1\] must be None, a standard deviation .* NormalActionNoise"),
+    ],
+)
+def test_a_nested_mistake_is_named_with_its_place(settings, words):
+    with pytest.raises(TypeError, match=words):
+        Config(**settings)
+
+
+def test_an_unknown_setting_gets_the_nearest_known_one():
+    with pytest.raises(TypeError, match="SAC has no setting 'learning_rat'; did you mean learning_rate"):
+        validation.build(Config, {"learning_rat": 1.0})
+
+
+def test_a_setting_unlike_any_gets_the_list():
+    with pytest.raises(TypeError, match="SAC has no setting 'qqq'; known: learning_rate, buffer_size"):
+        validation.build(Config, {"qqq": 1.0})
+
+
+def test_every_setting_is_documented_and_shown_by_help():
+    docs = validation.field_docs(Config)
+    assert list(docs) == validation.field_names(Config)
+    assert all(text[0].isupper() or text.startswith("``") for text in docs.values())
+    for name, text in docs.items():
+        assert f"{name}: {text}" in rejeu.SAC.__doc__
+    parameters = inspect.signature(rejeu.SAC).parameters
+    assert set(docs) < set(parameters)
+    assert parameters["gamma"].default == 0.99

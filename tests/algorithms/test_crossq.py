@@ -1,0 +1,310 @@
+"""CrossQ's losses against float64 NumPy, and when which network learns and which statistics move."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.algorithms import crossq
+from rejeu.core import TD_ERROR, Clock, Transition
+from tests.algorithms.test_tqc import Halfway
+from tests.networks.test_batch_renorm import NumpyRenorm, numpy_torso
+
+OBS_DIM, ACTION_DIM, BATCH, N_CRITICS = 3, 2, 6, 2
+OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
+ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+SMALL = {"learning_rate": 1e-2, "policy_kwargs": {"net_arch": [5, 4]}}
+
+
+def make(**settings):
+    algorithm = crossq.make(crossq.Config(**{**SMALL, **settings}), OBS_SPACE, ACTION_SPACE)
+    return jax.jit(algorithm.update), jax.jit(algorithm.init)(jax.random.PRNGKey(1))
+
+
+critics_loss, joint_values, actor_loss = (
+    jax.jit(crossq.critics_loss),
+    jax.jit(crossq.joint_values),
+    jax.jit(crossq.actor_loss),
+)
+
+
+def random_batch(seed=0):
+    rng = np.random.default_rng(seed)
+    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
+    return Transition(
+        f32(BATCH, OBS_DIM), np.tanh(f32(BATCH, ACTION_DIM)), f32(BATCH), 1 + f32(BATCH, OBS_DIM), discount
+    )
+
+
+# An independent CrossQ in float64.
+
+
+def numpy_output(network, x, method):
+    """Of one network for inputs ``(batch, n)``; and its renormalisations, which training has moved."""
+    norms = [NumpyRenorm(norm) for norm in network.torso.norms]
+    hidden = numpy_torso(network.torso, norms, x, method)
+    return hidden @ np.float64(network.head.weight) + np.float64(network.head.bias), norms
+
+
+def one_of(critics, index):
+    return jax.tree.map(lambda leaf: leaf[index], critics)
+
+
+def numpy_action(outputs, key):
+    """Action and log-density of mean + std * noise squashed by tanh: Gaussian minus log|da/du| with da/du = 1 - a^2."""
+    noise = np.float64(jax.random.normal(key, (BATCH, ACTION_DIM), jnp.float32))
+    mean, log_std = np.split(outputs, 2, axis=1)
+    action = np.tanh(mean + np.exp(log_std) * noise)
+    gaussian = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
+    return action, (gaussian - np.log(1.0 - action**2)).sum(axis=1)
+
+
+def numpy_joint_values(critics, batch, next_action):
+    """One pass of 2 * batch rows through each critic: ``(n_critics, 2 * batch)``."""
+    now = np.concatenate([batch.obs, batch.action], axis=1)
+    then = np.concatenate([batch.next_obs, next_action], axis=1)
+    rows = np.concatenate([now, then], axis=0)
+    return np.stack([numpy_output(one_of(critics, i), rows, "train")[0][:, 0] for i in range(N_CRITICS)])
+
+
+def numpy_critics_loss(critics, batch, next_action, cost):
+    values = numpy_joint_values(critics, batch, next_action)
+    now, then = values[:, :BATCH], values[:, BATCH:]
+    target = batch.reward + batch.discount * (then.min(axis=0) - cost)
+    return sum(0.5 * np.mean((value - target) ** 2) for value in now), now, target
+
+
+def given_next(seed=5):
+    rng = np.random.default_rng(seed)
+    return np.tanh(rng.normal(size=(BATCH, ACTION_DIM))).astype(np.float32), rng.normal(size=BATCH).astype(np.float32)
+
+
+@pytest.mark.usefixtures("strict_dtypes")
+def test_critics_loss_equals_numpy():
+    _, state = make()
+    batch, (next_action, cost) = random_batch(), given_next()
+    loss, (values, target, _) = critics_loss(state.critics, batch, next_action, cost)
+    expected, expected_values, expected_target = numpy_critics_loss(state.critics, batch, next_action, cost)
+    np.testing.assert_allclose(values, expected_values, atol=1e-4)
+    np.testing.assert_allclose(target, expected_target, atol=1e-4)
+    assert float(loss) == pytest.approx(expected, abs=1e-4)
+
+
+def test_importance_weights_multiply_the_squared_errors():
+    _, state = make()
+    batch, (next_action, cost) = random_batch(), given_next()
+    weight = np.linspace(0.1, 1.0, BATCH, dtype=np.float32)
+    loss, _ = critics_loss(state.critics, batch._replace(weight=weight), next_action, cost)
+    _, values, target = numpy_critics_loss(state.critics, batch, next_action, cost)
+    assert float(loss) == pytest.approx(sum(0.5 * np.mean(weight * (v - target) ** 2) for v in values), abs=1e-4)
+
+
+def test_both_halves_share_their_statistics():
+    """After one pass the running mean of the input is a hundredth of the mean over both halves."""
+    _, state = make()
+    batch, (next_action, _) = random_batch(), given_next()
+    values, _, trained = joint_values(state.critics, batch, next_action)
+    rows = np.concatenate([np.hstack([batch.obs, batch.action]), np.hstack([batch.next_obs, next_action])])
+    for critic in range(N_CRITICS):
+        np.testing.assert_allclose(trained.torso.norms[0].mean[critic], 0.01 * rows.mean(axis=0), atol=1e-6)
+    other, _, _ = joint_values(state.critics, batch._replace(next_obs=batch.next_obs + 3), next_action)
+    assert (np.abs(values - other) > 1e-3).any(), "the values of (s, a) do not depend on the s' beside them"
+
+
+def test_the_critics_gradient_equals_finite_differences_with_the_target_held():
+    """Through the batch statistics of both halves, but not through the target, in the weights that reach them all."""
+    _, state = make()
+    batch, (next_action, cost) = random_batch(), given_next()
+    differentiate = jax.jit(jax.grad(crossq.critics_loss, has_aux=True))
+    gradient, (_, target, _) = differentiate(state.critics, batch, next_action, cost)
+    critic = jax.tree.map(np.float64, one_of(state.critics, 0))
+    weight = critic.torso.layers[0].weight
+
+    def loss():
+        rows = np.concatenate([np.hstack([batch.obs, batch.action]), np.hstack([batch.next_obs, next_action])])
+        values = numpy_output(critic, rows, "train")[0][:BATCH, 0]
+        return 0.5 * np.mean((values - np.float64(target)) ** 2)
+
+    expected = np.zeros_like(weight)
+    for index in np.ndindex(weight.shape):
+        kept = weight[index]
+        ends = []
+        for step in (1e-6, -1e-6):
+            weight[index] = kept + step
+            ends.append(loss())
+        weight[index] = kept
+        expected[index] = (ends[0] - ends[1]) / 2e-6
+    np.testing.assert_allclose(gradient.torso.layers[0].weight[0], expected, atol=1e-4)
+
+
+@pytest.mark.usefixtures("strict_dtypes")
+def test_the_actor_goes_by_its_batch_and_the_critics_by_their_running_statistics():
+    update, state = make(policy_delay=3)
+    for seed in range(3):
+        with jax.numpy_dtype_promotion("standard"):
+            state, _ = update(state, random_batch(seed), CLOCK)
+    batch, key = random_batch(9), jax.random.PRNGKey(7)
+    loss, (log_prob, trained) = actor_loss(state.actor, state.critics, jnp.float32(0.3), batch.obs, key)
+    outputs, norms = numpy_output(state.actor, batch.obs, "train")
+    action, expected = numpy_action(outputs, key)
+    rows = np.hstack([batch.obs, action])
+    values = np.stack([numpy_output(one_of(state.critics, i), rows, "infer")[0][:, 0] for i in range(N_CRITICS)])
+    np.testing.assert_allclose(log_prob, expected, atol=1e-4)
+    assert float(loss) == pytest.approx(np.mean(0.3 * expected - values.min(axis=0)), abs=1e-4)
+    for given, wanted in zip(trained.torso.norms, norms, strict=True):
+        np.testing.assert_allclose(given.mean, wanted.mean, atol=1e-6)
+
+
+def test_an_update_uses_the_mathematics_above_in_the_documented_order():
+    """Metrics of the first update from the keys it derives; with policy_delay=1 the actor follows the critics' step."""
+    update, state = make(policy_delay=1, ent_coef="auto_0.3")
+    batch = random_batch()
+    target_key, actor_key = jax.random.split(jax.random.fold_in(state.key, 0))
+    after, metrics = update(state, batch, CLOCK)
+    next_action, next_log_prob = numpy_action(numpy_output(state.actor, batch.next_obs, "infer")[0], target_key)
+    loss, values, target = numpy_critics_loss(state.critics, batch, next_action, 0.3 * next_log_prob)
+    assert float(metrics["critic_loss"]) == pytest.approx(loss, abs=1e-4)
+    assert float(metrics["q_value"]) == pytest.approx(values.mean(), abs=1e-4)
+    np.testing.assert_allclose(metrics[TD_ERROR], np.abs(values - target).mean(axis=0), atol=1e-4)
+    action, log_prob = numpy_action(numpy_output(state.actor, batch.obs, "train")[0], actor_key)
+    rows = np.hstack([batch.obs, action])
+    judged = [numpy_output(one_of(after.critics, i), rows, "infer")[0][:, 0] for i in range(N_CRITICS)]
+    assert float(metrics["actor_loss"]) == pytest.approx(np.mean(0.3 * log_prob - np.min(judged, axis=0)), abs=1e-4)
+    assert float(metrics["entropy"]) == pytest.approx(-log_prob.mean(), abs=1e-4)
+
+
+def test_actor_and_temperature_learn_every_policy_delay_th_update_and_the_critics_at_each():
+    update, state = make(policy_delay=3)
+    moved = {"actor": [], "log_alpha": [], "critics": []}
+    for seed in range(6):
+        before, (state, _) = state, update(state, random_batch(seed), CLOCK)
+        for name, parts in moved.items():
+            old, new = getattr(before, name), getattr(state, name)
+            weight = (lambda part: part) if name == "log_alpha" else (lambda part: part.head.weight)
+            parts.append(bool((weight(old) != weight(new)).any()))
+    assert moved["critics"] == [True] * 6
+    assert moved["actor"] == moved["log_alpha"] == [False, False, True, False, False, True]
+    assert int(state.n_updates) == 6
+
+
+def test_running_statistics_move_only_with_the_loss_of_their_own_network():
+    """Once per update for the critics and once per actor step for the actor, whoever else passes through them."""
+    update, state = make(policy_delay=3)
+    for seed in range(7):
+        state, _ = update(state, random_batch(seed), CLOCK)
+    for norm in state.critics.torso.norms:
+        np.testing.assert_array_equal(norm.n_batches, [7.0] * N_CRITICS)
+    for norm in state.actor.torso.norms:
+        assert float(norm.n_batches) == 2.0
+
+
+def test_running_statistics_are_those_of_the_batches_seen_and_not_the_optimizers():
+    """From 0, one batch moves the mean of the input to a hundredth of the batch's, whatever the learning rate."""
+    update, state = make(policy_delay=1, ent_coef="auto_0.3")
+    batch = random_batch()
+    after, _ = update(state, batch, CLOCK)
+    np.testing.assert_allclose(after.actor.torso.norms[0].mean, 0.01 * batch.obs.mean(axis=0), atol=1e-6)
+
+
+def test_a_skipped_actor_step_is_a_branch_that_is_not_taken():
+    """All products of the actor's loss stand inside a cond, so that a scan does not compute them when they are not due."""
+    algorithm = crossq.make(crossq.Config(**SMALL), OBS_SPACE, ACTION_SPACE)
+    state = jax.eval_shape(algorithm.init, jax.random.PRNGKey(0))
+    jaxpr = jax.make_jaxpr(algorithm.update)(state, random_batch(), CLOCK).jaxpr
+    conds = [equation for equation in jaxpr.eqns if equation.primitive.name == "cond"]
+    products = [[str(branch).count("dot_general") for branch in cond.params["branches"]] for cond in conds]
+    assert len(products) == 1
+    assert min(products[0]) == 0
+    # forward and backward through the actor (2 layers and a head) and the critics
+    assert max(products[0]) >= 2 * (3 + 3)
+
+
+def test_there_is_no_target_network_and_no_tau():
+    names = [field.name for field in dataclasses.fields(crossq.State)]
+    assert not [name for name in names if "target" in name]
+    assert "tau" not in [field.name for field in dataclasses.fields(crossq.Config)]
+    with pytest.raises(TypeError, match="CrossQ has no setting 'tau'"):
+        rejeu.CrossQ("MlpPolicy", "Pendulum-v1", tau=0.01)
+
+
+def test_a_policy_acts_on_each_observation_by_itself():
+    _, state = make()
+    algorithm = crossq.make(crossq.Config(**SMALL), OBS_SPACE, ACTION_SPACE)
+    obs = random_batch().obs
+    np.testing.assert_allclose(
+        algorithm.exploit(state.actor, obs)[:1], algorithm.exploit(state.actor, obs[:1]), atol=1e-6
+    )
+
+
+def test_the_defaults_are_those_of_stable_baselines3_contrib():
+    config = crossq.Config()
+    shown = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    expected = {"learning_rate": 1e-3, "policy_delay": 3, "renorm_warmup_steps": 100_000, "n_critics": 2}
+    expected |= {"gamma": 0.99, "batch_size": 256, "ent_coef": "auto", "learning_starts": 100}
+    assert {key: shown[key] for key in expected} == expected
+    state = jax.eval_shape(crossq.make(config, OBS_SPACE, ACTION_SPACE).init, jax.random.PRNGKey(0))
+    assert [layer.weight.shape for layer in state.critics.torso.layers] == [(2, 5, 1024), (2, 1024, 1024)]
+    assert [layer.weight.shape for layer in state.actor.torso.layers] == [(3, 256), (256, 256)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"policy_delay": 0}, "policy_delay=0 must be a whole number of at least 1"),
+        ({"renorm_warmup_steps": -1}, "renorm_warmup_steps=-1 must be"),
+        ({"policy_kwargs": {"layer_norm": True}}, "take net_arch and activation_fn, not layer_norm"),
+        ({"ent_coef": 0}, "ent_coef=0 must be"),
+    ],
+)
+def test_an_impossible_setting_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        crossq.Config(**settings)
+
+
+def test_discrete_actions_are_refused():
+    with pytest.raises(ValueError, match="CrossQ needs a Box action space"):
+        crossq.make(crossq.Config(), OBS_SPACE, gym.spaces.Discrete(2))
+
+
+def test_it_finds_the_best_action_of_a_probe_and_its_values_and_a_file_keeps_them(tmp_path):
+    """At the end the best action is 1/2 and worth 1; a step earlier everything is worth gamma times that."""
+    agent = rejeu.CrossQ(
+        "MlpPolicy",
+        Halfway(),
+        seed=0,
+        learning_rate=rejeu.Linear(1e-2, 0.0),
+        learning_starts=100,
+        batch_size=64,
+        policy_delay=2,
+        gamma=0.8,
+        ent_coef=0.001,
+        policy_kwargs={"net_arch": [32, 32]},
+    ).learn(2_000)
+    obs, best = np.array([[0.0], [1.0]], np.float32), jnp.array([[0.0], [0.5]])
+    action, _ = agent.predict(obs, deterministic=True)
+    assert abs(float(action[1, 0]) - 0.5) < 0.15
+    values = jax.vmap(lambda critic: critic(obs, best)[:, 0])(agent.state.critics)
+    np.testing.assert_allclose(np.mean(values, axis=0), [0.8, 1.0], atol=0.15)
+
+    loaded = rejeu.load(agent.save(tmp_path / "agent"))
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], action)
+    for norm, kept in zip(agent.state.actor.torso.norms, loaded.state.actor.torso.norms, strict=True):
+        assert float(norm.n_batches) == 950
+        jax.tree.map(np.testing.assert_array_equal, norm, kept)
+
+
+@pytest.mark.slow
+def test_it_learns_pendulum_in_5_000_steps():
+    """A random policy gets about -1,200; swinging up and holding about -150."""
+    agent = rejeu.CrossQ(
+        "MlpPolicy", "Pendulum-v1", seed=0, batch_size=64, policy_delay=2, policy_kwargs={"net_arch": [64, 64]}
+    ).learn(5_000)
+    assert agent.evaluate(20, seed=1).mean_return > -250

@@ -1,0 +1,121 @@
+"""Which hidden layers networks have where none are asked for: on numbers, on images and in files."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import jax
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.algorithms import config as configs, crossq, ppo
+from rejeu.algorithms.actor_critic import ActorCritic
+from rejeu.callbacks import Checkpoint
+from rejeu.io import checkpoint
+from rejeu.spaces import leaves
+from tests.environments import Sampled
+
+IMAGE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
+VECTOR = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+STACK = gym.spaces.Box(0, 255, (2, 8, 8, 1), np.uint8)
+DICT = gym.spaces.Dict(image=IMAGE)
+TINY = gym.spaces.Box(0, 255, (4, 4, 1), np.uint8)
+BOX, DISCRETE = gym.spaces.Box(-1.0, 1.0, (1,), np.float32), gym.spaces.Discrete(2)
+DISCRETE_ONLY = ("DQN", "QRDQN", "MaskablePPO")
+
+
+def networks_of(name, space, **settings):
+    """Returns the networks that an algorithm builds for observations of a space, of shapes in place of arrays."""
+    module = rejeu.AGENTS[name].algorithm
+    action_space = DISCRETE if name in ("DQN", "QRDQN", "MaskablePPO") else BOX
+    state = jax.eval_shape(module.make(module.Config(**settings), space, action_space).init, jax.random.PRNGKey(0))
+    if name in ("SAC", "TQC", "TD3"):
+        return [state.actor, state.critics]
+    if name == "DDPG":
+        return [state.actor, state.critic]
+    return [{"QRDQN": lambda n: n.outputs, "RecurrentPPO": lambda n: n.readers}.get(name, lambda n: n)(state.network)]
+
+
+def widths_of(network):
+    torsos = [network.torso] if not isinstance(network, ActorCritic) else [network.torso, network.value_torso]
+    widths = [[layer.weight.shape[-1] for layer in getattr(torso, "last", torso).layers] for torso in torsos]
+    assert all(one == widths[0] for one in widths)
+    return widths[0]
+
+
+# Stable-Baselines3 2.9.2 and sb3-contrib, policies.py of each: net_arch is None with a NatureCNN, and with other encoders.
+SB3 = {
+    **dict.fromkeys(("DQN", "QRDQN", "PPO", "A2C", "RecurrentPPO", "MaskablePPO"), ([], [64, 64])),
+    **dict.fromkeys(("TD3", "DDPG"), ([256, 256], [400, 300])),
+    **dict.fromkeys(("SAC", "TQC"), ([256, 256], [256, 256])),
+}
+
+
+@pytest.mark.parametrize("name", list(SB3))
+def test_default_widths_are_those_of_stable_baselines3(name):
+    for space, expected in zip((IMAGE, VECTOR), SB3[name], strict=True):
+        assert [widths_of(network) for network in networks_of(name, space)] == [expected] * len(
+            networks_of(name, space)
+        )
+
+
+@pytest.mark.parametrize(("space", "expected"), [(STACK, []), (DICT, [64, 64]), (TINY, [64, 64])])
+def test_a_stack_of_images_is_an_image_and_a_dict_or_an_image_too_small_to_convolve_is_not(space, expected):
+    assert widths_of(*networks_of("DQN", space)) == expected
+
+
+@pytest.mark.parametrize("shape", [{"net_arch": [5]}, {"pi": [7], "qf": [5]}, {"critic_layers": [5]}])
+def test_widths_that_are_asked_for_are_built_on_images_too(shape):
+    assert widths_of(*networks_of("DQN", IMAGE, policy_kwargs=shape)) == [5]
+
+
+def test_a_network_without_hidden_layers_learns():
+    agent = rejeu.PPO("CnnPolicy", Sampled(IMAGE, DISCRETE), n_steps=10, batch_size=10, n_epochs=1, seed=0)
+    before = agent.get_parameters()
+    agent.learn(10)
+    after = agent.get_parameters()
+    assert all((before[key] != after[key]).any() for key in before if key.startswith("network."))
+
+
+# Files say the widths. Those written before left them to the default, which was that of numbers for images too.
+
+
+def as_written_before(path, kind):
+    """Rewrites a file as it was before it said the widths of hidden layers."""
+    header, arrays = checkpoint.read(path, kind)
+    assert header["config"]["policy_kwargs"]["net_arch"] is not None
+    header["config"]["policy_kwargs"]["net_arch"] = None
+    checkpoint.write(path, kind, arrays, {key: header[key] for key in header if key not in checkpoint.RESERVED})
+
+
+@pytest.mark.parametrize(("name", "space"), [("DQN", IMAGE), ("PPO", IMAGE), ("DDPG", IMAGE), ("TD3", VECTOR)])
+def test_a_model_saved_before_is_loaded_with_the_layers_that_it_had(tmp_path, name, space):
+    env = Sampled(space, DISCRETE if name == "DQN" else BOX)
+    settings = {"policy_kwargs": {"net_arch": SB3[name][1]}, "seed": 0}
+    agent = rejeu.AGENTS[name]("CnnPolicy" if space is IMAGE else "MlpPolicy", env, **settings)
+    path = agent.save(tmp_path / "model")
+    as_written_before(path, "agent")
+    loaded = rejeu.load(path)
+    obs = np.stack([space.sample() for _ in range(5)])
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
+    assert rejeu.load(loaded.save(tmp_path / "again")).config == loaded.config == agent.config
+
+
+def test_a_run_saved_before_is_resumed_with_the_layers_that_it_had(tmp_path):
+    env = lambda: Sampled(IMAGE, DISCRETE)  # noqa: E731
+    agent = rejeu.DQN("CnnPolicy", env(), buffer_size=99, policy_kwargs={"net_arch": [64, 64]}, seed=0)
+    agent.learn(8, Checkpoint(tmp_path))
+    for path in tmp_path.glob("run_*.safetensors"):
+        as_written_before(path, "run")
+    with pytest.warns(UserWarning, match="new episodes"):
+        resumed = rejeu.DQN.resume(tmp_path, env())
+    assert resumed.config == agent.config
+    resumed.learn(8)
+
+
+def test_a_file_says_the_widths_so_that_no_other_default_changes_them():
+    config = configs.with_widths(crossq.Config(policy_kwargs={"pi": [4]}), leaves(VECTOR))
+    shape = configs.to_json(config)["policy_kwargs"]
+    assert (shape["net_arch"], shape["pi"], shape["qf"]) == (None, [4], [1024, 1024])
+    shape = configs.to_json(configs.with_widths(ppo.Config(), leaves(IMAGE)))["policy_kwargs"]
+    assert shape["net_arch"] == []

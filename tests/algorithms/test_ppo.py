@@ -1,0 +1,769 @@
+"""PPO's losses, gradients and whole updates against float64 NumPy, its networks, its settings and what it refuses."""
+
+from __future__ import annotations
+
+import functools
+
+import equinox as eqx
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+import rejeu
+from rejeu.algorithms import ppo
+from rejeu.algorithms.actor_critic import (
+    ActorCritic,
+    ActorCriticConfig,
+    Samples,
+    action_kind,
+    clipped,
+    explained_variance,
+    is_value,
+    standardised,
+)
+from rejeu.core import Clock, Rollout
+from rejeu.distributions import Bernoulli, Categorical, Normal
+from rejeu.prng import nth
+from rejeu.spaces import leaves
+from tests import numpy_actor_critic as by_hand
+from tests.environments import Sampled
+from tests.numpy_networks import assert_equal_layers, gradient
+
+OBS_DIM, N_STEPS, N_ENVS = 3, 5, 3
+OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
+CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.25))
+EVERYWHERE = np.ones((N_STEPS, N_ENVS), bool)
+
+ACTIONS = {
+    "box": (gym.spaces.Box(-1.0, 1.0, (2,), np.float32), "box"),
+    "choice": (gym.spaces.Discrete(3), [3]),
+    "choices": (gym.spaces.MultiDiscrete([2, 3]), [2, 3]),
+    "bits": (gym.spaces.MultiBinary(3), "binary"),
+}
+"""Spaces, and what they are called in ``numpy_actor_critic``."""
+
+
+def bold(network):
+    """The network with a policy head a hundred times as large, so that actions depend on what is seen."""
+    return eqx.tree_at(lambda n: n.head.weight, network, 100.0 * network.head.weight)
+
+
+def random_rollout(space, seed=0, valid=EVERYWHERE):
+    rng = np.random.default_rng(seed)
+    shape = valid.shape
+    obs, next_obs = rng.normal(size=(2, *shape, OBS_DIM)).astype(np.float32)
+    if isinstance(space, gym.spaces.Box):
+        action = np.tanh(rng.normal(size=(*shape, *space.shape))).astype(np.float32)
+    else:
+        high = {"Discrete": lambda: space.n, "MultiDiscrete": lambda: space.nvec, "MultiBinary": lambda: 2}
+        action = rng.integers(high[type(space).__name__](), size=(*shape, *space.shape), dtype=np.int32)
+    how = rng.integers(4, size=shape)
+    return Rollout(
+        obs=obs,
+        action=action,
+        reward=rng.normal(size=shape).astype(np.float32),
+        next_obs=next_obs,
+        discount=np.where(how == 1, 0.0, 0.9).astype(np.float32),
+        ended=(how == 1) | (how == 2),
+        valid=valid,
+        running_return=np.zeros(shape, np.float32),
+        started=np.ones(shape[1], bool),
+        carry=(),
+    )
+
+
+# The parts of the loss.
+
+
+@pytest.mark.usefixtures("strict_dtypes")
+def test_the_surrogate_stops_where_a_ratio_has_moved_beyond_the_clip_for_gain():
+    """With epsilon 0.2: gains end at the ratio 1.2, losses at 0.8; in the other direction nothing is clipped."""
+    ratio = jnp.array([0.5, 0.9, 1.1, 1.5])
+    up, down = jnp.ones(4), -2.0 * jnp.ones(4)
+    np.testing.assert_allclose(ppo.surrogate(ratio, up, 0.2), [-0.5, -0.9, -1.1, -1.2], rtol=1e-6)
+    np.testing.assert_allclose(ppo.surrogate(ratio, down, 0.2), [1.6, 1.8, 2.2, 3.0], rtol=1e-6)
+    slope = jax.grad(lambda r, a: jnp.sum(ppo.surrogate(r, a, 0.2)))
+    np.testing.assert_allclose(slope(ratio, up), [-1.0, -1.0, -1.0, 0.0])
+    np.testing.assert_allclose(slope(ratio, down), [0.0, 2.0, 2.0, 2.0])
+
+
+def samples_of(ratio, advantage, value=0.0, target=0.0, valid=True):
+    """A batch of standard normal actions of one component whose ratios of probabilities are as given."""
+    ratio = np.atleast_1d(np.float64(ratio))
+    action = np.linspace(-1.0, 1.0, len(ratio))[:, None]
+    log_prob = -0.5 * action[:, 0] ** 2 - 0.5 * np.log(2 * np.pi)
+    f32 = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), ratio.shape)  # noqa: E731
+    return Samples(
+        obs=(),
+        action=jnp.asarray(action, jnp.float32),
+        log_prob=jnp.asarray(log_prob - np.log(ratio), jnp.float32),
+        value=f32(value),
+        advantage=f32(advantage),
+        target=f32(target),
+        valid=jnp.broadcast_to(jnp.asarray(valid), ratio.shape),
+    )
+
+
+jitted_loss_of = jax.jit(ppo.loss_of, static_argnums=3)
+
+
+def loss_of(batch, value=0.0, **settings):
+    """The loss where the policy is the standard normal and the values are as given."""
+    n = len(batch.log_prob)
+    policy = Normal(jnp.zeros((n, 1)), jnp.zeros((1, 1)))
+    values = jnp.broadcast_to(jnp.asarray(value, jnp.float32), (n,))
+    total, losses = jitted_loss_of(policy, values, batch, ppo.Config(**settings), CLOCK)
+    return float(total), {name: float(one) for name, one in losses._asdict().items()}
+
+
+def test_the_policy_loss_is_the_mean_clipped_surrogate():
+    batch = samples_of([0.5, 0.9, 1.1, 1.5, 0.5, 1.5], [1, 1, 1, 1, -1, -1])
+    _, losses = loss_of(batch, normalize_advantage=False)
+    assert losses["policy_loss"] == pytest.approx(-(0.5 + 0.9 + 1.1 + 1.2 - 0.8 - 1.5) / 6, rel=1e-5)
+    assert losses["clip_fraction"] == pytest.approx(4 / 6)
+    ratio = np.array([0.5, 0.9, 1.1, 1.5, 0.5, 1.5])
+    assert losses["approx_kl"] == pytest.approx(np.mean(ratio - 1 - np.log(ratio)), rel=1e-5)
+
+
+def test_the_clip_range_follows_its_schedule():
+    """At a quarter of the way from 0.4 to 0 it is 0.3."""
+    batch = samples_of([1.25, 1.35], [1, 1])
+    _, losses = loss_of(batch, normalize_advantage=False, clip_range=rejeu.Linear(0.4, 0.0))
+    assert losses["policy_loss"] == pytest.approx(-(1.25 + 1.3) / 2, rel=1e-5)
+    assert losses["clip_fraction"] == pytest.approx(0.5)
+
+
+def test_only_valid_entries_count_in_any_part_of_the_loss():
+    ratio, advantage, target, valid = [0.9, 1.5, 3.0], [2.0, -1.0, 1e6], [1.0, 2.0, -1e6], [True, True, False]
+    full = loss_of(samples_of(ratio, advantage, 0.0, target, valid), value=0.5, ent_coef=0.1)
+    part = samples_of(ratio, advantage, 0.0, target)
+    part = jax.tree.map(lambda x: x[:2], part)
+    assert full[0] == pytest.approx(loss_of(part, value=0.5, ent_coef=0.1)[0], rel=1e-6)
+    scaled = np.array([1.0, -1.0])  # 2 and -1 lie one deviation from their mean
+    assert full[1]["policy_loss"] == pytest.approx(-np.mean([0.9 * scaled[0], min(1.5 * scaled[1], 1.2 * scaled[1])]))
+    assert full[1]["value_loss"] == pytest.approx(np.mean([0.5**2, 1.5**2]))
+    assert full[1]["clip_fraction"] == 0.5
+
+
+def test_the_whole_loss_weighs_value_and_entropy():
+    """A standard normal has 0.5 log(2 pi e) nats; the bonus is subtracted."""
+    total, losses = loss_of(samples_of([1.0, 1.0], [1.0, -1.0], 0.0, [3.0, 1.0]), 2.0, vf_coef=0.25, ent_coef=0.1)
+    entropy = 0.5 * np.log(2 * np.pi * np.e)
+    assert losses["entropy"] == pytest.approx(entropy, rel=1e-5)
+    assert losses["value_loss"] == pytest.approx(1.0)
+    assert total == pytest.approx(0.25 * 1.0 - 0.1 * entropy, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("value", "clipped_value", "slope"), [(1.2, 1.2, 1.0), (2.0, 1.3, 0.0), (0.8, 0.8, 1.0), (-1.0, 0.7, 0.0)]
+)
+def test_value_clipping_bounds_the_value_around_the_old_one(value, clipped_value, slope):
+    """V_old is 1 and may move by 0.3; the target is 3. Beyond it the gradient is 0, even where it leads back."""
+    batch = samples_of([1.0], [0.0], value=1.0, target=3.0)
+    _, losses = loss_of(batch, value, clip_range_vf=0.3)
+    assert losses["value_loss"] == pytest.approx((clipped_value - 3.0) ** 2, rel=1e-5)
+    config = ppo.Config(clip_range_vf=0.3, vf_coef=1.0)
+    policy = Normal(jnp.zeros((1, 1)), jnp.zeros((1, 1)))
+    given = jax.grad(lambda v: jitted_loss_of(policy, v, batch, config, CLOCK)[0])(jnp.array([value], jnp.float32))
+    assert float(given[0]) == pytest.approx(slope * 2 * (value - 3.0), rel=1e-5)
+
+
+def test_advantages_are_standardised_over_the_valid_entries_alone():
+    rng = np.random.default_rng(0)
+    values, valid = rng.normal(5.0, 3.0, 20).astype(np.float32), np.arange(20) < 13
+    values[13:] = 1e5
+    kept = np.float64(values[:13])
+    expected = (kept - kept.mean()) / kept.std()
+    np.testing.assert_allclose(standardised(jnp.array(values), jnp.array(valid))[:13], expected, rtol=1e-4)
+
+
+def test_one_advantage_alone_is_left_as_it_is():
+    """It has no deviation: subtracting its mean would leave nothing to learn from (Stable-Baselines3 1.6.1)."""
+    values = jnp.array([3.5, 100.0])
+    assert float(standardised(values, jnp.array([True, False]))[0]) == 3.5
+    assert float(standardised(values[:1], jnp.array([True]))[0]) == 3.5
+
+
+def test_explained_variance_is_1_for_exact_values_and_0_for_a_constant():
+    target, valid = jnp.array([1.0, 2.0, 4.0, 1e6]), jnp.array([True, True, True, False])
+    assert float(explained_variance(target + 7.0, target, valid)) == pytest.approx(1.0, abs=1e-6)
+    assert float(explained_variance(jnp.zeros(4), target, valid)) == pytest.approx(0.0, abs=1e-6)
+    halved = 1 - np.var([0.5, 1.0, 2.0]) / np.var([1.0, 2.0, 4.0])
+    assert float(explained_variance(target / 2, target, valid)) == pytest.approx(halved, rel=1e-5)
+    assert np.isnan(explained_variance(target, jnp.ones(4), valid))
+
+
+def test_gradients_are_scaled_down_to_the_largest_norm_and_never_up():
+    tree = {"a": jnp.array([3.0]), "b": jnp.array([[4.0]])}
+    for most, factor in ((1.0, 0.2), (10.0, 1.0), (None, 1.0)):
+        given, norm = clipped(tree, most)
+        assert float(norm) == pytest.approx(5.0)
+        assert [float(given["a"][0]), float(given["b"][0, 0])] == pytest.approx([3 * factor, 4 * factor], rel=1e-5)
+
+
+# The estimate of the divergence.
+
+
+def kl_of(old, new, actions):
+    n = len(actions)
+    batch = Samples((), actions, old.log_prob(actions), jnp.zeros(n), jnp.zeros(n), jnp.zeros(n), jnp.ones(n, bool))
+    return float(jitted_loss_of(new, jnp.zeros(n), batch, ppo.Config(), CLOCK)[1].approx_kl)
+
+
+N_DRAWN = 100_000
+
+
+def rows(*numbers):
+    return jnp.broadcast_to(jnp.array(numbers, jnp.float32), (N_DRAWN, len(numbers)))
+
+
+@pytest.mark.parametrize(("shift", "widening"), [(0.1, 0.0), (0.0, 0.1), (-0.2, -0.1)])
+def test_the_divergence_of_normals_is_estimated(shift, widening):
+    """KL(N(0, s) || N(d, s')) = log(s' / s) + (s^2 + d^2) / (2 s'^2) - 1/2 with s = 0.5."""
+    action = np.random.default_rng(0).normal(0.0, 0.5, (N_DRAWN, 1))
+    old, new = np.log(0.5), np.log(0.5) + widening
+    exact = widening + (0.25 + shift**2) / (2 * np.exp(2 * new)) - 0.5
+    normal = lambda mean, log_std: Normal(rows(mean), jnp.full((1, 1), log_std, jnp.float32))  # noqa: E731
+    given = kl_of(normal(0.0, old), normal(shift, new), jnp.asarray(action, jnp.float32))
+    assert given == pytest.approx(exact, rel=0.05)
+
+
+def test_the_divergence_of_choices_and_of_bits_is_estimated():
+    rng = np.random.default_rng(1)
+    old, new = np.array([0.5, -0.3, 1.0]), np.array([0.6, -0.4, 0.8])
+    p, q = special.softmax(old), special.softmax(new)
+    choice = rng.choice(3, size=N_DRAWN, p=p).astype(np.int32)
+    given = kl_of(Categorical(rows(*old)), Categorical(rows(*new)), jnp.array(choice))
+    assert given == pytest.approx(np.sum(p * np.log(p / q)), rel=0.05)
+    p, q = special.expit(old), special.expit(new)
+    bits = (rng.uniform(size=(N_DRAWN, 3)) < p).astype(np.int32)
+    given = kl_of(Bernoulli(rows(*old)), Bernoulli(rows(*new)), jnp.array(bits))
+    exact = np.sum(p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q)))
+    assert given == pytest.approx(exact, rel=0.05)
+
+
+# Gradients.
+
+NETWORKS = {
+    "box": ("box", "box", {}),
+    "box, std by observation": ("box", "box", {"state_dependent_std": True, "log_std_init": -0.5}),
+    "squashed": ("box", "squashed", {"squash_output": True}),
+    "choice": ("choice", [3], {}),
+    "choices": ("choices", [2, 3], {}),
+    "bits": ("bits", "binary", {}),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_gradient_of_the_loss_equals_finite_differences_in_float64(name):
+    """With every part of the loss at work; half of the ratios lie beyond the clip."""
+    actions, kind, shape = NETWORKS[name]
+    space = ACTIONS[actions][0]
+    config = ppo.Config(ent_coef=0.1, clip_range=0.1, clip_range_vf=0.5, policy_kwargs={"net_arch": [4], **shape})
+    network = bold(draw(leaves(OBS_SPACE), action_kind(space), config.policy_kwargs))
+    rng, rollout = np.random.default_rng(0), random_rollout(space)
+    n = N_STEPS * N_ENVS
+    obs, action = rollout.obs.reshape(n, -1), rollout.action.reshape(n, *rollout.action.shape[2:])
+    hand = by_hand.Network(network)
+    log_prob, _ = by_hand.log_prob_and_entropy(hand, obs, action, kind)
+    old_log_prob = np.float32(log_prob + rng.choice([-0.3, -0.05, 0.05, 0.3], n))
+    old_value = np.float32(hand.value(obs) + rng.choice([-0.7, -0.2, 0.2, 0.7], n))
+    advantage, target = rng.normal(size=(2, n)).astype(np.float32)
+    batch = Samples(obs, action, old_log_prob, old_value, advantage, target, np.ones(n, bool))
+    (total, losses), given = jax.jit(jax.value_and_grad(ppo.loss, has_aux=True), static_argnums=2)(
+        network, batch, config, CLOCK
+    )
+
+    def expected():
+        scaled = by_hand.standard(np.float64(advantage))
+        return by_hand.Losses(hand, obs, action, kind, old_log_prob, old_value, scaled, target, 0.1, 0.5, 0.5, 0.1)
+
+    assert 0.2 < expected().clip_fraction < 0.8
+    assert float(total) == pytest.approx(expected().total, rel=1e-4, abs=1e-5)
+    for field, value in losses._asdict().items():
+        assert float(value) == pytest.approx(vars(expected())[field], rel=1e-4, abs=1e-5), field
+    slopes = gradient(hand.everything, lambda: expected().total)
+    assert_equal_layers(by_hand.Network(given).everything, slopes, "gradient", atol=1e-5, rtol=1e-4)
+
+
+# Whole updates.
+
+SETTINGS = {
+    "box": ("box", {}),
+    "a choice, everything following a schedule": (
+        "choice",
+        {
+            "learning_rate": rejeu.Linear(4e-2, 0.0),
+            "clip_range": rejeu.Linear(0.4, 0.0),
+            "clip_range_vf": rejeu.Linear(0.04, 0.0),
+            "ent_coef": rejeu.Linear(0.4, 0.0),
+        },
+    ),
+    "choices, two optimizers": ("choices", {"critic_learning_rate": 1e-2, "max_grad_norm": 0.1}),
+    "bits, nothing scaled": ("bits", {"max_grad_norm": None, "normalize_advantage": False, "batch_size": 100}),
+    "box, stopping early": ("box", {"learning_rate": 5e-2, "target_kl": 0.05}),
+}
+LAST_STEP_MISSING = np.arange(N_STEPS * N_ENVS).reshape(N_STEPS, N_ENVS) != N_STEPS * N_ENVS - 1
+
+
+def make(actions, **settings):
+    settings = {
+        "batch_size": 4,
+        "n_epochs": 3,
+        "gae_lambda": 0.8,
+        "learning_rate": 3e-2,
+        "policy_kwargs": {"net_arch": [4]},
+        **settings,
+    }
+    config = ppo.Config(**settings)
+    return config, ppo.make(config, OBS_SPACE, ACTIONS[actions][0])
+
+
+def begin(algorithm, seed=0):
+    state = jax.jit(algorithm.init)(jax.random.PRNGKey(seed))
+    return eqx.tree_at(lambda s: s.network, state, bold(state.network))
+
+
+def orders_of(state, rollout, config):
+    valid = rollout.valid.ravel()
+    size = min(config.batch_size, valid.size)
+    orders = ppo.shuffled(nth(state.key, state.n_rollouts), valid, config.n_epochs, -valid.size % size)
+    return np.asarray(orders)[:, : valid.sum()]
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_two_updates_equal_numpy(name):
+    """14 of 15 steps exist, in minibatches of 4, 4, 4 and 2, in the orders that JAX draws."""
+    actions, settings = SETTINGS[name]
+    space, kind = ACTIONS[actions]
+    config, algorithm = make(actions, **settings)
+    state, update = begin(algorithm), jax.jit(algorithm.update)
+    hand = by_hand.PPO(state.network, config, kind, two_rates="critic_learning_rate" in settings)
+    scheduled = "schedule" in name
+    rates = [3e-2, 1e-2] if "two" in name else [5e-2 if "early" in name else 3e-2]
+    schedule = (0.3, 0.03, 0.3) if scheduled else (0.2, None, 0.0)  # of 0.4 to 0 at a quarter of the way
+    for k in range(2):
+        rollout = random_rollout(space, seed=k, valid=LAST_STEP_MISSING)
+        expected = hand.update(rollout, orders_of(state, rollout, config), rates, *schedule)
+        state, metrics = update(state, rollout, CLOCK)
+        given, numbers = by_hand.Network(state.network), hand.network
+        assert int(state.n_updates) == hand.n_updates
+        assert_equal_layers(given.everything, numbers.everything, f"after rollout {k}", atol=3e-5)
+        for field in ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"):
+            assert float(metrics[field]) == pytest.approx(expected[field], rel=1e-3, abs=1e-5), field
+        assert float(metrics["learning_rate"]) == pytest.approx(rates[0])
+        if kind == "box":
+            assert float(metrics["std"]) == pytest.approx(np.exp(numbers.log_std[0][0]).mean(), rel=1e-4)
+    full = 2 * 3 * (1 if settings.get("batch_size") == 100 else 4)
+    assert 2 <= hand.n_updates < full if "early" in name else hand.n_updates == full
+
+
+def test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them():
+    """Stable-Baselines3 1.8.0 and 2.8.0 mended the count: a rollout of 8 steps would be worth 4 gradient steps."""
+    settings = {**SMALL, "learning_rate": 0.3, "target_kl": 0.01}
+    agent = rejeu.PPO("MlpPolicy", Noisy(), **settings).learn(32)
+    assert 0 < agent.n_updates == int(agent.state.n_updates) < 4 * 4
+    free = rejeu.PPO("MlpPolicy", Noisy(), **{**settings, "target_kl": 1e6}).learn(32)
+    assert free.n_updates == int(free.state.n_updates) == 4 * 4
+    assert free.statistics()["train/gradient_steps"] == 4
+
+
+def test_padding_leaks_into_no_update():
+    space, _ = ACTIONS["box"]
+    _, algorithm = make("box")
+    state, update, rollout = begin(algorithm), jax.jit(algorithm.update), random_rollout(space, valid=LAST_STEP_MISSING)
+    spoil = lambda a: np.where(rollout.valid.reshape(*rollout.valid.shape, *[1] * (a.ndim - 2)), a, 50.0)  # noqa: E731
+    spoilt = rollout._replace(
+        **{name: spoil(getattr(rollout, name)).astype(np.float32) for name in ("obs", "action", "reward", "next_obs")}
+    )
+    (clean, clean_metrics), (given, metrics) = update(state, rollout, CLOCK), update(state, spoilt, CLOCK)
+    for one, two in zip(jax.tree.leaves(clean), jax.tree.leaves(given), strict=True):
+        np.testing.assert_array_equal(one, two)
+    for name, value in clean_metrics.items():
+        assert float(value) == float(metrics[name]), name
+
+
+def test_each_rollout_is_shuffled_anew():
+    space, _ = ACTIONS["box"]
+    config, algorithm = make("box")
+    state, rollout = begin(algorithm), random_rollout(space)
+    after, _ = jax.jit(algorithm.update)(state, rollout, CLOCK)
+    assert int(after.n_rollouts) == 1
+    assert (orders_of(state, rollout, config) != orders_of(after, rollout, config)).any()
+
+
+@pytest.mark.parametrize("n_valid", [1, 7, 12])
+def test_an_order_holds_every_step_once_the_valid_ones_first(n_valid):
+    valid = np.random.default_rng(0).permutation(np.arange(12) < n_valid)
+    orders = np.asarray(ppo.shuffled(nth(jax.random.PRNGKey(0), 3), jnp.array(valid), 5, 4))
+    assert (orders.shape, orders.dtype) == ((5, 16), np.int32)
+    for order in orders:
+        assert sorted(order[:12]) == list(range(12))
+        assert sorted(order[:n_valid]) == np.flatnonzero(valid).tolist()
+    if n_valid > 1:
+        assert len({tuple(order) for order in orders.tolist()}) == 5, "every epoch has its own"
+
+
+def test_every_step_comes_first_equally_often():
+    """1200 orders of 6 steps: each is expected first 200 times, with a deviation of 13."""
+    orders = np.asarray(ppo.shuffled(nth(jax.random.PRNGKey(1), 0), jnp.ones(6, bool), 1200, 0))
+    assert np.abs(np.bincount(orders[:, 0], minlength=6) - 200).max() < 5 * 13
+
+
+def test_training_actions_are_drawn_and_the_deterministic_one_is_the_mode():
+    _, algorithm = make("box")
+    state, obs = begin(algorithm), jnp.zeros((5000, OBS_DIM)).at[:, 0].set(1.0)
+    drawn = np.asarray(algorithm.explore(state.network, obs, jax.random.PRNGKey(0), CLOCK))
+    mode = np.asarray(algorithm.exploit(state.network, obs))
+    expected = by_hand.through(by_hand.Network(state.network).pi, np.eye(3)[:1])
+    np.testing.assert_allclose(mode, np.repeat(expected, 5000, axis=0), atol=1e-5)
+    np.testing.assert_allclose(drawn.mean(axis=0), expected[0], atol=5 / np.sqrt(5000))
+    np.testing.assert_allclose(drawn.std(axis=0), 1.0, atol=5 / np.sqrt(10000))
+
+
+# Networks.
+
+IMAGES = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+
+def build(space=OBS_SPACE, **shape):
+    shape = ActorCriticConfig(**{"net_arch": [6, 4], **shape})
+    return draw(leaves(space), action_kind(ACTIONS["box"][0]), shape)
+
+
+@functools.cache
+def draw(obs_leaves, kind, shape):
+    return jax.jit(lambda key: ActorCritic(key, obs_leaves, kind, shape))(jax.random.PRNGKey(0))
+
+
+def assert_orthogonal(layer, gain):
+    """W^T W = gain^2 I for as many columns as rows or fewer, else W W^T; of a convolution, of its filters."""
+    weight = np.float64(layer.weight).reshape(-1, layer.weight.shape[-1])
+    product = weight.T @ weight if weight.shape[0] >= weight.shape[1] else weight @ weight.T
+    np.testing.assert_allclose(product, gain**2 * np.eye(len(product)), atol=1e-5)
+    np.testing.assert_array_equal(layer.bias, 0.0)
+
+
+def test_weights_begin_orthogonal_with_a_gain_for_each_part():
+    network = build()
+    assert [layer.weight.shape for layer in (*network.torso.layers, network.head)] == [(3, 6), (6, 4), (4, 2)]
+    for layer in (*network.torso.layers, *network.value_torso.layers):
+        assert_orthogonal(layer, np.sqrt(2.0))
+    assert_orthogonal(network.head, 0.01)
+    assert_orthogonal(network.value_head, 1.0)
+    weights = [np.asarray(torso.layers[0].weight) for torso in (network.torso, network.value_torso)]
+    assert (weights[0] != weights[1]).any(), "policy and value are drawn apart"
+    np.testing.assert_array_equal(network.log_std, np.zeros(2))
+
+
+def test_convolutions_begin_orthogonal_too():
+    network = build(IMAGES, share_features_extractor=False)
+    for encoder in (network.encoder, network.value_encoder):
+        (cnn,) = encoder.images
+        for layer in (*cnn.layers, cnn.linear):
+            assert_orthogonal(layer, np.sqrt(2.0))
+
+
+def test_without_orthogonal_initialisation_weights_are_uniform():
+    for layer in (*(network := build(ortho_init=False)).torso.layers, network.head, network.value_head):
+        bound = 1.0 / np.sqrt(layer.weight.shape[0])
+        assert 0.5 * bound < np.abs(layer.weight).max() <= bound
+        assert (layer.bias != 0).all()
+
+
+def test_policy_and_value_have_the_widths_asked_for():
+    apart = build(net_arch={"pi": [5], "vf": [7, 6]})
+    assert [layer.weight.shape for layer in apart.torso.layers] == [(3, 5)]
+    assert [layer.weight.shape for layer in apart.value_torso.layers] == [(3, 7), (7, 6)]
+    default = jax.eval_shape(lambda: build(net_arch=None))
+    for torso in (default.torso, default.value_torso):
+        assert [layer.weight.shape for layer in torso.layers] == [(3, 64), (64, 64)]
+    assert default.torso.activation == "tanh"
+
+
+OBS = np.random.default_rng(0).normal(size=(5, OBS_DIM)).astype(np.float32)
+PIXELS = np.random.default_rng(0).integers(256, size=(5, 8, 8, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("shape", [{}, {"share_layers": True}, {"share_features_extractor": False}])
+def test_policy_and_value_at_once_are_what_each_is_alone(shape):
+    network = bold(build(IMAGES, **shape))
+    (policy, value), policy_alone, value_alone = jax.jit(lambda n: (n.both(PIXELS), n.policy(PIXELS), n.value(PIXELS)))(
+        network
+    )
+    np.testing.assert_allclose(value, value_alone, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(policy.mean, policy_alone.mean, rtol=1e-5, atol=1e-6)
+
+
+def moves(of, network):
+    """Which parts of the network a change of what ``of`` computes goes through."""
+    slopes = jax.jit(jax.grad(lambda n: jnp.sum(of(n))))(network)
+    parts = ("encoder", "torso", "head", "value_encoder", "value_torso", "value_head")
+    return {part for part in parts if any((np.asarray(x) != 0).any() for x in jax.tree.leaves(getattr(slopes, part)))}
+
+
+@pytest.mark.parametrize(
+    ("shape", "of_policy", "of_value"),
+    [
+        ({}, {"encoder", "torso", "head"}, {"encoder", "value_torso", "value_head"}),
+        (
+            {"share_features_extractor": False},
+            {"encoder", "torso", "head"},
+            {"value_encoder", "value_torso", "value_head"},
+        ),
+        ({"share_layers": True}, {"encoder", "torso", "head"}, {"encoder", "torso", "value_head"}),
+    ],
+)
+def test_only_what_is_shared_is_moved_by_both(shape, of_policy, of_value):
+    network = build(IMAGES, **shape)
+    assert moves(lambda n: n.policy(PIXELS).mean, network) == of_policy
+    assert moves(lambda n: n.value(PIXELS), network) == of_value
+
+
+def test_the_values_own_optimizer_has_all_that_is_the_values_alone():
+    network = build(IMAGES, share_features_extractor=False)
+    flags = is_value(network)
+    of = lambda part: set(jax.tree.leaves(getattr(flags, part)))  # noqa: E731
+    assert of("value_encoder") == of("value_torso") == of("value_head") == {True}
+    assert of("encoder") == of("torso") == of("head") == of("log_std") == {False}
+
+
+def test_a_standard_deviation_by_observation_begins_near_its_initial_value_and_is_bounded():
+    network = build(state_dependent_std=True, log_std_init=-0.7)
+    assert network.log_std is None
+    assert network.head.weight.shape == (4, 4)
+    np.testing.assert_allclose(network.policy(OBS).log_std, np.full((5, 2), -0.7), atol=0.05)
+    bolder = bold(network).policy(OBS).log_std
+    assert np.ptp(bolder[:, 0]) > 0.1, "it depends on what is seen"
+    for factor, bound in ((1e6, 2.0), (-1e6, -20.0)):
+        extreme = eqx.tree_at(lambda n: n.head.bias, network, factor * jnp.ones(4))
+        np.testing.assert_array_equal(extreme.policy(OBS).log_std, np.full((5, 2), bound))
+
+
+SMALL = {
+    "n_steps": 8,
+    "batch_size": 4,
+    "n_epochs": 2,
+    "learning_rate": 1e-2,
+    "policy_kwargs": {"net_arch": [4]},
+    "seed": 0,
+}
+
+
+def play(env, **settings):
+    """An agent that has acted 8 times and learnt nothing yet."""
+    agent = rejeu.PPO("MlpPolicy", env, **{**SMALL, "n_steps": 100, **settings})
+    return agent.learn(100, callback=lambda agent, progress: progress.step < 8)
+
+
+def test_a_standard_deviation_that_is_not_learnt_stays_exactly_where_it_began():
+    """log 0.707 = -0.3466; with an entropy bonus, which pulls at nothing else."""
+    shape = {"net_arch": [4], "log_std_init": -0.3466, "learn_std": False}
+
+    def train(shape):
+        settings = {**SMALL, "policy_kwargs": shape, "ent_coef": 0.1}
+        return rejeu.PPO("MlpPolicy", Noisy(), **settings).learn(24)
+
+    kept = train(shape)
+    np.testing.assert_array_equal(kept.state.network.log_std, np.float32([-0.3466]))
+    assert kept.statistics()["train/std"] == pytest.approx(0.7071, abs=1e-4)
+    learnt = train({**shape, "learn_std": True})
+    assert float(learnt.state.network.log_std[0]) > -0.3466 + 1e-3
+
+
+class Noisy(Sampled):
+    """Random rewards, and actions that must lie in the space as they are."""
+
+    def __init__(self, action_space=None):
+        super().__init__(OBS_SPACE, action_space)
+        self.actions = []
+
+    def step(self, action):
+        assert self.action_space.contains(action), (action, getattr(action, "dtype", None))
+        self.actions.append(np.array(action))
+        self.reward = float(self.np_random.normal())
+        return super().step(action)
+
+
+SPACES = {
+    "bounds of its own": gym.spaces.Box(np.float32([-1.0, 0.0]), np.float32([3.0, 0.5])),
+    "no bounds": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32),
+    "one bound": gym.spaces.Box(np.float32([0.0, -np.inf]), np.float32([np.inf, 0.2])),
+    "two axes": gym.spaces.Box(-2.0, 2.0, (2, 3), np.float64),
+    "a choice from 3 on": gym.spaces.Discrete(4, start=3),
+    "choices from 1 and -2 on": gym.spaces.MultiDiscrete([2, 3], start=[1, -2]),
+    "choices of two axes": gym.spaces.MultiDiscrete([[2, 3], [4, 2]]),
+    "bits": gym.spaces.MultiBinary(3),
+    "bits of two axes": gym.spaces.MultiBinary([2, 3]),
+}
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_actions_have_the_spaces_range_shape_and_dtype_in_training_and_after(name):
+    space = SPACES[name]
+    agent = play(env := Noisy(space))
+    assert len(env.actions) == 8
+    assert len({action.tobytes() for action in env.actions}) > 1, "they are drawn"
+    obs = np.random.default_rng(0).normal(size=(6, OBS_DIM)).astype(np.float32)
+    for deterministic in (True, False):
+        batch, state = agent.predict(obs, deterministic=deterministic)
+        assert state is None
+        assert (batch.shape, batch.dtype) == ((6, *space.shape), space.dtype)
+        assert all(space.contains(one) for one in batch)
+    single, _ = agent.predict(obs[0], deterministic=True)
+    np.testing.assert_array_equal(single, agent.predict(obs, deterministic=True)[0][0])
+    assert np.shape(single) == space.shape
+
+
+def set_mean(agent, mean):
+    head = {"weight": np.zeros((4, 2), np.float32), "bias": np.full(2, mean, np.float32)}
+    agent.set_parameters({f"network.head.{name}": array for name, array in head.items()}, exact_match=False)
+
+
+def test_without_bounds_the_mean_is_the_action():
+    """With 3 as its bias the mean lies beyond [-1, 1]: it is neither scaled nor clipped, but for the bound there is."""
+    for name, expected in (("no bounds", [3.0, 3.0]), ("one bound", [3.0, 0.2]), ("bounds of its own", [3.0, 0.5])):
+        agent = play(Noisy(SPACES[name]))
+        set_mean(agent, 3.0)
+        np.testing.assert_allclose(agent.predict(np.zeros(OBS_DIM), deterministic=True)[0], expected, rtol=1e-6)
+
+
+def test_squashed_actions_lie_within_the_bounds_without_being_clipped():
+    space = SPACES["bounds of its own"]
+    agent = play(env := Noisy(space), policy_kwargs={"net_arch": [4], "squash_output": True, "log_std_init": 0.5})
+    actions = np.array(env.actions)
+    assert ((actions > space.low) & (actions < space.high)).all(), "none lies at a bound, where clipped ones would"
+    set_mean(agent, 0.5)
+    expected = space.low + (np.tanh(0.5) + 1.0) / 2.0 * (space.high - space.low)
+    np.testing.assert_allclose(agent.predict(np.zeros(OBS_DIM), deterministic=True)[0], expected, rtol=1e-5)
+
+
+# Settings.
+
+
+def test_the_defaults_are_those_of_stable_baselines3():
+    theirs = {
+        "learning_rate": 3e-4,
+        "n_steps": 2048,
+        "batch_size": 64,
+        "n_epochs": 10,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "clip_range": 0.2,
+        "clip_range_vf": None,
+        "normalize_advantage": True,
+        "ent_coef": 0.0,
+        "vf_coef": 0.5,
+        "max_grad_norm": 0.5,
+        "target_kl": None,
+    }
+    config = ppo.Config()
+    assert {key: getattr(config, key) for key in theirs} == theirs
+    shape = config.policy_kwargs
+    assert (shape.activation_fn, shape.ortho_init, shape.log_std_init, shape.squash_output) == (
+        "tanh",
+        True,
+        0.0,
+        False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_steps": 0}, "n_steps=0 must be a whole number of at least 1"),
+        ({"batch_size": 2.5}, "batch_size=2.5 must be a whole number of at least 1"),
+        ({"n_epochs": 0}, "n_epochs=0 must be a whole number of at least 1"),
+        ({"gamma": 1.5}, "gamma=1.5 must be a finite number, at least 0 and at most 1"),
+        ({"gae_lambda": -0.1}, "gae_lambda=-0.1 must be a finite number, at least 0 and at most 1"),
+        ({"vf_coef": float("nan")}, "vf_coef=nan must be a finite number, at least 0"),
+        ({"max_grad_norm": 0}, "max_grad_norm=0 must be a finite number, above 0"),
+        ({"target_kl": 0.0}, "target_kl=0.0 must be a finite number, above 0"),
+        ({"learning_rate": -1e-3}, "learning_rate=-0.001 must not fall below 0"),
+        ({"learning_rate": rejeu.Linear(1e-3, -1e-3)}, r"learning_rate=Linear\(.* must not fall below 0"),
+        ({"ent_coef": -1.0}, "ent_coef=-1.0 must not fall below 0"),
+        ({"clip_range": -0.2}, "clip_range=-0.2 must not fall below 0"),
+        ({"clip_range_vf": -0.2}, "clip_range_vf=-0.2 must not fall below 0"),
+        ({"critic_learning_rate": -1.0}, "critic_learning_rate=-1.0 must not fall below 0"),
+        ({"learning_rate": lambda p: p}, r"learning_rate=.* must be a number, rejeu.Linear\(.*cannot be saved"),
+        ({"normalize_advantage": 1}, "normalize_advantage=1 must be True or False"),
+        ({"policy_kwargs": [64]}, r"policy_kwargs=\[64\] must be a dict with the keys net_arch"),
+        ({"policy_kwargs": {"log_std_init": float("inf")}}, "log_std_init=inf must be a finite number"),
+        ({"policy_kwargs": {"share_layers": "yes"}}, "share_layers='yes' must be True or False"),
+        ({"policy_kwargs": {"squash_output": 1}}, "squash_output=1 must be True or False"),
+        ({"policy_kwargs": {"ortho": True}}, "ortho.*ortho_init"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8], "v": [8]}}}, r"unknown keys \['v'\]; expected 'pi' and "),
+        (
+            {"policy_kwargs": {"state_dependent_std": True, "learn_std": False}},
+            "state_dependent_std=True leaves learn_std=False without meaning",
+        ),
+        (
+            {"policy_kwargs": {"share_layers": True, "share_features_extractor": False}},
+            "share_layers=True leaves share_features_extractor=False without meaning; .* one",
+        ),
+        (
+            {"policy_kwargs": {"share_layers": True, "net_arch": {"pi": [32], "vf": [64, 64]}}},
+            r"one stack of hidden layers, of the policy's widths \[32\], and leaves vf=\[64, 64\] without meaning; leave",
+        ),
+        (
+            {"policy_kwargs": {"share_layers": True, "vf": [32]}},
+            r"of the policy's widths \[64, 64\], and leaves vf=\[32\] without meaning",
+        ),
+        (
+            {"policy_kwargs": {"share_layers": True, "actor_layers": [8], "critic_layers": [4]}},
+            r"of the policy's widths \[8\], and leaves critic_layers=\[4\] without meaning",
+        ),
+        (
+            {"critic_learning_rate": 1e-3, "policy_kwargs": {"share_layers": True}},
+            "critic_learning_rate gives the value an optimizer of its own, which share_layers=True forbids; leave one",
+        ),
+    ],
+)
+def test_an_impossible_setting_is_refused_in_one_line(settings, message):
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
+        ppo.Config(**settings)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "shape", [{"net_arch": {"pi": [8], "vf": [8]}}, {"pi": [8]}, {"net_arch": None, "actor_layers": [8]}]
+)
+def test_shared_layers_may_have_the_widths_of_both_or_of_the_policy(shape):
+    network = build(OBS_SPACE, share_layers=True, **shape)
+    assert network.head.weight.shape[0] == network.value_head.weight.shape[0] == 8
+
+
+@pytest.mark.parametrize("algorithm", [rejeu.PPO, rejeu.A2C])
+def test_a_rate_of_the_values_own_needs_convolutions_of_its_own(algorithm):
+    """Shared ones would follow one of the two optimizers, and the gradients of both."""
+    env = Sampled(IMAGES)
+    with pytest.raises(ValueError, match=r"critic_learning_rate .*share_features_extractor=False") as caught:
+        algorithm("CnnPolicy", env, critic_learning_rate=1e-3)
+    assert "\n" not in str(caught.value)
+    make, config = algorithm.algorithm.make, algorithm.algorithm.Config
+    make(config(critic_learning_rate=1e-3, policy_kwargs={"share_features_extractor": False}), IMAGES, env.action_space)
+    make(config(critic_learning_rate=1e-3), OBS_SPACE, env.action_space)
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (gym.spaces.Box(-1.0, 1.0, (), np.float32), "PPO needs Box actions of floats with an axis, got Box"),
+        (gym.spaces.Box(0, 3, (2,), np.int32), "PPO needs Box actions of floats .* use MultiDiscrete"),
+        (gym.spaces.Box(1.0, 1.0, (2,), np.float32), r"must satisfy low < high, got low=\[1.0, 1.0\]"),
+        (gym.spaces.Dict({"a": gym.spaces.Discrete(2)}), "PPO needs a Box, .* got Dict.*ActionWrapper"),
+        (gym.spaces.Tuple([gym.spaces.Discrete(2)]), "PPO needs a Box, .* got Tuple.*ActionWrapper"),
+    ],
+)
+def test_an_action_space_that_does_not_fit_is_refused_in_one_line(space, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        ppo.make(ppo.Config(), OBS_SPACE, space)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_setting_gets_the_nearest_one_suggested():
+    with pytest.raises(TypeError, match=r"n_epoch.*n_epochs"):
+        rejeu.PPO("MlpPolicy", Noisy(), n_epoch=3)

@@ -1,0 +1,428 @@
+"""Advantages against plain float64 sums and closed forms; what a rollout buffer keeps, and what an agent puts into it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import rejeu
+from rejeu import spaces
+from rejeu.algorithms import actor_critic
+from rejeu.buffers.rollout import RolloutBuffer, advantages
+from rejeu.core import Rollout
+from rejeu.envs.make import InProcess
+from rejeu.loops.packing import Readings
+from tests.environments import Counter
+
+GAMMA = 0.9
+estimate = jax.jit(advantages)
+
+
+def by_definition(reward, value, next_value, discount, ended, gae_lambda):
+    """A_t = sum over k >= t of (prod of lambda discount from t to k - 1) delta_k, up to the end of the episode or rollout.
+
+    Equation 16 of arXiv 1506.02438 as the sum that it is, not as a recursion; one environment after the other.
+    """
+    reward, value, next_value, discount = map(np.float64, (reward, value, next_value, discount))
+    result = np.zeros_like(reward)
+    for t, env in np.ndindex(result.shape):
+        weight = 1.0
+        for k in range(t, len(reward)):
+            result[t, env] += weight * (reward[k, env] + discount[k, env] * next_value[k, env] - value[k, env])
+            if ended[k, env]:
+                break
+            weight *= gae_lambda * discount[k, env]
+    return result
+
+
+def random_steps(shape, seed, gamma=GAMMA):
+    """Rewards, values and ends of which a third each are terminal states, time limits and none."""
+    rng = np.random.default_rng(seed)
+    reward, value, next_value = rng.normal(size=(3, *shape)).astype(np.float32)
+    how = rng.integers(3, size=shape)
+    discount = np.where(how == 1, 0.0, gamma).astype(np.float32)
+    return reward, value, next_value, discount, how > 0
+
+
+@settings(max_examples=60)
+@given(
+    shape=st.sampled_from([(1, 1), (7, 2), (20, 3)]),
+    seed=st.integers(0, 2**32 - 1),
+    gamma=st.floats(0.0, 1.0),
+    gae_lambda=st.floats(0.0, 1.0),
+)
+def test_advantages_equal_the_sum_that_defines_them(shape, seed, gamma, gae_lambda):
+    steps = random_steps(shape, seed, gamma)
+    np.testing.assert_allclose(
+        estimate(*steps, np.float32(gae_lambda)), by_definition(*steps, gae_lambda), rtol=1e-5, atol=1e-5
+    )
+
+
+@pytest.mark.usefixtures("strict_dtypes")
+def test_lambda_0_gives_the_td_error():
+    reward, value, next_value, discount, ended = random_steps((9, 2), 0)
+    given = advantages(reward, value, next_value, jnp.array(discount), jnp.array(ended), 0.0)
+    np.testing.assert_allclose(given, reward + discount * next_value - value, atol=1e-6)
+
+
+def test_lambda_1_gives_the_return_to_go_minus_the_value():
+    """Four steps: a terminal state after the second, a time limit after the fourth, where the value 7 is left over."""
+    reward, value = np.float32([[1.0], [2.0], [3.0], [4.0]]), np.float32([[0.5], [0.25], [-1.0], [2.0]])
+    next_value = np.float32([[0.25], [100.0], [2.0], [7.0]])
+    discount = np.float32([[GAMMA], [0.0], [GAMMA], [GAMMA]])
+    ended = np.array([[False], [True], [False], [True]])
+    to_go = [1.0 + GAMMA * 2.0, 2.0, 3.0 + GAMMA * 4.0 + GAMMA**2 * 7.0, 4.0 + GAMMA * 7.0]
+    given = estimate(reward, value, next_value, discount, ended, np.float32(1.0))
+    np.testing.assert_allclose(given[:, 0], np.array(to_go) - value[:, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.7, 1.0])
+@pytest.mark.parametrize("limit", [1, 3, 100])
+def test_the_right_values_of_an_endless_reward_leave_no_advantage(limit, gae_lambda):
+    """Always 1 is worth 1 / (1 - gamma), however often a time limit or the rollout's end cuts it."""
+    shape = (12, 2)
+    value = np.full(shape, 1.0 / (1.0 - GAMMA), np.float32)
+    ended = np.repeat((np.arange(12) % limit == limit - 1)[:, None], 2, axis=1)
+    given = estimate(
+        np.ones(shape, np.float32), value, value, np.full(shape, GAMMA, np.float32), ended, np.float32(gae_lambda)
+    )
+    np.testing.assert_allclose(given, np.zeros(shape), atol=1e-5)
+
+
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.5, 1.0])
+def test_episodes_of_one_step_have_the_reward_minus_the_value(gae_lambda):
+    reward, value, next_value, _, _ = random_steps((6, 2), 3)
+    ended, gone = np.ones((6, 2), bool), np.zeros((6, 2), np.float32)
+    given = estimate(reward, value, next_value, gone, ended, np.float32(gae_lambda))
+    np.testing.assert_allclose(given, reward - value, atol=1e-6)
+
+
+def test_the_rollouts_end_bootstraps_from_the_value_of_the_state_reached():
+    """Nothing ended; with lambda 1 three rewards are summed and the value 10 of the last state is added."""
+    reward, value = np.float32([[1.0], [2.0], [4.0]]), np.float32([[0.0], [0.0], [0.0]])
+    given = estimate(
+        reward,
+        value,
+        np.float32([[0.0], [0.0], [10.0]]),
+        np.full((3, 1), 0.5, np.float32),
+        np.zeros((3, 1), bool),
+        np.float32(1.0),
+    )
+    np.testing.assert_allclose(
+        given[:, 0], [1 + 0.5 * 2 + 0.25 * 4 + 0.125 * 10, 2 + 0.5 * 4 + 0.25 * 10, 4 + 0.5 * 10]
+    )
+
+
+def test_nothing_flows_over_the_end_of_an_episode_or_from_one_environment_to_another():
+    steps = random_steps((8, 3), 4)
+    ended = steps[4].copy()
+    ended[3] = True
+    before = np.asarray(estimate(*steps[:4], ended, np.float32(0.9)))
+    for array in steps[:3]:
+        array[4:, 1] += 100.0
+    after = np.asarray(estimate(*steps[:4], ended, np.float32(0.9)))
+    np.testing.assert_array_equal(before[:4], after[:4])
+    np.testing.assert_array_equal(before[:, [0, 2]], after[:, [0, 2]])
+    assert (before[4:, 1] != after[4:, 1]).all()
+
+
+# Samples: a rollout with its values and log-probabilities.
+
+OBS_LEAVES = spaces.leaves(gym.spaces.Box(-5.0, 5.0, (2,), np.float32))
+SHAPE = actor_critic.ActorCriticConfig(net_arch=[4])
+
+
+@pytest.fixture(scope="module")
+def network():
+    kind = actor_critic.action_kind(gym.spaces.Discrete(3))
+    return actor_critic.ActorCritic(jax.random.PRNGKey(0), OBS_LEAVES, kind, SHAPE)
+
+
+def value_by_hand(network, obs):
+    (layer,) = network.value_torso.layers
+    hidden = np.tanh(np.float64(obs) @ np.float64(layer.weight) + np.float64(layer.bias))
+    return (hidden @ np.float64(network.value_head.weight) + np.float64(network.value_head.bias))[..., 0]
+
+
+def random_rollout(n_steps, n_envs, valid, seed=0):
+    rng = np.random.default_rng(seed)
+    reward, _, _, discount, ended = random_steps((n_steps, n_envs), seed)
+    obs, next_obs = rng.normal(size=(2, n_steps, n_envs, 2)).astype(np.float32)
+    action = rng.integers(3, size=(n_steps, n_envs), dtype=np.int32)
+    nothing = np.zeros((n_steps, n_envs), np.float32)
+    return Rollout(obs, action, reward, next_obs, discount, ended, valid, nothing, np.ones(n_envs, bool), ())
+
+
+def test_samples_hold_values_advantages_and_targets_of_every_step(network):
+    rollout = random_rollout(5, 3, np.ones((5, 3), bool))
+    data = actor_critic.samples(network, rollout, 0.8)
+    value, next_value = value_by_hand(network, rollout.obs), value_by_hand(network, rollout.next_obs)
+    expected = by_definition(rollout.reward, value, next_value, rollout.discount, rollout.ended, 0.8)
+    np.testing.assert_allclose(data.advantage, expected.ravel(), atol=1e-5)
+    np.testing.assert_allclose(data.value, value.ravel(), atol=1e-5)
+    np.testing.assert_allclose(data.target, (expected + value).ravel(), atol=1e-5)
+    np.testing.assert_array_equal(data.obs, rollout.obs.reshape(15, 2))
+    np.testing.assert_array_equal(data.action, rollout.action.ravel())
+
+
+def test_padding_leaks_into_no_sample(network):
+    """The environments stop after 5, 3 and no steps; what stands behind must not be told apart from zeros."""
+    valid = np.arange(5)[:, None] < [5, 3, 0]
+    rollout = random_rollout(5, 3, valid)
+    spoilt = [np.where(valid.reshape(5, 3, *[1] * (a.ndim - 2)), a, 1e4).astype(a.dtype) for a in rollout[:5]]
+    clean = actor_critic.samples(network, rollout, 0.8)
+    given = actor_critic.samples(network, rollout._replace(**dict(zip(Rollout._fields, spoilt, strict=False))), 0.8)
+    keep = valid.ravel()
+    for name in ("value", "advantage", "target"):
+        np.testing.assert_array_equal(getattr(given, name)[keep], getattr(clean, name)[keep], err_msg=name)
+    value, next_value = value_by_hand(network, rollout.obs), value_by_hand(network, rollout.next_obs)
+    for env, n in enumerate([5, 3]):
+        alone = [np.asarray(a)[:n, [env]] for a in (rollout.reward, value, next_value, rollout.discount, rollout.ended)]
+        expected = by_definition(*alone, 0.8)[:, 0]
+        np.testing.assert_allclose(given.advantage.reshape(5, 3)[:n, env], expected, atol=1e-5)
+
+
+# The buffer.
+
+
+def buffer_of(space, n_steps=4, n_envs=3, action_shape=(2,), action_dtype=np.float32):
+    leaves, structure = spaces.leaves(space), spaces.structure(space)
+    return RolloutBuffer(n_steps, n_envs, leaves, structure, action_shape, action_dtype, GAMMA)
+
+
+NESTED = gym.spaces.Dict(
+    {
+        "z": gym.spaces.Tuple([gym.spaces.Discrete(3, start=5), gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)]),
+        "a": gym.spaces.Box(-1.0, 1.0, (2,), np.float64),
+        "m": gym.spaces.Dict({"bits": gym.spaces.MultiBinary(4), "many": gym.spaces.MultiDiscrete([2, 3])}),
+    }
+)
+OBSERVATIONS = {
+    "Box": gym.spaces.Box(-5.0, 5.0, (3,), np.float32),
+    "image": gym.spaces.Box(0, 255, (8, 8, 3), np.uint8),
+    "nested": NESTED,
+}
+
+
+def batch_of(space, n_envs):
+    drawn = [spaces.plain(space, space.sample()) for _ in range(n_envs)]
+    return spaces.cast(space, spaces.leaves(space), jax.tree.map(lambda *parts: np.stack(parts), *drawn))
+
+
+def fill(buffer, space, n, seed=0):
+    """Puts ``n`` steps in and returns what they were, one namespace a step."""
+    space.seed(seed)
+    rng, steps = np.random.default_rng(seed), []
+    for _ in range(n):
+        how = rng.integers(3, size=buffer.n_envs)
+        step = SimpleNamespace(
+            obs=batch_of(space, buffer.n_envs),
+            action=rng.normal(size=buffer.action.shape[1:]).astype(buffer.action.dtype),
+            reward=rng.normal(size=buffer.n_envs).astype(np.float32),
+            terminated=how == 1,
+            truncated=how == 2,
+            next_obs=batch_of(space, buffer.n_envs),
+        )
+        buffer.observe(step.obs)
+        buffer.add(step.action, step.reward, step.terminated, step.truncated, step.next_obs)
+        steps.append(step)
+    return steps
+
+
+def assert_holds(rollout, steps):
+    for t, step in enumerate(steps):
+        for name in ("obs", "next_obs"):
+            kept, put = getattr(rollout, name), getattr(step, name)
+            assert jax.tree.structure(kept) == jax.tree.structure(put)
+            for one, other in zip(jax.tree.leaves(kept), jax.tree.leaves(put), strict=True):
+                assert one.dtype == other.dtype
+                np.testing.assert_array_equal(one[t], other, err_msg=f"{name} of step {t}")
+        np.testing.assert_array_equal(rollout.action[t], step.action)
+        np.testing.assert_array_equal(rollout.reward[t], step.reward)
+        np.testing.assert_array_equal(
+            rollout.discount[t], np.float32([0.0 if end else GAMMA for end in step.terminated])
+        )
+        np.testing.assert_array_equal(
+            rollout.ended[t], [a or b for a, b in zip(step.terminated, step.truncated, strict=True)]
+        )
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("kind", OBSERVATIONS)
+def test_what_goes_into_the_buffer_comes_out(kind, n_envs):
+    space = OBSERVATIONS[kind]
+    buffer = buffer_of(space, n_envs=n_envs)
+    buffer.begin((), np.ones(n_envs, bool))
+    steps = fill(buffer, space, 4)
+    assert buffer.full
+    assert (buffer.length, buffer.size()) == (4, 4 * n_envs)
+    rollout = buffer.rollout()
+    assert_holds(rollout, steps)
+    assert rollout.valid.all()
+    assert rollout.started.all()
+    assert rollout.reward.dtype == rollout.discount.dtype == np.float32
+
+
+def test_a_new_rollout_has_nothing_of_the_one_before_in_it():
+    space = OBSERVATIONS["Box"]
+    buffer = buffer_of(space)
+    buffer.begin((), np.ones(3, bool))
+    fill(buffer, space, 4)
+    started = np.array([True, False, True])
+    buffer.begin((), started)
+    started[:] = False
+    assert (buffer.length, buffer.size(), buffer.full) == (0, 0, False)
+    steps = fill(buffer, space, 2, seed=1)
+    rollout = buffer.rollout()
+    assert_holds(rollout, steps)
+    np.testing.assert_array_equal(rollout.valid, np.arange(4)[:, None] < np.full(3, 2))
+    np.testing.assert_array_equal(rollout.started, [True, False, True])
+
+
+def test_only_the_steps_of_active_environments_count():
+    space = OBSERVATIONS["Box"]
+    buffer = buffer_of(space)
+    buffer.begin((), np.ones(3, bool))
+    fill(buffer, space, 1)
+    none = np.zeros(3, bool)
+    buffer.observe(batch_of(space, 3))
+    buffer.add(np.zeros((3, 2)), np.zeros(3), none, none, batch_of(space, 3), valid=np.array([True, True, False]))
+    assert (buffer.length, buffer.size()) == (2, 5)
+    np.testing.assert_array_equal(buffer.rollout().valid[:2], [[True] * 3, [True, True, False]])
+
+
+def test_an_environment_may_write_to_what_it_returned_without_changing_what_is_kept():
+    buffer = buffer_of(OBSERVATIONS["Box"], n_envs=1)
+    buffer.begin((), np.ones(1, bool))
+    own, none = np.zeros((1, 3), np.float32), np.zeros(1, bool)
+    reward, action = np.zeros(1, np.float32), np.zeros((1, 2), np.float32)
+    for t in range(4):
+        own[:] = t
+        buffer.observe(own)
+        own[:], reward[:], action[:] = t + 0.5, t, t
+        buffer.add(action, reward, none, none, own)
+    own[:] = reward[:] = action[:] = -1.0
+    rollout = buffer.rollout()
+    np.testing.assert_array_equal(rollout.obs[:, 0, 0], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(rollout.next_obs[:, 0, 0], [0.5, 1.5, 2.5, 3.5])
+    np.testing.assert_array_equal(rollout.reward[:, 0], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(rollout.action[:, 0, 0], [0.0, 1.0, 2.0, 3.0])
+
+
+def steps_of(buffer, n):
+    """The leaves of the first n steps of a rollout."""
+    rollout = buffer.rollout()
+    return [leaf[:n] for leaf in jax.tree.leaves(rollout._replace(started=()))]
+
+
+@pytest.mark.parametrize("kind", OBSERVATIONS)
+def test_arrays_put_back_give_the_same_rollout(kind):
+    space = OBSERVATIONS[kind]
+    buffer, other = buffer_of(space), buffer_of(space)
+    for one, seed, n in ((buffer, 0, 3), (other, 1, 4)):
+        one.begin((), np.ones(3, bool))
+        fill(one, space, n, seed)
+    arrays = {name: array.copy() for name, array in buffer.arrays().items()}
+    assert {len(array) for array in arrays.values()} == {3}
+    other.restore(arrays)
+    assert (other.length, other.size(), other.full) == (3, 9, False)
+    for one, two in zip(steps_of(buffer, 3), steps_of(other, 3), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert not other.rollout().valid[3].any()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda a: a.pop("reward"), r"differ in the arrays \['reward'\]"),
+        (lambda a: a.update(extra=a["reward"]), r"differ in the arrays \['extra'\]"),
+        (
+            lambda a: a.update(action=a["action"][:, :, :1]),
+            r"action in the file is float32\[3, 3, 1\], expected float32",
+        ),
+        (
+            lambda a: a.update(reward=np.float64(a["reward"])),
+            r"reward in the file is float64\[3, 3\], expected float32",
+        ),
+        (lambda a: a.update(ended=a["ended"][:2]), r"ended in the file is bool\[2, 3\], expected bool"),
+        (lambda a: a.update({k: np.concatenate([v, v]) for k, v in a.items()}), r"\[6, .*at most \[4, "),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused_and_change_nothing(spoil, message):
+    space = OBSERVATIONS["Box"]
+    buffer, other = buffer_of(space), buffer_of(space)
+    for one, seed in ((buffer, 0), (other, 1)):
+        one.begin((), np.ones(3, bool))
+        fill(one, space, 3, seed)
+    arrays = {name: array.copy() for name, array in other.arrays().items()}
+    before = {name: array.copy() for name, array in buffer.arrays().items()}
+    spoil(arrays)
+    with pytest.raises(ValueError, match=message) as caught:
+        buffer.restore(arrays)
+    assert "\n" not in str(caught.value)
+    assert buffer.length == 3
+    for name, array in buffer.arrays().items():
+        np.testing.assert_array_equal(array, before[name])
+
+
+# What an agent's environments put into it.
+
+
+def recorded(n_envs, total, lengths, ends, n_steps=4):
+    """The rollouts that learning ``total`` steps hands to the update, copied, and the agent."""
+    env = InProcess([Counter(lengths, ends) for _ in range(n_envs)], seed=0)
+    agent = rejeu.A2C("MlpPolicy", env, n_steps=n_steps, gamma=GAMMA, seed=0, policy_kwargs={"net_arch": [4]})
+    rollouts = []
+
+    def update(state, rollout, clock):
+        rollouts.append(jax.tree.map(np.copy, rollout))
+        return state, Readings((), np.zeros(1)), None
+
+    agent._compiled.update = update
+    return rollouts, agent.learn(total)
+
+
+@pytest.mark.parametrize("ends", ["truncated", "terminated"])
+def test_a_step_has_its_true_successor_whatever_ended_it(ends):
+    """Episodes of 3 and 2 steps; ``Counter`` sees (episode, time, ...) and earns 100 episode + time."""
+    (rollout,), _ = recorded(1, 6, (3, 2), ends, n_steps=6)
+    np.testing.assert_array_equal(rollout.obs[:, 0, :2], [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0]])
+    np.testing.assert_array_equal(rollout.next_obs[:, 0, :2], [[0, 1], [0, 2], [0, 3], [1, 1], [1, 2], [2, 1]])
+    np.testing.assert_array_equal(rollout.reward[:, 0], [0, 1, 2, 100, 101, 200])
+    np.testing.assert_array_equal(rollout.ended[:, 0], [False, False, True, False, True, False])
+    last = np.float32(GAMMA if ends == "truncated" else 0.0)
+    np.testing.assert_array_equal(rollout.discount[:, 0], np.float32([GAMMA, GAMMA, last, GAMMA, last, GAMMA]))
+
+
+def test_a_rollout_says_where_it_began_within_an_episode():
+    rollouts, _ = recorded(2, 24, (5, 3), "truncated")
+    assert [r.started.tolist() for r in rollouts] == [[True, True], [False, False], [True, True]]
+    assert [r.obs[0, :, :2].tolist() for r in rollouts] == [[[0, 0]] * 2, [[0, 4]] * 2, [[2, 0]] * 2]
+
+
+@pytest.mark.parametrize(("n_envs", "total"), [(1, 10), (3, 32), (8, 45), (8, 3)])
+def test_as_many_steps_are_learnt_from_as_are_asked_for(n_envs, total):
+    """Of the last turn only as many environments count as steps remain, the first ones; the next call continues there."""
+    rollouts, agent = recorded(n_envs, total, (5,), "truncated")
+    turns = -(-total // n_envs)
+    assert len(rollouts) == agent.n_updates == turns // 4
+    assert agent.num_timesteps == total
+    agent.learn((8 - turns % 4) * n_envs, reset_num_timesteps=False)
+    assert len(rollouts) == turns // 4 + 2
+    kept = lambda name: np.concatenate([getattr(r, name) for r in rollouts])  # noqa: E731
+    obs, valid, ended = np.concatenate([r.obs for r in rollouts]), kept("valid"), kept("ended")
+    active = n_envs if total % n_envs == 0 else total % n_envs
+    expected = np.ones_like(valid)
+    expected[turns - 1, active:] = False
+    np.testing.assert_array_equal(valid, expected)
+    # Environments whose last step did not count began again, and their episodes are cut there; the others went on.
+    times = [turns % 5] * active + [0] * (n_envs - active)
+    np.testing.assert_array_equal(obs[turns, :, 1], times)
+    np.testing.assert_array_equal(ended[turns - 1], [time == 0 for time in times])
+    np.testing.assert_array_equal(obs[1:, :, 1] == 0, ended[:-1])

@@ -1,0 +1,550 @@
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.callbacks import Evaluate
+from rejeu.cli import main, one_line, run_folder, settings
+from rejeu.reporting.logging import CsvFile
+from tests.full_disk import FullDisk
+
+FILES = {
+    "agent.safetensors",
+    "best.safetensors",
+    "checkpoints",
+    "config.json",
+    "curve.png",
+    "episodes.csv",
+    "evaluations.csv",
+    "metrics.csv",
+    "video.mp4",
+}
+TINY = ["policy_kwargs.net_arch=[8]", "batch_size=8", "buffer_size=5000", "learning_starts=50"]
+
+
+class Words(gym.Env):
+    """An environment whose actions nothing here takes."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Text(3)
+
+
+class Switches(gym.Env):
+    """An environment whose actions SAC does not take."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.MultiBinary(3)
+
+
+class Broken(gym.Env):
+    """An environment whose 120th reward is NaN; its episodes have 50 steps."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+    steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(2, np.float32), np.nan if self.steps == 120 else 1.0, False, self.steps % 50 == 0, {}
+
+
+gym.register("rejeu-test/Words-v0", Words)
+gym.register("rejeu-test/Switches-v0", Switches)
+gym.register("rejeu-test/Broken-v0", Broken)
+
+
+def train(out, *more, env="Pendulum-v1", steps=850):
+    return main(
+        ["train", env, "--steps", str(steps), "--out", str(out), "--evaluate-episodes", "2", *more, "--set", *TINY]
+    )
+
+
+def error_of(capsys, *argv):
+    """The line that a command prints when it fails."""
+    assert main([*argv]) == 2
+    text = capsys.readouterr().err
+    assert re.fullmatch(r"rejeu: error: [^\n]+\n", text)
+    return text
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a short run."""
+    out = tmp_path_factory.mktemp("runs") / "pendulum"
+    assert train(out, "--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium") == 0
+    return out
+
+
+def test_train_leaves_a_complete_run_folder(run):
+    assert {path.name for path in run.iterdir()} == FILES
+    assert all(path.stat().st_size for path in run.iterdir())
+
+
+def test_config_holds_what_repeats_the_run(run):
+    config = json.loads((run / "config.json").read_text())
+    assert (config["env"], config["algorithm"], config["seed"], config["n_envs"]) == ("Pendulum-v1", "SAC", 3, 1)
+    assert (config["steps"], config["minutes"], config["backend"]) == (850, None, "gymnasium")
+    assert config["hyperparameters"]["policy_kwargs"]["net_arch"] == [8]
+    assert config["hyperparameters"]["learning_rate"] == 1e-3  # the preset's
+    assert {"rejeu", "jax", "numpy", "gymnasium", "envpool"} <= set(config["versions"])
+    again = rejeu.SAC("MlpPolicy", "Pendulum-v1", **config["hyperparameters"])
+    assert again.config == rejeu.load(run / "agent.safetensors").config
+
+
+def test_tables_hold_every_episode_and_evaluation(run):
+    assert [float(row["step"]) for row in rows(run / "episodes.csv")] == [200, 400, 600, 800]
+    assert [int(row["step"]) for row in rows(run / "evaluations.csv")] == [400, 800, 850]
+    assert "train/critic_loss" in rows(run / "metrics.csv")[0]
+
+
+def test_the_same_seed_gives_the_same_run(run, tmp_path):
+    assert train(tmp_path / "again", "--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium") == 0
+    first, second = (rejeu.load(path / "agent.safetensors").get_parameters() for path in (run, tmp_path / "again"))
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_the_best_model_is_that_of_the_best_evaluation(run):
+    table = rows(run / "evaluations.csv")
+    last_best = max(i for i, row in enumerate(table) if row["best"] == "1")
+    assert last_best == np.argmax([float(row["mean_return"]) for row in table])
+    counters = rejeu.load(run / "best.safetensors").num_timesteps
+    assert counters == int(table[last_best]["step"])
+
+
+def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
+    assert train(tmp_path / "run", "--seed", "1", steps=60) == 0
+    text = capsys.readouterr().out
+    assert "environment   Pendulum-v1, 1 at once\nbackend       envpool\n" in text
+    assert "SAC, preset, seed 1" in text
+    assert "60/60 steps" in text
+    assert "95 % interval" in text
+    assert re.search(r"[\d.]+ s in all, [\d.]+ s of them compiling", text)
+
+
+def test_train_stops_after_the_minutes_given(tmp_path):
+    out = tmp_path / "run"
+    argv = ["train", "Pendulum-v1", "--minutes", "0.01", "--evaluate-episodes", "1", "--out", str(out), "--set", *TINY]
+    assert main(argv) == 0
+    assert {path.name for path in out.iterdir()} == FILES
+
+
+def test_goal_environments_are_trained_with_hindsight(tmp_path):
+    assert train(tmp_path / "run", "--envs", "2", env="parking-v0", steps=120) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["policy"] == "MultiInputPolicy"
+    assert config["hyperparameters"]["replay_buffer_class"] == "HerReplayBuffer"
+    assert (config["n_envs"], config["backend"]) == (2, "envpool")
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
+
+
+def test_without_a_name_the_run_folder_is_new_each_time(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = [run_folder.create(None, "ALE/Pong-v5", "SAC", 7).path for _ in range(3)]
+    assert len(set(folders)) == 3
+    assert re.fullmatch(r"ALE-Pong-v5-SAC-seed7-\d{8}-\d{6}", folders[0].name)
+
+
+def test_without_the_video_extra_the_run_goes_on_and_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert train(tmp_path / "run", steps=60) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"no curve: .*rejeu\[plot\]", text)
+    assert re.search(r"no video: .*rejeu\[video\]", text)
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES - {"curve.png", "video.mp4"}
+
+
+def test_evaluate_prints_the_result_and_writes_nothing(run, capsys):
+    before = {path: path.stat().st_mtime_ns for path in run.iterdir()}
+    assert main(["evaluate", str(run), "--episodes", "2", "--backend", "gymnasium", "--seed", "0"]) == 0
+    text = capsys.readouterr().out
+    assert "on gymnasium" in text
+    assert "2 episodes" in text
+    assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == before
+
+
+def test_evaluate_for_minutes_plays_at_least_an_episode_in_each_environment(run, capsys):
+    assert main(["evaluate", str(run), "--minutes", "1e-6", "--backend", "gymnasium"]) == 0
+    assert "16 episodes" in capsys.readouterr().out
+    assert main(["evaluate", str(run), "--minutes", "0"]) == 2
+    assert "--minutes=0.0 must be a finite number, above 0" in capsys.readouterr().err
+
+
+def test_evaluate_with_a_seed_repeats_itself(run, capsys):
+    for _ in range(2):
+        assert main(["evaluate", str(run), "--episodes", "2", "--seed", "5"]) == 0
+    first, second = capsys.readouterr().out.split("Pendulum-v1 on envpool")[1:]
+    assert first.strip() == second.strip()
+
+
+def test_evaluate_takes_the_last_model_or_a_file_as_well(run, capsys):
+    assert main(["evaluate", str(run), "--which", "last", "--episodes", "1"]) == 0
+    assert main(["evaluate", str(run / "agent.safetensors"), "--episodes", "1"]) == 0
+    assert capsys.readouterr().out.count("agent.safetensors") == 2
+
+
+def test_record_writes_a_video_where_asked(run, tmp_path):
+    assert main(["record", str(run), "--out", str(tmp_path / "v.mp4"), "--episodes", "1", "--seed", "0"]) == 0
+    assert (tmp_path / "v.mp4").stat().st_size
+
+
+def test_list_shows_algorithms_and_presets(capsys):
+    assert main(["list"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"SAC +Soft actor-critic", text)
+    assert re.search(r"parking-v0 +SAC +56,000 steps  success", text)
+
+
+def test_list_groups_presets_by_environment_in_columns(capsys):
+    main(["list"])
+    lines = capsys.readouterr().out.partition("environments with")[2].splitlines()[1:]
+    rows = [line for line in lines if " steps  " in line]
+    assert len(rows) == len(rejeu.presets.ALL)
+    assert len({row.index(" steps  ") for row in rows}) == 1
+    named = [row.split()[0] for row in rows if not row.startswith("   ")]
+    assert sorted(named) == sorted({preset.env_id for preset in rejeu.presets.ALL})
+
+
+def test_version_is_printed(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"rejeu {rejeu.__version__}\n"
+
+
+def test_help_names_the_commands(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in ("train", "evaluate", "record", "list", "--version"))
+
+
+def test_python_m_rejeu_is_the_same_command():
+    done = subprocess.run([sys.executable, "-m", "rejeu", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"rejeu {rejeu.__version__}\n"
+
+
+def test_set_takes_dotted_names_numbers_lists_and_words():
+    argv = ['train_freq=[1,"episode"]', "learning_rate=1e-3", "policy_kwargs.net_arch=[64,64]", "ent_coef=auto_0.1"]
+    assert settings.apply(argv, {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
+        "policy_kwargs": {"layer_norm": True, "net_arch": [64, 64]},
+        "gamma": 0.9,
+        "train_freq": [1, "episode"],
+        "learning_rate": 1e-3,
+        "ent_coef": "auto_0.1",
+    }
+
+
+def test_set_understands_pythons_false_as_false():
+    assert settings.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
+
+
+def test_set_leaves_the_preset_as_it_was():
+    preset = rejeu.presets.find("parking-v0")
+    settings.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
+    assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
+
+
+def test_set_may_be_given_more_than_once(tmp_path):
+    assert train(tmp_path / "run", "--set", "gamma=0.5", steps=60) == 0
+    hyperparameters = json.loads((tmp_path / "run" / "config.json").read_text())["hyperparameters"]
+    assert (hyperparameters["gamma"], hyperparameters["batch_size"]) == (0.5, 8)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["train", "Pendulum-v1", "--set", "learning_rat=1"], "did you mean learning_rate?"),
+        (["train", "Pendulum-v1", "--set", "policy_kwargs.net_archh=[1]"], "did you mean net_arch?"),
+        (["train", "Pendulum-v1", "--set", "gamma=7"], "gamma=7 must be"),
+        (["train", "Pendulum-v1", "--set", "gamma"], "must be name=value"),
+        (["train", "Pendulmu-v1"], "did you mean Pendulum-v1"),
+        (["train", "Pendulum-v1", "--algo", "SCA"], "did you mean SAC?"),
+        (["train", "Pendulum-v1", "--backend", "envpol"], "must be one of auto, envpool"),
+        (["train", "Pendulum-v1", "--steps", "5", "--minutes", "1"], "exclude each other"),
+        (["train", "Pendulum-v1", "--steps", "0"], "--steps=0 must be"),
+        (["train", "Pendulum-v1", "--seed", "-1"], "seed=-1 must be"),
+        (
+            ["train", "LunarLander-v2"],
+            "LunarLander-v2 is an old version that Gymnasium no longer has; use LunarLander-v3",
+        ),
+        (["train", "ALE/Pong-v5"], "pip install ale-py; EnvPool has Pong-v5: backend='envpool' (--backend envpool)"),
+        (["check", "Pong-v5"], "Gymnasium has no Pong-v5, so it cannot be drawn or stepped by Gymnasium; EnvPool has"),
+        (["trian", "Pendulum-v1"], "no command is called 'trian'; did you mean train?"),
+        (["train"], "rejeu train needs ENV"),
+        (["train", "Pendulum-v1", "CartPole-v1"], "does not expect 'CartPole-v1'"),
+        (["train", "Pendulum-v1", "--step", "5"], "no option --step; did you mean --steps?"),
+        (["train", "Pendulum-v1", "--steps"], "--steps needs a value"),
+        (["train", "Pendulum-v1", "--seed", "x"], "--seed 'x' must be a whole number"),
+        (["train", "Pendulum-v1", "--seed", "1.5"], "--seed 1.5 must be a whole number"),
+        (["train", "Pendulum-v1", "--minutes", "ten"], "--minutes 'ten' must be a number"),
+        (["evaluate", "run", "--which", "bets"], "--which 'bets' must be one of best, last"),
+        (["train", "rejeu-test/Words-v0"], "which no algorithm here takes"),
+        (["train", "rejeu-test/Switches-v0", "--algo", "SAC"], "MultiBinary(3)"),
+        (["evaluate", "no-such-run"], "no run folder or model file no-such-run"),
+        (["record", "no-such-run"], "no run folder or model file no-such-run"),
+    ],
+)
+def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, monkeypatch, tmp_path, argv, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in error_of(capsys, *argv)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.filterwarnings("ignore:.*HalfCheetah-v3 is out of date:DeprecationWarning")
+def test_an_old_version_that_gymnasium_lists_and_cannot_make_names_the_new_one(capsys):
+    assert "HalfCheetah-v3 is an old version that cannot be made any more" in error_of(
+        capsys, "check", "HalfCheetah-v3"
+    )
+
+
+def test_a_folder_that_is_no_run_is_an_error(capsys, tmp_path):
+    assert "holds no best.safetensors" in error_of(capsys, "evaluate", str(tmp_path))
+
+
+def test_a_run_folder_is_never_overwritten(capsys, run):
+    before = (run / "config.json").read_text()
+    assert "not an empty folder" in error_of(capsys, "train", "Pendulum-v1", "--steps", "5", "--out", str(run))
+    assert (run / "config.json").read_text() == before
+
+
+def test_a_damaged_model_is_an_error(capsys, run, tmp_path):
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes((run / "agent.safetensors").read_bytes()[:500])
+    assert "not a complete safetensors file" in error_of(capsys, "evaluate", str(cut))
+
+
+def test_a_nan_reward_is_an_error_and_what_was_learnt_until_then_is_saved(capsys, tmp_path):
+    argv = ["train", "rejeu-test/Broken-v0", "--steps", "500", "--evaluate-every", "60", "--evaluate-episodes", "1"]
+    text = error_of(capsys, *argv, "--out", str(tmp_path / "run"), "--set", *TINY)
+    assert "returned the reward nan" in text
+    assert rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps == 119
+    assert rejeu.load(tmp_path / "run" / "best.safetensors").num_timesteps == 60
+    assert len(rows(tmp_path / "run" / "episodes.csv")) == 2
+
+
+def test_metrics_that_come_up_later_get_their_column(tmp_path):
+    table = CsvFile(tmp_path / "metrics.csv")
+    table.write(1, {"a": 1.0})
+    table.write(2, {"a": 2.0, "loss": 0.5})
+    table.write(3, {"loss": 0.25})
+    table.close()
+    assert [list(row.values()) for row in rows(table.path)] == [
+        ["1", "1.0", ""],
+        ["2", "2.0", "0.5"],
+        ["3", "", "0.25"],
+    ]
+
+
+def test_a_table_that_is_gone_on_with_keeps_the_rows_up_to_a_step(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("step,a\n1,1.0\n2,2.0\n3,3.0\n4,")  # and the last was cut short
+    table = CsvFile(path, up_to=2)
+    table.write(3, {"a": 3.5, "b": 1.0})
+    table.close()
+    assert [list(row.values()) for row in rows(path)] == [["1", "1.0", ""], ["2", "2.0", ""], ["3", "3.5", "1.0"]]
+
+
+def table(path):
+    """A table without what depends on the clock."""
+    return [{k: v for k, v in row.items() if "seconds" not in k and not k.startswith("time/")} for row in rows(path)]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path):
+    arguments = ["--steps", "900", "--seed", "3", "--evaluate-every", "300", "--evaluate-episodes", "2"]
+    argv = ["train", "rejeu/Ball-v0", *arguments, "--set", *TINY, "--checkpoint-minutes", "0.002"]
+    assert main([*argv, "--out", str(tmp_path / "whole")]) == 0
+    script = """if True:
+        import os, signal, sys
+        from rejeu.callbacks import Evaluate
+        from rejeu.cli import main
+        evaluate = Evaluate.__call__
+        def call(self, agent, progress):
+            evaluate(self, agent, progress)
+            if progress.step >= 500:
+                os.kill(os.getpid(), signal.SIGKILL)
+        Evaluate.__call__ = call
+        main(sys.argv[1:])
+    """
+    killed = subprocess.run([sys.executable, "-c", script, *argv, "--out", str(tmp_path / "cut")], capture_output=True)
+    assert killed.returncode == -signal.SIGKILL
+    assert not (tmp_path / "cut" / "agent.safetensors").exists()
+    resume = [
+        sys.executable,
+        "-m",
+        "rejeu",
+        "resume",
+        str(tmp_path / "cut"),
+    ]  # this process may have another thread count
+    resumed = subprocess.run(resume, capture_output=True, text=True, check=True)
+    assert re.search(r"resumed at step [\d,]+, exactly where it stood", resumed.stdout), resumed.stdout
+    for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
+        assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
+    one, two = (rejeu.load(tmp_path / run / "agent.safetensors").get_parameters() for run in ("whole", "cut"))
+    assert all(np.array_equal(one[key], two[key]) for key in one)
+
+
+def test_a_complete_run_can_be_trained_further(run, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "run")
+    text = error_of(capsys, "resume", str(tmp_path / "run"))
+    assert "the run is complete" in text
+    before = rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps
+    assert main(["resume", str(tmp_path / "run"), "--steps", "50"]) == 0
+    assert rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps == before + 50
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
+    """Pausing changes nothing about the run: it ends where the one that was never paused ended."""
+    argv = ["--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium"]
+    out = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        kill = lambda self, agent, turn: os.kill(os.getpid(), signal.SIGINT) if turn.step == 100 else None  # noqa: E731
+        patch.setattr(rejeu.callbacks.Evaluate, "__call__", kill)
+        arguments = ["train", "Pendulum-v1", "--steps", "850", "--out", str(out), "--evaluate-episodes", "2", *argv]
+        assert main([*arguments, "--set", *TINY]) == 130
+    assert main(["resume", str(out), "--steps", "1e2"]) == 0
+    text = capsys.readouterr().out
+    assert f"paused; everything is saved; rejeu resume {out} continues" in text
+    paused = rejeu.load(out / "agent.safetensors").num_timesteps
+    assert paused == 200
+    assert main(["resume", str(out)]) == 0
+    one, two = (rejeu.load(path / "agent.safetensors") for path in (run, out))
+    assert one.num_timesteps == two.num_timesteps == 850
+    weights = [agent.get_parameters() for agent in (one, two)]
+    assert all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_the_best_model_is_kept_when_a_complete_run_is_trained_further(tmp_path, capsys, monkeypatch):
+    """The last evaluation of the first part, at step 60, is the best by far and must be remembered."""
+    better = iter([10.0, 1.0])
+    evaluation = rejeu.Evaluation
+    fake = lambda *_, **__: evaluation(np.array([next(better)]), np.array([5]), np.array([np.nan]))  # noqa: E731
+    monkeypatch.setattr(rejeu.SAC, "evaluate", fake)
+    assert train(tmp_path / "run", "--evaluate-every", "1000", steps=60) == 0
+    assert main(["resume", str(tmp_path / "run"), "--steps", "20"]) == 0
+    assert [row["best"] for row in rows(tmp_path / "run" / "evaluations.csv")] == ["1", "0"]
+    assert rejeu.load(tmp_path / "run" / "best.safetensors").num_timesteps == 60
+
+
+def test_resume_explains_what_it_cannot_go_on_with(run, tmp_path, capsys):
+    assert "no run folder" in error_of(capsys, "resume", str(tmp_path))
+    assert "exclude each other" in error_of(capsys, "resume", str(run), "--steps", "5", "--minutes", "1")
+    shutil.copytree(run, tmp_path / "run")
+    config = tmp_path / "run" / "config.json"
+    content = json.loads(config.read_text())
+    for damage, message in (
+        ({"n_envs": "8"}, "n_envs"),
+        ({"algorithm": "os.system"}, "unknown"),
+        ({"seed": None}, "seed"),
+    ):
+        config.write_text(json.dumps({**content, **damage}))
+        assert message in error_of(capsys, "resume", str(tmp_path / "run"))
+    config.write_text("{")
+    assert "is damaged" in error_of(capsys, "resume", str(tmp_path / "run"))
+    config.write_text(json.dumps(content))
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    assert "no checkpoint in" in error_of(capsys, "resume", str(tmp_path / "run"))
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_resume_says_that_it_skipped_a_damaged_checkpoint(run, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "run")
+    newest = max((tmp_path / "run" / "checkpoints").glob("run_*"))
+    content = bytearray(newest.read_bytes())
+    content[-9] ^= 1
+    newest.write_bytes(content)
+    assert main(["resume", str(tmp_path / "run"), "--steps", "10"]) == 0
+    said = capsys.readouterr()
+    assert "resumed at step 0" in said.out
+    warning = (
+        rf"warning: {re.escape(str(newest))}: the array '?\S+ is damaged .*; resuming from the checkpoint before it\n"
+    )
+    assert re.fullmatch(warning, said.err)
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_what_could_not_be_written_is_repeated_at_the_end_of_the_command(tmp_path, capsys, monkeypatch):
+    disk, call = FullDisk(monkeypatch), Evaluate.__call__
+
+    def fill(self, agent, progress):
+        call(self, agent, progress)
+        disk.full = progress.step >= 50
+
+    monkeypatch.setattr(Evaluate, "__call__", fill)
+    out = tmp_path / "run"
+    assert train(out, "--seed", "3", "--evaluate-every", "40", env="rejeu/Ball-v0", steps=100) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert all(line.startswith("warning: ") for line in lines)
+    said = lines[-1].removeprefix("warning: ")
+    assert said.startswith("not written (No space left on device): ")
+    for name in ("checkpoints", "evaluations.csv", "episodes.csv", "agent.safetensors"):
+        assert str(out / name) in said
+    assert [row["step"] for row in rows(out / "evaluations.csv")] == ["40"]
+    assert not (out / "agent.safetensors").exists()
+    assert rejeu.load(out / "best.safetensors").num_timesteps == 40
+
+
+def test_check_leaves_out_what_only_the_authors_of_a_package_can_change(capsys):
+    assert main(["check", "CartPole-v1"]) == 0
+    text = capsys.readouterr().out
+    assert text.splitlines()[0] == "CartPole-v1: no errors, no warnings"
+    assert re.search(r"\d+ warnings? on what only the authors of gymnasium can change; --all shows it", text)
+    assert main(["check", "CartPole-v1", "--all"]) == 0
+    assert "warning: gymnasium.utils.env_checker" in capsys.readouterr().out
+
+
+def test_a_warning_is_one_line_on_the_command_line(capsys):
+    argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1", "--minutes", "1"]
+    with pytest.MonkeyPatch.context() as patch:
+        warn = lambda arguments: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
+        patch.setattr("rejeu.cli.train.check", warn)
+        patch.setattr("rejeu.cli.train.named", lambda *_: (_ for _ in ()).throw(ValueError("over")))
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            assert main(argv) == 2
+    assert capsys.readouterr().err == "warning: one two\nrejeu: error: over\n"
+
+
+def test_an_error_of_many_lines_becomes_one():
+    assert one_line(ValueError("first,\n   then second")) == "first, then second"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+def test_ctrl_c_saves_everything_and_exits_130(tmp_path):
+    out = tmp_path / "run"
+    argv = ["train", "Pendulum-v1", "--steps", "100000000", "--out", str(out), "--seed", "0"]
+    argv += ["--evaluate-every", "500", "--evaluate-episodes", "1", "--set", *TINY]
+    process = subprocess.Popen([sys.executable, "-m", "rejeu", *argv], stdout=subprocess.PIPE, text=True)
+    try:
+        assert any(line.startswith("step") for line in process.stdout)
+        process.send_signal(signal.SIGINT)
+        text, _ = process.communicate(timeout=100)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 130
+    assert "stopped by Ctrl-C" in text
+    assert {path.name for path in out.iterdir()} == FILES - {"video.mp4"}
+    steps = rejeu.load(out / "agent.safetensors").num_timesteps
+    assert steps >= 500
+    assert len(rows(out / "episodes.csv")) == steps // 200

@@ -1,0 +1,218 @@
+"""Environments of the user's own on the command line: what is typed is imported, what a run folder says never is."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import rejeu
+from rejeu.cli import main
+from tests.cli.test_cli import TINY, error_of
+
+SOURCE = """
+import gymnasium as gym, numpy as np
+
+class Drift(gym.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+    observation_space = gym.spaces.Box(-100, 100, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, gain=1.0, offsets=(), render_mode=None):
+        self.gain, self.render_mode = gain, render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = 0.0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.x += float(action[0])
+        return np.array([self.x], np.float32), self.gain, False, False, {}
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+class Double(gym.RewardWrapper):
+    def reward(self, reward):
+        return 2 * reward
+
+gym.register("Drift-v0", "drift_env:Drift", max_episode_steps=10)
+"""
+"""Every step of an episode of 10 is worth ``gain``, whatever is done."""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with ``drift_env.py``, which is the current one; what it registers and imports is forgotten afterwards."""
+    (tmp_path / "drift_env.py").write_text(SOURCE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield tmp_path
+    gym.registry.pop("Drift-v0", None)
+    sys.modules.pop("drift_env", None)
+
+
+def train(*named, out="run"):
+    argv = ["train", *named, "--algo", "SAC", "--steps", "60", "--seed", "0", "--out", out, "--evaluate-episodes", "1"]
+    assert main([*argv, "--set", *TINY]) == 0
+
+
+def forget():
+    """Stands for a new process."""
+    gym.registry.pop("Drift-v0", None)
+    sys.modules.pop("drift_env", None)
+
+
+@pytest.mark.parametrize("named", ["drift_env:Drift-v0", "drift_env.py"])
+def test_the_command_that_train_prints_works_for_an_environment_of_ones_own(named, here, capsys):
+    train(named)
+    hint = capsys.readouterr().out.strip().splitlines()[-1]
+    assert hint == f"try it        rejeu evaluate run --env {named} --backend gymnasium"
+    forget()
+    assert main([*shlex.split(hint.partition("rejeu ")[2]), "--episodes", "1"]) == 0
+    assert "return 10.00" in capsys.readouterr().out
+    forget()
+    assert main(["record", "run", "--env", named, "--episodes", "1"]) == 0
+    forget()
+    assert main(["resume", "run", "--env", named, "--steps", "20"]) == 0
+    assert rejeu.load("run/agent").num_timesteps == 80
+
+
+def test_keyword_arguments_and_wrappers_are_used_while_training_and_named_in_the_hint(here, capsys):
+    train("drift_env.py", "--env-kwargs", "gain=3", "--wrapper", "drift_env:Double")
+    text = capsys.readouterr().out
+    assert "environment   Drift-v0 (gain=3), drift_env:Double, 1 at once" in text
+    assert "return 60.00" in text  # 10 steps of twice 3
+    assert text.splitlines()[-1].endswith(
+        "rejeu evaluate run --env drift_env.py --env-kwargs gain=3 --wrapper drift_env:Double --backend gymnasium"
+    )
+
+
+def test_check_takes_a_file_and_keyword_arguments(here, capsys):
+    assert main(["check", "drift_env.py", "--env-kwargs", "gain=high"]) == 1
+    assert "reward 'high' of type str" in capsys.readouterr().out
+
+
+def test_the_console_script_finds_modules_in_the_current_folder(here):
+    script = Path(sys.executable).with_name("rejeu")
+    program = "import sys; sys.path[0] = '/nonexistent'; from rejeu.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [str(script)] if script.exists() else [sys.executable, "-c", program]
+    done = subprocess.run([*command, "check", "drift_env:Drift-v0"], capture_output=True, text=True)
+    assert "Drift-v0: no errors" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("named", "message"),
+    [
+        (["no_such_env:X-v0"], "there is no module 'no_such_env' in"),
+        (["no_such_env.py"], "there is no file no_such_env.py"),
+        (["drift_env:Drif-v0"], "drift_env registers Drift-v0, not 'Drif-v0'"),
+        (["empty_env.py"], "empty_env.py registers no environment; add gymnasium.register("),
+        (["two_env.py"], "two_env.py registers A-v0 and B-v0; name one of them: two_env.py:A-v0"),
+        (["Pendulum-v1", "--wrapper", "drift_env"], "must be MODULE:CLASS"),
+        (["Pendulum-v1", "--wrapper", "drift_env:Triple"], "has no class or function 'Triple'"),
+        (["Pendulum-v1", "--env-kwargs", "g"], "--env-kwargs 'g' must be name=value"),
+    ],
+)
+def test_what_cannot_be_found_is_one_line(named, message, here, capsys):
+    (here / "empty_env.py").write_text("x = 1\n")
+    (here / "two_env.py").write_text(
+        "import gymnasium\nfor name in 'AB':\n    gymnasium.register(f'{name}-v0', 'two_env:X')\n"
+    )
+    try:
+        assert message in error_of(capsys, "check", *named)
+    finally:
+        for name in ("A-v0", "B-v0"):
+            gym.registry.pop(name, None)
+        sys.modules.pop("two_env", None)
+
+
+@pytest.fixture(scope="module")
+def registered_run(tmp_path_factory):
+    """The folder of a short run on an environment that rejeu registers, with a keyword argument."""
+    out = tmp_path_factory.mktemp("runs") / "ball"
+    train("rejeu/Ball-v0", "--env-kwargs", "sigma=2", out=str(out))
+    return out
+
+
+def test_plain_keyword_arguments_of_a_registered_environment_are_read_from_the_run(registered_run, capsys):
+    assert main(["evaluate", str(registered_run), "--episodes", "1"]) == 0
+    assert "rejeu/Ball-v0 (sigma=2) on gymnasium" in capsys.readouterr().out
+    assert main(["evaluate", str(registered_run), "--episodes", "1", "--env-kwargs", "sigma=1"]) == 0
+    assert "rejeu/Ball-v0 (sigma=1) on gymnasium" in capsys.readouterr().out
+
+
+EVIL = [
+    {"env": "evil_env:Pendulum-v1"},
+    {"env": "evil_env.py"},
+    {"env": "os:system"},
+    {"env_argument": "evil_env:Pendulum-v1"},
+    {"wrappers": ["evil_env:Wrapper"]},
+    {"env_kwargs": {"sigma": "evil_env:Wrapper"}},
+    {"env_kwargs": {"sigma": "/etc/passwd"}},
+    {"env_kwargs": {"sigma": [1.0]}},
+    {"env_kwargs": {"dimension": 10**12}},
+    {"env_kwargs": {"a b": 1}},
+]
+
+
+@pytest.mark.parametrize("lie", EVIL, ids=json.dumps)
+def test_a_run_folder_imports_nothing_and_says_what_to_type(lie, registered_run, tmp_path, monkeypatch, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(registered_run, run)
+    (run / "evil_env.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.chdir(run)
+    monkeypatch.syspath_prepend(run)
+    config = run / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), **lie}))
+    error = error_of(capsys, "resume", ".")
+    assert " --env " in error
+    assert "evil_env" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"n_envs": 10**9},
+        {"n_envs": 0},
+        {"evaluate_episodes": 10**9},
+        {"evaluate_every": 0},
+        {"film_every": -1},
+        {"steps": 0},
+        {"minutes": -1.0},
+        {"checkpoint_minutes": float("nan")},
+        {"seed": 2**40},
+        {"success_threshold": float("inf")},
+        {"wrappers": [1]},
+        {"env_kwargs": []},
+    ],
+    ids=json.dumps,
+)
+def test_numbers_of_a_run_folder_are_bounded(lie, registered_run, tmp_path, capsys):
+    shutil.copy(registered_run / "config.json", tmp_path)
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), **lie}))
+    assert f"config.json is damaged: ValueError {next(iter(lie))}" in error_of(capsys, "resume", str(tmp_path))
+
+
+def test_a_run_folder_of_an_earlier_version_is_read(registered_run, tmp_path):
+    from rejeu.cli import run_folder
+
+    content = json.loads((registered_run / "config.json").read_text())
+    for name in run_folder.LATER:
+        del content[name]
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    config = run_folder.read_config(run_folder.RunFolder(tmp_path))
+    assert (config.env_argument, config.env_kwargs, config.wrappers) == ("", {}, ())
+
+
+def test_a_folder_of_runs_names_the_newest_inside(registered_run, capsys):
+    assert f"the newest of the 1 in it is {registered_run}" in error_of(capsys, "evaluate", str(registered_run.parent))
+    assert f"the newest of the 1 in it is {registered_run}" in error_of(capsys, "resume", str(registered_run.parent))

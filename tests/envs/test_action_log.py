@@ -1,0 +1,173 @@
+"""Runs on EnvPool: what was done to the environments is recorded, and replayed where a run is resumed."""
+
+from __future__ import annotations
+
+import zlib
+from contextlib import closing
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.callbacks import Checkpoint
+from rejeu.envs import action_log
+from rejeu.envs.action_log import ActionLog
+from rejeu.envs.base import DivergedError
+from rejeu.envs.make import make_vector
+
+pytest.importorskip("envpool")
+
+SPACES = {
+    "Discrete": gym.spaces.Discrete(3, start=2),
+    "Box": gym.spaces.Box(-2.0, 2.0, (2,), np.float64),
+    "MultiDiscrete": gym.spaces.MultiDiscrete([2, 5]),
+    "MultiBinary": gym.spaces.MultiBinary(3),
+}
+
+
+def sampled(space, n):
+    space.seed(0)
+    return np.stack([space.sample() for _ in range(n)])
+
+
+def fill(log, space, n_steps):
+    """Records steps and resets of all environments and of some, and returns them."""
+    done = []
+    for i in range(n_steps):
+        which = None if i % 3 else np.array([0, 2], np.int32)
+        action = sampled(space, log.n_envs if which is None else 2)
+        log.step(action, which)
+        done.append((which, action))
+        if i % 5 == 0:
+            log.reset(which)
+            done.append((which, None))
+    return done
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_a_log_yields_the_operations_that_were_recorded(name, monkeypatch):
+    monkeypatch.setattr(action_log, "BLOCK", 100)  # so that there are several
+    space = SPACES[name]
+    log = ActionLog(3, space)
+    done = fill(log, space, 40)
+    saved = log.to_plain()
+    assert len(saved["blocks"]) > 3
+    again = list(ActionLog(3, space).operations(saved))
+    assert len(again) == len(done) == saved["n_operations"]
+    for (which, action), (expected_which, expected_action) in zip(again, done, strict=True):
+        np.testing.assert_equal(which, expected_which)
+        np.testing.assert_equal(action, expected_action)
+
+
+def blocks(data):
+    return {"n_operations": 1, "blocks": [np.frombuffer(data, np.uint8)]}
+
+
+@pytest.mark.parametrize(
+    "saved",
+    [
+        blocks(b"no zlib"),
+        blocks(zlib.compress(bytes([9]))),
+        blocks(zlib.compress(bytes([action_log.STEP, 0]))),
+        blocks(zlib.compress(bytes([action_log.STEP]) + np.int64(7).tobytes())),
+        blocks(zlib.compress(bytes(2**24))),
+        blocks(zlib.compress(bytes(100))[:-3]),
+        {"n_operations": 1, "blocks": [3]},
+    ],
+    ids=["not compressed", "no operation", "cut short", "no action", "a bomb", "cut off", "no array"],
+)
+def test_a_damaged_log_is_refused(saved):
+    with pytest.raises(ValueError, match=r"record of actions|operation"):
+        list(ActionLog(1, gym.spaces.Discrete(2)).operations(saved))
+
+
+def test_a_log_is_full_by_steps_or_by_bytes():
+    few, wide = ActionLog(4, gym.spaces.Discrete(2), most_steps=8), gym.spaces.Box(-1, 1, (2**19,), np.float32)
+    few.step(np.zeros(4))
+    assert not few.is_full
+    few.step(np.zeros(4))
+    assert few.is_full
+    log = ActionLog(2, wide)  # 2 MiB an action, so 8 of them are 16 MiB
+    for _ in range(4):
+        assert not log.is_full
+        log.step(np.zeros((2, 2**19)))
+    assert log.is_full
+
+
+def test_a_log_that_nobody_empties_takes_no_more_memory(monkeypatch):
+    monkeypatch.setattr("rejeu.envs.envpool.MOST_STEPS", 10)
+    with closing(make_vector("CartPole-v1", 2, "envpool", seed=3)) as env:
+        env.reset()
+        for _ in range(9):
+            env.step(np.zeros(2, int))
+        assert env.snapshot() is not None
+        env.step(np.zeros(2, int))
+        env.step(np.zeros(2, int))
+        assert env.snapshot() is None
+        env.reset()
+        assert env.snapshot()["n_operations"] == 1
+
+
+def test_a_full_log_begins_again_with_another_pool_whose_seed_follows(monkeypatch):
+    monkeypatch.setattr("rejeu.envs.envpool.MOST_STEPS", 4)
+    first = []
+    for _ in range(2):
+        with closing(make_vector("CartPole-v1", 2, "envpool", seed=3)) as env:
+            before = env.reset().copy()
+            for _ in range(2):
+                assert not env.must_reset
+                env.step(np.zeros(2, int))
+            assert env.must_reset
+            first.append(env.reset().copy())
+            assert not env.must_reset
+            assert (first[-1] != before).any()
+    np.testing.assert_array_equal(*first)
+
+
+@pytest.mark.parametrize("algorithm", ["DQN", "PPO"])
+def test_a_run_that_fills_its_log_can_be_resumed_before_and_after(algorithm, tmp_path, monkeypatch):
+    monkeypatch.setattr("rejeu.envs.envpool.MOST_STEPS", 60)
+    settings = {"policy_kwargs": {"net_arch": [8]}, "seed": 1}
+    settings |= {"n_steps": 16, "batch_size": 16} if algorithm == "PPO" else {"learning_starts": 10, "batch_size": 8}
+    kind = rejeu.AGENTS[algorithm]
+    env = lambda: make_vector("CartPole-v1", 2, "envpool", seed=1)  # noqa: E731
+    whole = kind("MlpPolicy", env(), **settings).learn(200)
+    for cut in (61, 131):
+        folder = tmp_path / str(cut)
+        stop = lambda agent, turn, cut=cut: turn.step < cut  # noqa: E731
+        kind("MlpPolicy", env(), **settings).learn(200, [stop, Checkpoint(folder)])
+        again = kind.resume(folder, env())
+        assert again.resumed.exact
+        again.learn()
+        np.testing.assert_equal(again.get_parameters(), whole.get_parameters())
+        episodes = [[(e.step, e.episode_return) for e in agent.history.episodes] for agent in (again, whole)]
+        assert episodes[0] == episodes[1]
+
+
+def test_a_pool_that_does_not_repeat_its_episodes_begins_new_ones(tmp_path):
+    env = lambda: make_vector("CartPole-v1", 2, "envpool", seed=1)  # noqa: E731
+    with closing(env()) as one:
+        obs = one.reset().copy()
+        with pytest.raises(DivergedError, match="does not repeat"):
+            one.restore(one.snapshot(), obs + 1.0)
+    settings = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 10, "batch_size": 8, "buffer_size": 200}
+    stop = lambda agent, turn: turn.step < 40  # noqa: E731
+    rejeu.DQN("MlpPolicy", env(), seed=1, **settings).learn(100, [stop, Checkpoint(tmp_path)])
+    other = make_vector("CartPole-v1", 2, "envpool", seed=1)
+    other._make = lambda seed: type(other)._make(other, seed + 1)  # another pool than the one that was recorded
+    with pytest.warns(UserWarning, match="at the start of new episodes: CartPole-v1 on this EnvPool does not repeat"):
+        again = rejeu.DQN.resume(tmp_path, other)
+    assert not again.resumed.exact
+    assert again.learn().num_timesteps == 100
+
+
+def test_a_record_with_more_operations_than_it_says_is_refused_at_the_first_too_many():
+    with closing(make_vector("CartPole-v1", 2, "envpool", seed=1)) as env:
+        obs = env.reset().copy()
+        many = np.frombuffer(zlib.compress(bytes([action_log.RESET]) * action_log.BLOCK), np.uint8)
+        saved = {**env.snapshot(), "blocks": [many]}
+        with pytest.raises(ValueError, match="does not hold the 1 operations"):
+            env.restore(saved, obs)
+        with pytest.raises(ValueError, match="n_operations"):
+            env.restore({**saved, "n_operations": 10**8}, obs)

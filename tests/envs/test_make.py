@@ -1,0 +1,449 @@
+"""Every backend keeps the same contract: the true successor is seen, and nothing resets by itself."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, make_vector
+from rejeu.envs.registry import make_env
+from rejeu.errors import MissingExtra
+from tests.environments import Counter, Reach, Sampled
+from tests.helpers import small_sac
+
+LENGTHS = (2, 4), (3, 1)
+"""Of the episodes of two environments, over and over."""
+MODES = (AutoresetMode.DISABLED, AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+
+
+def counters():
+    return [lambda lengths=lengths: Counter(lengths) for lengths in LENGTHS]
+
+
+def in_process():
+    return InProcess([make() for make in counters()], seed=7)
+
+
+def synchronous(mode):
+    return lambda: GymnasiumVector(SyncVectorEnv(counters(), autoreset_mode=mode), seed=7)
+
+
+def walk(vector, n_steps=12):
+    """Observations that actions are chosen from, and steps, as the training loop sees them (copied)."""
+    rows = []
+    obs = vector.reset().copy()
+    for _ in range(n_steps):
+        step = vector.step(np.zeros((vector.n_envs, *vector.action_space.shape), np.float32))
+        rows.append((obs, step.obs.copy(), step.reward.copy(), step.terminated.copy(), step.truncated.copy()))
+        done = step.terminated | step.truncated
+        obs = (vector.reset_done(done) if done.any() else step.obs).copy()
+    return rows
+
+
+def expected_walk(n_steps=12):
+    """The (episode, time) pairs of the two counters, by counting."""
+    rows, episode, time = [], [0, 0], [0, 0]
+    for _ in range(n_steps):
+        before = [(episode[i], time[i]) for i in range(2)]
+        time = [t + 1 for t in time]
+        after = [(episode[i], time[i]) for i in range(2)]
+        over = [time[i] == LENGTHS[i][episode[i] % 2] for i in range(2)]
+        rows.append((before, after, over))
+        for i in range(2):
+            if over[i]:
+                episode[i], time[i] = episode[i] + 1, 0
+    return rows
+
+
+@pytest.mark.parametrize("make", [in_process, *map(synchronous, MODES)], ids=["in-process", *(m.name for m in MODES)])
+def test_the_successor_of_every_step_is_the_true_one(make):
+    vector = make()
+    for (obs, next_obs, reward, terminated, truncated), (before, after, over) in zip(
+        walk(vector), expected_walk(), strict=True
+    ):
+        np.testing.assert_array_equal(obs[:, :2], before)
+        np.testing.assert_array_equal(next_obs[:, :2], after)
+        np.testing.assert_array_equal(next_obs[:, 2], obs[:, 2])  # drawn once an episode
+        np.testing.assert_array_equal(reward, [100 * episode + time for episode, time in before])
+        np.testing.assert_array_equal(truncated, over)
+        assert not terminated.any()
+        assert obs.dtype == next_obs.dtype == reward.dtype == np.float32
+    vector.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_all_gymnasium_vectors_walk_like_the_one_in_process(mode):
+    for one, two in zip(walk(in_process()), walk(synchronous(mode)()), strict=True):
+        for left, right in zip(one, two, strict=True):
+            np.testing.assert_array_equal(left, right)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_worker_processes_walk_like_the_one_in_process(mode):
+    vector = GymnasiumVector(AsyncVectorEnv(counters(), autoreset_mode=mode, context="forkserver"), seed=7)
+    assert vector.backend == "gymnasium-async"
+    for one, two in zip(walk(in_process()), walk(vector), strict=True):
+        for left, right in zip(one, two, strict=True):
+            np.testing.assert_array_equal(left, right)
+    vector.close()
+
+
+def test_a_termination_is_reported_as_one():
+    vector = InProcess([Counter((1,), "terminated")])
+    vector.reset()
+    step = vector.step(np.zeros((1, 1), np.float32))
+    assert step.terminated.tolist() == [True]
+    assert step.truncated.tolist() == [False]
+
+
+def test_a_vector_that_resets_itself_beyond_repair_is_refused():
+    class Own(gym.vector.VectorEnv):
+        metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    with pytest.raises(ValueError, match=r"Own resets by itself .*AutoresetMode.DISABLED or SAME_STEP"):
+        GymnasiumVector(Own())
+
+
+# Observations of Dict spaces.
+
+
+class Unordered(gym.Env):
+    """Returns its observation as highway-env does: an OrderedDict, the keys not sorted."""
+
+    observation_space = gym.spaces.Dict({k: gym.spaces.Box(0, 9, (1,), np.float64) for k in "zab"})
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def observe(self):
+        return OrderedDict([("z", np.array([3.0])), ("a", np.array([1.0])), ("b", np.array([2.0]))])
+
+    def reset(self, *, seed=None, options=None):
+        return self.observe(), {}
+
+    def step(self, action):
+        return self.observe(), 0.0, True, False, {}
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: InProcess([Unordered(), Unordered()]),
+        lambda: GymnasiumVector(SyncVectorEnv([Unordered] * 2, autoreset_mode=AutoresetMode.DISABLED)),
+        lambda: GymnasiumVector(SyncVectorEnv([Unordered] * 2, autoreset_mode=AutoresetMode.SAME_STEP)),
+    ],
+    ids=["in-process", "DISABLED", "SAME_STEP"],
+)
+def test_keys_keep_their_values_whatever_mapping_the_environment_returns(make):
+    vector = make()
+    for obs in (vector.reset(), vector.step(np.zeros((2, 1), np.float32)).obs, vector.reset_done(np.ones(2, bool))):
+        assert type(obs) is dict
+        assert {key: value.tolist() for key, value in obs.items()} == {
+            "a": [[1.0], [1.0]],
+            "b": [[2.0], [2.0]],
+            "z": [[3.0], [3.0]],
+        }
+        assert obs["a"].dtype == np.float32
+
+
+def test_parking_observations_mean_the_same_on_every_backend():
+    """highway-env puts observation before the goals; EnvPool sorts. In the first observation, position is achieved."""
+    for backend in ("gymnasium", "envpool"):
+        vector = make_vector("parking-v0", 2, backend, seed=0)
+        obs = vector.reset()
+        np.testing.assert_allclose(obs["observation"], obs["achieved_goal"], atol=1e-6)
+        # The goal is a parking spot: its velocity is zero and it points up or down, unlike a car that starts anyhow.
+        np.testing.assert_allclose(obs["desired_goal"][:, 2:4], 0.0, atol=1e-6)
+        np.testing.assert_allclose(np.abs(obs["desired_goal"][:, 5]), 1.0, atol=1e-6)
+        vector.close()
+
+
+def test_observations_of_tuples_and_numbers_are_stacked():
+    space = gym.spaces.Tuple([gym.spaces.Discrete(5, start=2), gym.spaces.MultiBinary(3)])
+    vector = InProcess([Sampled(space), Sampled(space)], seed=0)
+    number, bits = vector.reset()
+    assert (number.shape, number.dtype) == ((2,), np.int32)
+    assert (bits.shape, bits.dtype) == ((2, 3), np.int8)
+    assert set(number.tolist()) <= {2, 3, 4, 5, 6}
+
+
+# Seeds.
+
+
+def first_observations(vector, resets=3):
+    every = np.ones(vector.n_envs, bool)
+    seen = [np.array(vector.reset()), *(np.array(vector.reset_done(every)) for _ in range(resets))]
+    vector.close()
+    return np.stack(seen)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_one_seed_gives_one_series_of_episodes_and_another_another(backend):
+    one, two, other = (first_observations(make_vector("Pendulum-v1", 3, backend, seed)) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, two)
+    assert (one != other).any()
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_environments_of_a_vector_start_differently(backend):
+    obs = make_vector("Pendulum-v1", 3, backend, seed=5).reset()
+    assert len(np.unique(obs[:, 0])) == 3
+
+
+def test_in_process_environments_are_seeded_one_after_the_other():
+    """Environment i of a vector with seed s starts as a single environment with seed s + i."""
+    obs = make_vector("Pendulum-v1", 2, "gymnasium", seed=5).reset()
+    for i in range(2):
+        np.testing.assert_array_equal(obs[i], gym.make("Pendulum-v1").reset(seed=5 + i)[0])
+
+
+@pytest.mark.parametrize("seed", [0, 2**31 - 1, 2**31, 2**32 - 1])
+def test_envpool_takes_every_seed_that_an_agent_does(seed):
+    vector = make_vector("Pendulum-v1", 2, "envpool", seed)
+    assert np.isfinite(vector.reset()).all()
+
+
+def test_a_seed_is_used_once_and_later_resets_differ():
+    vector = make_vector("Pendulum-v1", 1, "gymnasium", seed=5)
+    assert (np.array(vector.reset()) != np.array(vector.reset())).any()
+
+
+# EnvPool.
+
+
+def test_envpool_walks_one_trajectory_a_seed():
+    walks = []
+    for _ in range(2):
+        vector = EnvPool("CartPole-v1", 3, seed=1)
+        rng, obs, seen = np.random.default_rng(0), vector.reset(), []
+        for _ in range(80):
+            step = vector.step(rng.integers(2, size=3, dtype=np.int32))
+            done = step.terminated | step.truncated
+            obs = vector.reset_done(done) if done.any() else step.obs
+            seen.append((np.array(step.obs), step.reward, done, np.array(obs)))
+        walks.append(seen)
+        vector.close()
+    assert any(done.any() for _, _, done, _ in walks[0])
+    for one, two in zip(*walks, strict=True):
+        for left, right in zip(one, two, strict=True):
+            np.testing.assert_array_equal(left, right)
+
+
+def test_envpool_shows_the_final_observation_and_restarts_only_what_ended():
+    """CartPole ends beyond 12 degrees (0.2095 rad) or 2.4 m, and starts within 0.05 of 0 in all four numbers."""
+    vector = EnvPool("CartPole-v1", 4, seed=1)
+    rng, ended = np.random.default_rng(0), 0
+    vector.reset()
+    for _ in range(80):
+        step = vector.step(rng.integers(2, size=4, dtype=np.int32))
+        before = np.array(step.obs)
+        outside = (np.abs(before[:, 2]) > 0.2094) | (np.abs(before[:, 0]) > 2.4)
+        np.testing.assert_array_equal(step.terminated, outside)
+        if step.terminated.any():
+            after = vector.reset_done(step.terminated)
+            assert (np.abs(after[step.terminated]) <= 0.05).all()
+            np.testing.assert_array_equal(after[~step.terminated], before[~step.terminated])
+            np.testing.assert_array_equal(step.obs, before)
+            ended += 1
+    assert ended > 3
+    vector.close()
+
+
+def test_envpool_knows_its_time_limit():
+    vector = EnvPool("Pendulum-v1", 1, seed=0)
+    assert vector.max_episode_steps == 200
+    vector.reset()
+    for t in range(200):
+        step = vector.step(np.zeros((1, 1), np.float32))
+        assert bool(step.truncated[0]) == (t == 199)
+        assert not step.terminated[0]
+    vector.close()
+
+
+def test_envpool_environments_without_a_time_limit_have_none():
+    """EnvPool says 2,147,483,647 of them."""
+    vector = EnvPool("CliffWalking-v0", 1, seed=0)
+    assert vector.max_episode_steps is None
+    vector.close()
+
+
+# Success.
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: InProcess([Reach(stops=True), Reach(stops=True)], seed=0),
+        lambda: synchronous_reach(AutoresetMode.DISABLED),
+        lambda: synchronous_reach(AutoresetMode.SAME_STEP),
+    ],
+    ids=["in-process", "DISABLED", "SAME_STEP"],
+)
+def test_success_is_read_from_the_step_that_ended_the_episode(make):
+    vector = make()
+    obs, outcomes = vector.reset(), []
+    for t in range(60):
+        towards = np.clip(obs["desired_goal"] - obs["achieved_goal"], -1, 1)
+        step = vector.step(towards if t % 20 < 10 else -np.sign(towards + 1e-9))
+        done = step.terminated | step.truncated
+        for i in np.flatnonzero(done):
+            reached = abs(step.obs["achieved_goal"][i, 0] - step.obs["desired_goal"][i, 0]) < 0.5
+            assert vector.success(step, i) == float(reached)
+            outcomes.append(reached)
+        obs = vector.reset_done(done) if done.any() else step.obs
+    assert {bool(o) for o in outcomes} == {True, False}
+
+
+def synchronous_reach(mode):
+    return GymnasiumVector(SyncVectorEnv([lambda: Reach(stops=True)] * 2, autoreset_mode=mode), seed=0)
+
+
+def test_success_is_unknown_where_the_environment_does_not_say():
+    for vector in (in_process(), synchronous(AutoresetMode.DISABLED)(), EnvPool("Pendulum-v1", 2, 0)):
+        vector.reset()
+        step = vector.step(np.zeros((2, 1), np.float32))
+        assert np.isnan(vector.success(step, 1))
+
+
+# What may be given.
+
+
+def test_an_id_a_function_an_environment_and_a_vector_all_become_vectors():
+    assert make_vector("Pendulum-v1", 2, "gymnasium").n_envs == 2
+    assert make_vector(lambda: Counter(), 3).n_envs == 3
+    assert make_vector(Counter()).n_envs == 1
+    assert make_vector(SyncVectorEnv(counters())).n_envs == 2
+    vector = in_process()
+    assert make_vector(vector) is vector
+
+
+def test_auto_takes_envpool_only_without_environment_arguments():
+    assert make_vector("Pendulum-v1").backend == "envpool"
+    assert make_vector("Pendulum-v1", g=9.0).backend == "gymnasium"
+
+
+def test_environment_arguments_reach_the_environment():
+    assert make_vector("Pendulum-v1", g=9.0).envs[0].unwrapped.g == 9.0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: make_vector("Pendulum-v1", backend="gym"), "backend='gym' must be one of auto, envpool, gymnasium"),
+        (lambda: make_vector("Pendulum-v1", 0), "n_envs=0 must be a whole number of at least 1"),
+        (lambda: make_vector("Pendulum-v1", True), "n_envs=True must be"),
+        (lambda: make_vector(Counter(), 2), "n_envs=2 needs an id or a function"),
+        (
+            lambda: make_vector("Pendulum-v1", backend="envpool", g=9.0),
+            "envpool backend takes no environment arguments",
+        ),
+        (lambda: make_vector("Pendulun-v1"), "no environment is called 'Pendulun-v1'; did you mean .*Pendulum-v1"),
+        (lambda: make_vector("parkin-v0"), "no environment is called 'parkin-v0'; did you mean .*parking-v0"),
+        (lambda: make_vector("Zzzzzz"), "no environment is called 'Zzzzzz'; rejeu list"),
+        (lambda: make_vector("Pendulun-v1", backend="envpool"), "no environment is called 'Pendulun-v1'; did you mean"),
+    ],
+)
+def test_a_wrong_argument_is_named_with_its_remedy(call, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_environment_that_only_gymnasium_has_is_referred_to_it(monkeypatch):
+    monkeypatch.setitem(gym.registry, "OnlyHere-v0", gym.envs.registration.EnvSpec("OnlyHere-v0", Counter))
+    with pytest.raises(ValueError, match="EnvPool has no OnlyHere-v0; use backend='gymnasium'"):
+        make_vector("OnlyHere-v0", backend="envpool")
+    assert make_vector("OnlyHere-v0").backend == "gymnasium"
+
+
+def test_something_that_is_no_environment_is_refused():
+    with pytest.raises(TypeError, match=r"env must be an id, a Gymnasium environment, .* got int"):
+        make_vector(3)
+
+
+def test_one_environment_given_several_times_is_refused():
+    env = Counter()
+    with pytest.raises(ValueError, match="same environment was given more than once"):
+        make_vector(lambda: env, 2)
+
+
+def test_a_missing_package_is_named_with_the_command_that_installs_it(monkeypatch):
+    import importlib.util
+
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "gymnasium_robotics" else real(name))
+    with pytest.raises(MissingExtra, match=r"FetchReach-v99 needs gymnasium-robotics.*pip install 'rejeu\[robotics\]'"):
+        make_env("FetchReach-v99")
+
+
+def test_a_dependency_that_gymnasium_misses_is_named_likewise(monkeypatch):
+    def make(*args, **kwargs):
+        raise gym.error.DependencyNotInstalled("Box2D is not installed, run `pip install swig`")
+
+    monkeypatch.setattr(gym, "make", make)
+    with pytest.raises(MissingExtra, match=r"pip install 'rejeu\[box2d\]'"):
+        make_env("LunarLander-v3")
+
+
+# One seed for each environment.
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async", "envpool"])
+def test_each_environment_begins_with_the_seed_that_is_given_for_it(backend):
+    """What a single environment shows with that seed: two of the seeds are equal, and so are their episodes."""
+    seeds = [7, 3, 7]
+    vector = make_vector("Pendulum-v1", 3, backend, seed=seeds)
+    obs = np.array(vector.reset())
+    for row, seed in zip(obs, seeds, strict=True):
+        one = make_vector("Pendulum-v1", 1, backend.removesuffix("-async"), seed=seed)
+        np.testing.assert_array_equal(row, one.reset()[0])
+        one.close()
+    again = np.array(vector.reset([3, 3, 7]))
+    np.testing.assert_array_equal(again, obs[[1, 1, 0]])
+    vector.close()
+
+
+def test_a_gymnasium_vector_environment_takes_one_seed_for_each_environment():
+    make = lambda: gym.make("Pendulum-v1")  # noqa: E731
+    vector = make_vector(gym.vector.SyncVectorEnv([make, make]), seed=[5, 2])
+    expected = [make().reset(seed=seed)[0] for seed in (5, 2)]
+    np.testing.assert_array_equal(vector.reset(), expected)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_training_begins_with_the_seeds_given_for_each_environment_and_not_with_the_agents(backend):
+    def first(agent_seed, seeds):
+        env = make_vector("Pendulum-v1", 2, backend, seed=seeds)
+        agent = small_sac(env, seed=agent_seed)
+        seen = []
+        agent.learn(2, lambda agent, turn: seen.append(agent._run.replay.arrays()["obs.array"][:, 0]))
+        return seen[0]
+
+    expected = np.array(make_vector("Pendulum-v1", 2, backend, seed=[4, 9]).reset())
+    np.testing.assert_array_equal(first(0, [4, 9]), expected)
+    np.testing.assert_array_equal(first(1, [4, 9]), expected)
+    assert (first(0, 4) != first(1, 4)).any()  # one number is the agent's to choose
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        ([1, 2], r"seed=\[1, 2\] must be a number, or a sequence of 3 numbers, one for each environment"),
+        ([1, 2, -3], "must have whole numbers from 0 to 2"),
+        ([1, 2, 2.5], "must have whole numbers from 0 to 2"),
+        ([1, 2, 2**31], "must have whole numbers from 0 to 2"),
+    ],
+)
+def test_seeds_that_are_not_one_for_each_environment_are_refused(seed, message):
+    with pytest.raises(ValueError, match=message):
+        make_vector("Pendulum-v1", 3, "gymnasium", seed=seed)
+
+
+def test_a_vector_that_seeds_its_environments_itself_takes_one_number():
+    from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor
+
+    venv = VecMonitor(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
+    with pytest.raises(ValueError, match="VecMonitor takes one number and seeds its environments itself"):
+        make_vector(venv, seed=[1, 2])

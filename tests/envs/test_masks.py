@@ -1,0 +1,450 @@
+"""Action masks: what is forbidden is never done nor learnt from, and who says what is allowed, and when."""
+
+from __future__ import annotations
+
+import functools
+import os
+
+import gymnasium as gym
+import jax
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import rejeu
+from rejeu.algorithms import ppo
+from rejeu.algorithms.actor_critic import samples
+from rejeu.core import Clock, Masked
+from rejeu.envs.make import InProcess, make_vector
+from rejeu.envs.masks import make_masked
+from rejeu.errors import BadEnvironmentError, WorkerError
+from tests.environments import Counter
+from tests.helpers import assert_same_parameters
+
+CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
+ACTIONS = {
+    "discrete": spaces.Discrete(5),
+    "shifted": spaces.Discrete(4, start=-2),
+    "multi": spaces.MultiDiscrete([2, 3, 4]),
+    "binary": spaces.MultiBinary(4),
+}
+
+
+def sizes(space):
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    return [int(n) for n in space.nvec] if isinstance(space, spaces.MultiDiscrete) else [1] * space.n
+
+
+class Rules(gym.Env):
+    """Allows something else at every step, and refuses to take what it forbade; episodes of 1 to 6 steps.
+
+    The observation is noise, so nothing but the mask says what is allowed. The mask is given by ``info`` or by method.
+    """
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def __init__(self, kind="discrete", by="info", all_at_end=True):
+        self.action_space = ACTIONS[kind]
+        self.by, self.all_at_end = by, all_at_end
+        self.taken, self.masks, self.seeds = 0, [], []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seeds.append(seed)
+        self.time, self.length = 0, int(self.np_random.integers(1, 7))
+        return self.see(), self.info()
+
+    def step(self, action):
+        assert self.allows(action), f"{action} is forbidden by {self.mask}"
+        self.taken += 1
+        self.time += 1
+        over = self.time >= self.length
+        reward = float(np.sum(action))
+        obs = self.see()
+        if over and not self.all_at_end:
+            self.mask = np.zeros_like(self.mask)
+        return obs, reward, over and self.taken % 2 == 0, over and self.taken % 2 == 1, self.info()
+
+    def see(self):
+        parts = []
+        for n in sizes(self.action_space):
+            part = self.np_random.random(n) < 0.4
+            if not isinstance(self.action_space, spaces.MultiBinary):
+                part[self.np_random.integers(n)] = True
+            parts.append(part)
+        self.mask = np.concatenate(parts)
+        self.masks.append(self.mask)
+        return self.np_random.normal(size=2).astype(np.float32)
+
+    def info(self):
+        return {"action_mask": self.mask.astype(np.int8)} if self.by == "info" else {}
+
+    def action_masks(self):
+        if self.by == "info":
+            raise AssertionError("the info says it already")
+        return self.mask
+
+    def allows(self, action):
+        space = self.action_space
+        assert space.contains(action) or space.contains(np.asarray(action, space.dtype)), action
+        if isinstance(space, spaces.MultiBinary):
+            return bool(np.all(self.mask | (np.asarray(action) == 0)))
+        chosen = np.atleast_1d(action) - (space.start if isinstance(space, spaces.Discrete) else 0)
+        ends = np.cumsum([0, *sizes(space)])[:-1]
+        return bool(self.mask[ends + chosen].all())
+
+
+class Silent(Rules):
+    """Says nowhere what is allowed."""
+
+    def __init__(self):
+        super().__init__(by="nowhere")
+
+    action_masks = property(lambda self: self.no_such_attribute)  # as where there is no method
+
+
+SMALL = {"policy_kwargs": {"net_arch": [4]}, "n_steps": 64, "batch_size": 64, "n_epochs": 1, "seed": 0}
+
+
+def small(env, **settings):
+    return rejeu.MaskablePPO("MlpPolicy", env, **{**SMALL, **settings})
+
+
+def vector(kind, by="info", n_envs=3):
+    return InProcess([Rules(kind, by) for _ in range(n_envs)], seed=0)
+
+
+# What is forbidden is not done: the environment itself checks every action.
+
+
+@pytest.mark.parametrize("kind", list(ACTIONS))
+@pytest.mark.parametrize(("by", "n_envs"), [("info", 3), ("method", 1)])
+def test_what_is_forbidden_is_never_done(kind, by, n_envs):
+    env = vector(kind, by, n_envs)
+    agent = small(env, learning_rate=0.05).learn(1000)
+    assert sum(one.taken for one in env.envs) == -(-1000 // n_envs) * n_envs
+    assert len(agent.history) > 100
+    other = vector(kind, by, n_envs)
+    for deterministic in (True, False):
+        agent.evaluate(60, env=other, deterministic=deterministic)
+    assert sum(one.taken for one in other.envs) > 200
+    assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+def test_a_rollout_of_whole_episodes_keeps_to_the_masks():
+    env = vector("multi")
+    small(env, n_episodes=2, n_steps=6).learn(300)
+    assert sum(one.taken for one in env.envs) >= 300
+
+
+def test_masks_come_out_of_worker_processes():
+    env = make_masked(functools.partial(Rules, "discrete"), 2, "gymnasium-async", seed=0)
+    try:
+        agent = small(env, n_steps=16).learn(64)
+        assert agent.env.backend == "gymnasium-async"
+    finally:
+        env.close()
+
+
+class Leaving(gym.Env):
+    """Allows both of two actions, at the second of which its process ends."""
+
+    observation_space = spaces.Box(0.0, 9.0, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {"action_mask": [1, 1]}
+
+    def step(self, action):
+        if action == 1:
+            os._exit(3)
+        return np.ones(1, np.float32), 0.0, False, False, {"action_mask": [1, 1]}
+
+
+def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
+    env = make_masked(Leaving, 2, "gymnasium-async", seed=0, worker_timeout=60.0, restart_workers=1)
+    try:
+        env.reset()
+        with pytest.warns(RuntimeWarning, match=r"started anew \(1 of at most 1 times\)"):
+            step = env.step(np.array([0, 1]))
+        assert step.truncated.tolist() == [False, True]
+        assert env.reset_done(step.truncated).mask.tolist() == [[True, True]] * 2
+        with pytest.raises(WorkerError, match="and 1 restarts are spent"):
+            env.step(np.array([0, 1]))
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"restart_workers": 1}, "restart_workers=1 is for worker processes, got backend='auto'"),
+        ({"worker_timeout": 0.0}, "worker_timeout=0.0 must be a number of seconds above 0"),
+    ],
+)
+def test_worker_options_without_meaning_are_refused_for_masks_too(given, message):
+    for env in (Leaving, Leaving(), vector("discrete")):
+        with pytest.raises(ValueError, match=message):
+            make_masked(env, **given)
+
+
+@pytest.mark.parametrize("normalize", [True, {"norm_reward": False}])
+def test_masks_and_normalisation_go_together(normalize):
+    env = vector("discrete")
+    agent = small(env, normalize=normalize).learn(384)
+    statistics = agent.state.statistics
+    assert [m.mean.shape for m in statistics.obs] == [(2,)]
+    assert float(statistics.obs[0].n_seen) == 384
+    agent.evaluate(20, env=vector("discrete"))
+
+
+# What is learnt from.
+
+
+def recorded(kind):
+    """An agent after one rollout, the rollout that it is about to learn from, and the environments."""
+    env = vector(kind, n_envs=2)
+    agent = small(env, n_steps=32)
+    rollouts, update = [], agent._compiled.update
+
+    def keep(state, batches, clock):
+        rollouts.append((agent.state, jax.tree.map(np.array, batches)))
+        return update(state, batches, clock)
+
+    agent._compiled.update = keep
+    agent.learn(64)
+    return rollouts[0], env
+
+
+@pytest.mark.parametrize("kind", list(ACTIONS))
+def test_masks_are_stored_with_the_step_that_they_belong_to(kind):
+    (_, rollout), env = recorded(kind)
+    mask = rollout.obs.mask
+    assert mask.dtype == bool
+    space = ACTIONS[kind]
+    for e, one in enumerate(env.envs):
+        shown = iter(one.masks)
+        for t in range(32):
+            assert np.array_equal(mask[t, e], next(shown)), (t, e)
+            following = next(shown)
+            assert np.array_equal(rollout.next_obs.mask[t, e], following)
+            if not rollout.ended[t, e]:
+                shown = iter([following, *shown])
+            own = type("", (), {})()
+            own.mask, own.action_space = mask[t, e], space
+            start = space.start if isinstance(space, spaces.Discrete) else 0
+            action = rollout.action[t, e] + start
+            assert Rules.allows(own, action)
+
+
+def allowed_distribution(logits, mask, space):
+    """Probabilities of each part over the allowed possibilities alone, in float64."""
+    parts, at = [], 0
+    for n in sizes(space):
+        x, m = np.float64(logits[at : at + n]), mask[at : at + n]
+        if isinstance(space, spaces.MultiBinary):
+            parts.append(
+                np.array([1.0, 0.0]) if not m[0] else np.array([1 - 1 / (1 + np.exp(-x[0])), 1 / (1 + np.exp(-x[0]))])
+            )
+        else:
+            p = np.where(m, np.exp(x - x[m].max()), 0.0)
+            parts.append(p / p.sum())
+        at += n
+    return parts
+
+
+@pytest.mark.parametrize("kind", list(ACTIONS))
+def test_learning_knows_the_probabilities_among_what_was_allowed(kind):
+    (state, rollout), _ = recorded(kind)
+    space = ACTIONS[kind]
+    bold = jax.tree.map(lambda x: 3.0 * x, state.network)
+    data = samples(bold, rollout, 0.95)
+    distribution = bold.policy(data.obs)
+    raw = bold.head(bold.hidden(data.obs.obs))
+    raw, entropy = np.float64(raw), np.asarray(distribution.entropy())
+    action = np.asarray(data.action).reshape(64, -1)
+    for i in range(64):
+        parts = allowed_distribution(raw[i], np.asarray(data.obs.mask)[i], space)
+        log_prob = sum(np.log(p[a]) for p, a in zip(parts, action[i], strict=True))
+        assert float(data.log_prob[i]) == pytest.approx(log_prob, abs=2e-5)
+        h = -sum((p[p > 0] * np.log(p[p > 0])).sum() for p in parts)
+        assert float(entropy[i]) == pytest.approx(h, abs=2e-5)
+
+
+def test_what_is_forbidden_gets_no_gradient():
+    (state, rollout), _ = recorded("discrete")
+    mask = np.ones((32, 2, 5), bool)
+    mask[..., 3] = False
+    action = np.where(rollout.action == 3, 0, rollout.action)
+    rollout = rollout._replace(obs=Masked(rollout.obs.obs, mask), action=action)
+    data = samples(state.network, rollout, 0.95)
+    config = ppo.Config(ent_coef=0.1)
+    slope = jax.grad(lambda n: ppo.loss(n, data, config, CLOCK)[0])(state.network)
+    weight = np.asarray(slope.head.weight)
+    assert np.abs(weight[:, 3]).max() == 0.0
+    assert np.abs(np.delete(weight, 3, axis=1)).min() > 0.0
+
+
+def test_the_best_of_what_is_allowed_is_learnt():
+    """Rewards are the action itself: with the mask in hand the best is the largest that is allowed."""
+    agent = small(vector("discrete"), gamma=0.0, learning_rate=0.02, n_steps=128, n_epochs=4).learn(4000)
+    rng = np.random.default_rng(0)
+    mask = rng.random((100, 5)) < 0.5
+    mask[np.arange(100), rng.integers(0, 5, 100)] = True
+    action, _ = agent.predict(rng.normal(size=(100, 2)).astype(np.float32), deterministic=True, action_masks=mask)
+    best = [np.flatnonzero(m)[-1] for m in mask]
+    assert np.mean(action == best) > 0.9
+
+
+# Predict.
+
+
+def test_predict_keeps_to_the_mask_that_it_is_given():
+    agent = small(vector("shifted"))
+    obs = np.random.default_rng(0).normal(size=(300, 2)).astype(np.float32)
+    mask = np.tile([0, 1, 0, 1], (300, 1))
+    for deterministic in (True, False):
+        action, _ = agent.predict(obs, deterministic=deterministic, action_masks=mask)
+        assert set(action.tolist()) <= {-1, 1}
+    assert set(agent.predict(obs, action_masks=mask)[0].tolist()) == {-1, 1}
+    assert set(agent.predict(obs)[0].tolist()) == {-2, -1, 0, 1}  # without a mask all is allowed
+    assert agent.predict(obs[0], action_masks=[0, 0, 1, 0])[0] == 0
+
+
+def test_predict_refuses_a_mask_of_another_length():
+    agent = small(vector("shifted"))
+    with pytest.raises(ValueError, match=r"action_masks has shape \(3,\), expected \(1, 4\)"):
+        agent.predict(np.zeros(2, np.float32), action_masks=[1, 1, 1])
+
+
+def test_other_agents_take_no_masks():
+    with pytest.raises(TypeError, match="use MaskablePPO"):
+        rejeu.PPO("MlpPolicy", Rules(), n_steps=4).predict(np.zeros(2, np.float32), action_masks=np.ones(5))
+
+
+def test_a_file_keeps_all_of_it(tmp_path):
+    agent = small(vector("multi")).learn(192)
+    loaded = rejeu.load(agent.save(tmp_path / "model"), env=vector("multi"))
+    assert isinstance(loaded, rejeu.MaskablePPO)
+    assert_same_parameters(agent, loaded)
+    rng = np.random.default_rng(1)
+    obs, mask = rng.normal(size=(20, 2)).astype(np.float32), np.ones((20, 9), bool)
+    mask[:, [0, 2, 7]] = False
+    one, other = (a.predict(obs, deterministic=True, action_masks=mask)[0] for a in (agent, loaded))
+    assert np.array_equal(one, other)
+    loaded.learn(192)
+
+
+def test_a_registered_environment_is_made_anew_for_evaluation():
+    gym.register("rejeu-test/Rules-v0", functools.partial(Rules, "discrete"), max_episode_steps=50)
+    agent = small("rejeu-test/Rules-v0").learn(64)
+    assert agent.env.max_episode_steps == 50
+    one, other = (agent.evaluate(8, seed=3).returns for _ in range(2))
+    assert np.array_equal(one, other)
+
+
+# Where masks come from.
+
+
+def test_environments_seeded_before_masks_were_asked_for_stay_seeded():
+    agent = small(vector("discrete"))
+    seeds = []
+    for seed in (4, 4, 5):
+        env = InProcess([Rules(), Rules()], seed)
+        seeds.append([agent.evaluate(10, env=env).returns.tolist(), env.envs[1].seeds[0]])
+    assert seeds[0] == seeds[1] != seeds[2]
+    assert seeds[0][1] == 5
+
+
+def test_an_episode_may_end_where_nothing_is_allowed():
+    env = InProcess([Rules(all_at_end=False) for _ in range(2)], seed=0)
+    agent = small(env, n_steps=16).learn(64)
+    agent.evaluate(4, env=InProcess([Rules(all_at_end=False)], seed=0))
+    assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+class Fixed(Counter):
+    """A counter that always shows the same mask."""
+
+    def __init__(self, mask, space=None):
+        super().__init__((4,))
+        self.action_space = spaces.Discrete(3) if space is None else space
+        self.action_masks = lambda: mask
+
+
+@pytest.mark.parametrize(
+    ("mask", "space", "message"),
+    [
+        ([0, 0, 0], None, r"Fixed allows no action: its mask is \[0, 0, 0\]"),
+        ([1, 1], None, "Fixed gave a mask of 2 entries, expected 3"),
+        ([1, 1, 0, 0], spaces.MultiDiscrete([2, 2]), "Fixed allows no action"),
+    ],
+)
+def test_a_mask_that_cannot_be_kept_to_is_refused(mask, space, message):
+    with pytest.raises(BadEnvironmentError, match=message):
+        small(Fixed(mask, space), n_steps=4).learn(4)
+
+
+def test_masks_may_come_as_a_list_of_parts():
+    env = Fixed([np.array([1, 0]), [False, True]], spaces.MultiDiscrete([2, 2]))
+    small(env, n_steps=4).learn(8)
+    assert np.array_equal(np.unique(env.actions, axis=0), [[0, 1]])
+
+
+def test_an_environment_that_says_nothing_is_refused_with_the_fix():
+    with pytest.raises(BadEnvironmentError, match=r'put info\["action_mask"\] into what reset and step return'):
+        small(Silent(), n_steps=4).learn(4)
+
+
+@pytest.mark.parametrize(
+    ("env", "error", "message"),
+    [
+        (
+            lambda: Counter(),
+            ValueError,
+            "masks need Discrete, MultiDiscrete or MultiBinary actions; Counter has .* use PPO",
+        ),
+        (
+            lambda: make_vector("CartPole-v1", 2, "envpool"),
+            TypeError,
+            "the masks of EnvPool cannot be reached; give the id",
+        ),
+        (lambda: gym.vector.SyncVectorEnv([Rules]), TypeError, "the masks of SyncVectorEnv cannot be reached"),
+        (lambda: 3, TypeError, "must be an id, an environment or a function that makes one, got int"),
+    ],
+)
+def test_environments_whose_masks_cannot_be_had_are_refused(env, error, message):
+    with pytest.raises(error, match=message):
+        small(env())
+
+
+def test_the_id_of_an_envpool_environment_is_made_where_its_masks_can_be_reached():
+    with pytest.raises(BadEnvironmentError, match="CartPole-v1 says nowhere which actions are allowed"):
+        small("CartPole-v1", n_steps=4).learn(4)
+
+
+# Who looks on.
+
+
+class Drawn(Rules):
+    """Can be filmed."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    render_mode = "rgb_array"
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+def test_films_keep_to_the_masks(tmp_path):
+    agent = small(vector("multi"))
+    env = Drawn("multi")
+    rejeu.record_video(agent, tmp_path / "film.mp4", env, episodes=20, seed=0)
+    assert env.taken > 20
+
+
+def test_predict_takes_what_an_environment_with_its_mask_shows():
+    agent = small(vector("discrete"))
+    shown = {"observation": np.zeros(2, np.float32), "action_mask": np.array([0, 0, 0, 1, 0], np.int8)}
+    assert agent.predict(shown)[0] == 3

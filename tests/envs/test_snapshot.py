@@ -1,0 +1,215 @@
+"""Environments whose state can be taken out and put back, and those where it cannot."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import warnings
+from contextlib import closing
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.envs.make import make_vector
+from rejeu.envs.snapshot import restore, state_of
+from rejeu.io import plain
+
+CARRIED = [
+    "CartPole-v1",
+    "MountainCar-v0",
+    "MountainCarContinuous-v0",
+    "Pendulum-v1",
+    "Acrobot-v1",
+    "rejeu/Ball-v0",
+    "rejeu/CartPoleNoVelocity-v0",
+]
+MUJOCO = ["HalfCheetah-v5", "Hopper-v5", "Reacher-v5"]
+has_mujoco = importlib.util.find_spec("mujoco") is not None
+
+
+def walk(env, actions):
+    """Steps an environment, beginning anew where an episode ends, and returns all that it said."""
+    said = []
+    for action in actions:
+        obs, reward, terminated, truncated, _ = env.step(action)
+        said.append((np.copy(obs), reward, terminated, truncated))
+        if terminated or truncated:
+            said.append(np.copy(env.reset()[0]))
+    return said
+
+
+def assert_goes_on_alike(make, n_before=13, n_after=300):
+    one, two = make(), make()
+    one.action_space.seed(1)
+    actions = [one.action_space.sample() for _ in range(n_before + n_after)]
+    one.reset(seed=4)
+    walk(one, actions[:n_before])
+    arrays = {}
+    text = json.dumps(plain.encode(state_of(one), arrays, "env"), allow_nan=False)
+    expected = walk(one, actions[n_before:])
+    restore(two, plain.decode(json.loads(text), arrays))
+    np.testing.assert_equal(walk(two, actions[n_before:]), expected)
+    for env in (one, two):
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", CARRIED)
+def test_environments_go_on_alike(env_id):
+    assert_goes_on_alike(lambda: gym.make(env_id))
+
+
+@pytest.mark.skipif(not has_mujoco, reason="MuJoCo is not installed")
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_mujoco_goes_on_alike(env_id):
+    assert_goes_on_alike(lambda: gym.make(env_id), n_after=80)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        rejeu.Monitor,
+        gym.wrappers.RecordEpisodeStatistics,
+        lambda env: gym.wrappers.RescaleAction(env, -1, 1),
+        lambda env: gym.wrappers.TransformReward(env, lambda r: 2 * r),
+        lambda env: gym.wrappers.TimeLimit(env, 50),
+        gym.wrappers.ClipAction,
+        gym.wrappers.FlattenObservation,
+    ],
+)
+def test_wrappers_are_carried(wrap):
+    assert_goes_on_alike(lambda: wrap(gym.make("Pendulum-v1")))
+
+
+def test_monitors_count_on():
+    one, two = (rejeu.Monitor(gym.make("CartPole-v1")) for _ in range(2))
+    one.reset(seed=0)
+    walk(one, [1, 0, 1])
+    restore(two, state_of(one))
+    assert two.get_total_steps() == 3
+    while not (step := two.step(1))[2]:
+        pass
+    assert step[4]["episode"]["l"] == two.get_total_steps()
+
+
+def test_an_environment_that_has_not_begun_can_be_carried():
+    env = gym.make("Pendulum-v1")
+    restore(env, state_of(gym.make("Pendulum-v1")))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(1))
+
+
+class Remembering(gym.Wrapper):
+    """Remembers something, and does not say so."""
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Remembering(gym.make("Pendulum-v1")),
+        lambda: gym.wrappers.NormalizeObservation(gym.make("Pendulum-v1")),
+        lambda: gym.make("FrozenLake-v1"),
+    ],
+)
+def test_what_is_not_known_is_not_carried(make):
+    env = make()
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_box2d_cannot_be_carried():
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # of what SWIG generates, and it crashes where they are errors
+        pytest.importorskip("Box2D")
+    env = gym.make("LunarLander-v3")
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_an_heir_of_a_known_environment_is_not_taken_for_it():
+    class Heir(gym.envs.classic_control.PendulumEnv):
+        """Might remember more."""
+
+    env = Heir()
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_the_state_of_another_environment_is_refused():
+    pendulum, cart = gym.make("Pendulum-v1"), gym.make("CartPole-v1")
+    pendulum.reset(seed=0)
+    with pytest.raises(ValueError, match="expected"):
+        restore(cart, state_of(pendulum))
+    with pytest.raises(ValueError, match="another environment"):
+        restore(pendulum, state_of(pendulum)[:-1])
+    with pytest.raises(ValueError, match="another environment"):
+        restore(pendulum, [*state_of(pendulum), {}])
+
+
+def test_the_state_taken_out_does_not_move_with_the_environment():
+    env = gym.make("CartPole-v1")
+    env.reset(seed=0)
+    state = state_of(env)
+    before = json.dumps(plain.encode(state, arrays := {}, "x")), {k: v.copy() for k, v in arrays.items()}
+    walk(env, [0, 1] * 30)
+    after = json.dumps(plain.encode(state, arrays := {}, "x")), arrays
+    np.testing.assert_equal(after, before)
+
+
+@pytest.mark.parametrize(
+    ("backend", "n_envs"), [("gymnasium", 1), ("gymnasium", 3), ("gymnasium-async", 2), ("envpool", 3)]
+)
+def test_a_vector_continues_from_its_snapshot(backend, n_envs):
+    def make():
+        return make_vector("CartPole-v1", n_envs, backend, seed=2)
+
+    with closing(make()) as one, closing(make()) as two:
+        obs = one.reset()
+        for _ in range(5):
+            obs = one.step(np.ones(n_envs, int)).obs
+        saved = plain.decode(plain.encode(one.snapshot(), arrays := {}, "envs"), arrays)
+        assert two.restore(saved, obs.copy()) == []
+        assert_vectors_continue_alike(one, two)
+
+
+def test_a_snapshot_of_another_number_of_environments_is_refused():
+    for backend in ("gymnasium", "gymnasium-async"):
+        with closing(make_vector("CartPole-v1", 2, backend, seed=2)) as one:
+            one.reset()
+            with pytest.raises(ValueError, match="not those of 2 environments"):
+                one.restore(one.snapshot()[:1], None)
+
+
+def test_worker_processes_refuse_a_snapshot_of_another_environment():
+    with closing(make_vector("CartPole-v1", 1, "gymnasium-async", seed=2)) as one:
+        one.reset()
+        with pytest.raises(ValueError, match="environment 0 cannot be restored"):
+            one.restore([[{}]], None)
+
+
+def assert_vectors_continue_alike(one, two):
+    n_envs = one.n_envs
+    only_first = np.arange(n_envs) == 0
+    for active in (only_first, None):
+        first, second = one.step(np.zeros(n_envs, int), active), two.step(np.zeros(n_envs, int), active)
+        np.testing.assert_array_equal(first.obs, second.obs)
+    done = np.ones(n_envs, bool)
+    np.testing.assert_array_equal(one.reset_done(done).copy(), two.reset_done(done))
+
+
+def test_a_worker_that_is_lost_before_a_snapshot_ends_its_episode_at_the_next_step():
+    with closing(make_vector("CartPole-v1", 2, "gymnasium-async", seed=0, restart_workers=1)) as env:
+        env.reset()
+        env.step(np.zeros(2, int))
+        env.workers.workers[1].process.kill()
+        env.workers.workers[1].process.join()
+        with pytest.warns(RuntimeWarning, match="started anew"):
+            assert env.snapshot() is None
+        step = env.step(np.zeros(2, int))
+        assert step.truncated.tolist() == [False, True]
+        env.reset_done(step.truncated)
+        assert env.snapshot() is not None
+        assert not env.step(np.zeros(2, int)).truncated.any()

@@ -1,0 +1,607 @@
+"""Training stops, or goes on without it, where an update would leave NaN or infinity; and says what, where and why."""
+
+from __future__ import annotations
+
+import itertools
+
+import equinox as eqx
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import rejeu
+from rejeu import cli
+from rejeu.algorithms import sac
+from rejeu.buffers.prioritized import Priorities, PriorityConfig
+from rejeu.buffers.ring import Ring
+from rejeu.buffers.rollout import RolloutBuffer
+from rejeu.core import Rollout
+from rejeu.envs.make import InProcess
+from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
+from rejeu.loops import finite, nonfinite
+from rejeu.loops.packing import Readings
+from rejeu.normalization import merged, nothing
+from rejeu.spaces import Leaf
+from tests.environments import Counter, Reach, Sampled
+
+NETS = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
+OFF = {"learning_starts": 8, "batch_size": 4, "buffer_size": 300, **NETS}
+ON = {"n_steps": 8, **NETS}
+TOTAL = 40
+
+
+def box(n_envs=1, actions=None):
+    return InProcess([Sampled(gym.spaces.Box(-1.0, 1.0, (3,)), actions) for _ in range(n_envs)], seed=0)
+
+
+def choice():
+    return box(actions=gym.spaces.Discrete(3))
+
+
+class Rules(Sampled):
+    """Forbids the last of three actions."""
+
+    def __init__(self):
+        super().__init__(gym.spaces.Box(-1.0, 1.0, (3,)), gym.spaces.Discrete(3))
+
+    def action_masks(self):
+        return np.array([True, True, False])
+
+
+def her():
+    return InProcess([Reach()], seed=0)
+
+
+MAKE = {
+    "SAC": lambda **s: rejeu.SAC("MlpPolicy", box(), **OFF, **s),
+    "SAC, four steps in a scan": lambda **s: rejeu.SAC("MlpPolicy", box(), gradient_steps=4, **OFF, **s),
+    "SAC, three environments": lambda **s: rejeu.SAC("MlpPolicy", box(3), **OFF, **s),
+    "SAC with hindsight": lambda **s: rejeu.SAC(
+        "MultiInputPolicy", her(), replay_buffer_class="HerReplayBuffer", **OFF, **s
+    ),
+    "SAC, normalised": lambda **s: rejeu.SAC("MlpPolicy", box(), normalize=True, **OFF, **s),
+    "DQN with priorities": lambda **s: rejeu.DQN("MlpPolicy", choice(), priorities={}, train_freq=1, **OFF, **s),
+    "TD3": lambda **s: rejeu.TD3("MlpPolicy", box(), **OFF, **s),
+    "CrossQ": lambda **s: rejeu.CrossQ("MlpPolicy", box(), **OFF, **s),
+    "PPO": lambda **s: rejeu.PPO("MlpPolicy", box(2), batch_size=8, n_epochs=2, **ON, **s),
+    "PPO, normalised": lambda **s: rejeu.PPO("MlpPolicy", box(), batch_size=8, normalize=True, **ON, **s),
+    "A2C": lambda **s: rejeu.A2C("MlpPolicy", choice(), **ON, **s),
+    "MaskablePPO": lambda **s: rejeu.MaskablePPO("MlpPolicy", InProcess([Rules()], seed=0), batch_size=8, **ON, **s),
+    "RecurrentPPO": lambda **s: rejeu.RecurrentPPO(
+        "MlpPolicy",
+        box(2),
+        batch_size=8,
+        n_steps=8,
+        seed=0,
+        policy_kwargs={"lstm_hidden_size": 4, "net_arch": [4]},
+        **s,
+    ),
+}
+SCANS = ("SAC, four steps in a scan", "SAC, three environments")
+ON_POLICY = ("PPO", "PPO, normalised", "A2C", "MaskablePPO", "RecurrentPPO")
+
+
+def replace_update(agent, which, instead):
+    """Lets the ``which``-th call of the update, counted from 0, be ``instead(state, batches, clock)``."""
+    update, numbers = agent._compiled.update, itertools.count()
+    agent._compiled.update = lambda *arguments: (instead if next(numbers) == which else update)(*arguments)
+
+
+def poison(agent, which, value):
+    """Puts ``value`` into a reward of the ``which``-th sample or rollout, so that what is saved is what was learnt from."""
+    buffer, calls = agent._run.replay, []
+    name = "rollout" if isinstance(buffer, RolloutBuffer) else "draw"
+    method = getattr(buffer, name)
+
+    def poisoned(*arguments):
+        answer = method(*arguments)
+        data, *drawn = answer if name == "draw" else (answer,)
+        calls.append(data)
+        if len(calls) != which + 1:
+            return answer
+        rewards = np.array(data.reward)
+        if rewards.ndim == 1:
+            rewards[0] = value
+        else:
+            rewards[1, 0] = value  # of a scan its second batch, of a rollout its second step
+        data = data._replace(reward=rewards)
+        return (data, *drawn) if drawn else data
+
+    setattr(buffer, name, poisoned)
+
+
+def without_statistics(agent):
+    return {name: value for name, value in agent.get_parameters().items() if not name.startswith("statistics")}
+
+
+def assert_same(one, two):
+    assert list(one) == list(two)
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, two[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_an_update_that_breaks_something_ends_training_with_the_state_before_it(name, tmp_path):
+    is_on_policy = name in ON_POLICY
+    which = 1 if is_on_policy else 5
+    agent = MAKE[name]()
+    agent.report_folder = tmp_path
+    poison(agent, which, np.nan)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    error = caught.value
+    turn = agent.n_envs
+    assert error.step == (8 * turn * 2 if is_on_policy else error.step)
+
+    twin = MAKE[name]()
+    last = error.step // 2 if is_on_policy else error.step - turn
+    twin.learn(TOTAL, lambda _, progress: progress.step < last)
+    assert twin._run.step == last
+    if name in SCANS:  # the second of the steps in one call was the broken one
+        assert agent.state.n_updates == twin.state.n_updates + 1
+    else:
+        assert_same(without_statistics(agent), without_statistics(twin))
+    assert error.batch is not None
+    assert error.batch.parent == tmp_path
+    assert error.names
+    found = finite.examine(agent, error.batch)
+    assert [text.split(" ")[0] for text in (*found.losses, *found.leaves)] == list(error.names)
+    assert found.batch == ["reward (nan)"]
+    agent.learn(2 * turn, reset_num_timesteps=False)  # the batch is gone, and learning goes on
+    assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("name", ["SAC", "DQN with priorities", "A2C"])
+def test_infinity_and_overflow_are_found_as_nan_is(name, value, tmp_path):
+    agent = MAKE[name]()
+    agent.report_folder = tmp_path
+    poison(agent, 1, value)
+    if name == "DQN with priorities" and value == 1e30:  # Huber's loss: finite, and so is its gradient
+        agent.learn(12)
+        assert np.isfinite(agent._run.replay.priorities.tree.total)
+        return
+    with pytest.raises(NonFiniteError, match=r"became no finite number|the batch held reward"):
+        agent.learn(TOTAL)
+    assert all(np.isfinite(leaf).all() for leaf in agent.get_parameters().values())
+
+
+def broken_at(leaf, trigger=100.0):
+    """SAC's ``make`` whose update puts NaN into a leaf of the state, and nowhere else, where a reward is ``trigger``."""
+    make = sac.make
+
+    def changed(*arguments):
+        algorithm = make(*arguments)
+
+        def update(state, batch, clock):
+            after, metrics = algorithm.update(state, batch, clock)
+            factor = jnp.where(jnp.max(batch.reward) >= trigger, jnp.nan, 1.0)
+            return eqx.tree_at(leaf, after, leaf(after) * factor), metrics
+
+        return algorithm._replace(update=update)
+
+    return changed
+
+
+LEAVES = {
+    "critics.torso.layers.0.weight": lambda s: s.critics.torso.layers[0].weight,
+    "actor.head.bias": lambda s: s.actor.head.bias,
+    "log_alpha": lambda s: s.log_alpha,
+    "critics_optimizer.nu.head.weight": lambda s: s.critics_optimizer.nu.head.weight,
+}
+
+
+def test_a_weight_between_wide_layers_is_found_by_the_next_loss_and_yet_its_own_batch_is_named(monkeypatch, tmp_path):
+    """The device passes over arrays of more than 8,192 numbers; from what was kept the first to blame is found."""
+    monkeypatch.setattr(sac, "make", broken_at(lambda s: s.critics.torso.layers[1].weight))
+    for which in (4, nonfinite.STRETCH - 1):  # in the midst of a stretch, and the last of one
+        agent = rejeu.SAC("MlpPolicy", box(), **{**OFF, "policy_kwargs": {"net_arch": [100, 100]}})
+        agent.report_folder = tmp_path
+        poison(agent, which, 100.0)
+        with pytest.raises(NonFiniteError) as caught:
+            agent.learn(100)
+        assert caught.value.names == ("critics.torso.layers.1.weight",)
+        assert caught.value.step == 9 + which
+        assert agent.state.n_updates == which
+        assert float(finite.load_batch(agent, caught.value.batch)[0].reward[0]) == 100.0
+
+
+@pytest.mark.parametrize("name", LEAVES)
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_gradient_that_breaks_a_weight_is_named_though_all_losses_are_finite(name, size, monkeypatch, tmp_path):
+    monkeypatch.setattr(sac, "make", broken_at(LEAVES[name]))
+    agent = rejeu.SAC("MlpPolicy", box(), gradient_steps=size, **OFF)
+    agent.report_folder = tmp_path
+    poison(agent, 4, 100.0)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    assert caught.value.names == (name,)
+    assert str(caught.value).startswith(
+        f"{name} (nan) of the state became no finite number, at environment step 13, update "
+    )
+
+
+def test_the_message_names_step_update_batch_model_and_what_to_try(tmp_path):
+    agent = MAKE["SAC"]()
+    agent.learn(20)
+    model = agent.save(tmp_path / "model")
+    agent._run.replay.ring.records["reward"][:] = 1e30
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(5, reset_num_timesteps=False)
+    message = str(caught.value)
+    assert caught.value.batch == tmp_path / "nonfinite_batch_21.safetensors"  # beside the newest model
+    assert "critic_loss (inf)" in message
+    assert "at environment step 21, update " in message
+    assert str(caught.value.batch) in message
+    assert f"last saved model: {model}" in message
+    assert "largest of this batch is 1e+30" in message
+    assert "lower learning_rate (it is 0.0003)" in message
+    assert "normalize=True" in message
+    assert "\n" not in message
+    assert 'nonfinite="skip"' in message
+
+
+def test_the_saved_batch_breaks_a_loaded_model_again(tmp_path):
+    agent = MAKE["SAC"]()
+    agent.report_folder = tmp_path
+    poison(agent, 3, 1e25)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"))
+    found = finite.examine(loaded, caught.value.batch)
+    assert found
+    assert found.losses == ["critic_loss (inf)"]
+    assert not found.batch
+    batch, clock = finite.load_batch(loaded, caught.value.batch)
+    assert batch.reward[0] == np.float32(1e25)
+    assert int(clock.step) == caught.value.step
+    header, arrays = rejeu.io.checkpoint.read(caught.value.batch, "batch")
+    assert header["names"] == list(caught.value.names)
+    assert {"obs", "reward", "discount"} <= {*arrays}
+    with pytest.raises(CheckpointError, match=r"holds a batch of SAC with .* this is A2C"):
+        finite.load_batch(MAKE["A2C"](), caught.value.batch)
+    with pytest.raises(CheckpointError, match="holds 'agent', expected 'batch'"):
+        finite.load_batch(agent, tmp_path / "model")
+
+
+def test_a_batch_never_replaces_another_and_goes_where_logs_or_the_process_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paths = []
+    for folder in (None, None, "logs"):
+        agent = rejeu.SAC("MlpPolicy", box(), tensorboard_log=None if folder is None else tmp_path / folder, **OFF)
+        agent.logger.outputs = [_Nothing()]  # no TensorBoard is needed
+        poison(agent, 1, np.nan)
+        with pytest.raises(NonFiniteError) as caught:
+            agent.learn(TOTAL)
+        paths.append(caught.value.batch.relative_to(tmp_path).as_posix())
+    assert paths == [
+        "nonfinite_batch_10.safetensors",
+        "nonfinite_batch_10_2.safetensors",
+        "logs/nonfinite_batch_10.safetensors",
+    ]
+
+
+class _Nothing:
+    def write(self, step, row):
+        pass
+
+
+def test_a_batch_that_cannot_be_saved_does_not_hide_what_happened(tmp_path):
+    (tmp_path / "file").touch()
+    agent = MAKE["SAC"]()
+    agent.report_folder = tmp_path / "file" / "folder"
+    poison(agent, 1, np.nan)
+    with pytest.raises(NonFiniteError, match=r"the batch held reward .* The batch could not be saved") as caught:
+        agent.learn(TOTAL)
+    assert caught.value.batch is None
+
+
+@pytest.mark.parametrize("name", ["SAC", "A2C"])
+def test_the_last_update_of_a_run_is_looked_at_too(name, tmp_path):
+    agent = MAKE[name]()
+    agent.report_folder = tmp_path
+    poison(agent, 1, np.nan)
+    with pytest.raises(NonFiniteError):
+        agent.learn(16 if name == "A2C" else 10)
+    other = MAKE[name]()
+    other.report_folder = tmp_path
+    poison(other, 1, np.nan)
+    with pytest.raises(NonFiniteError):  # also where a callback ends it
+        other.learn(TOTAL, lambda _, progress: progress.step < (16 if name == "A2C" else 10))
+
+
+@pytest.mark.parametrize("use", ["save", "predict", "remember_best", "state"])
+def test_who_looks_at_the_agent_right_after_a_broken_update_is_told(use, tmp_path):
+    agent = MAKE["SAC"]()
+    agent.report_folder = tmp_path
+
+    def look(agent, progress):
+        if progress.step == 10:
+            calls = {
+                "save": lambda: agent.save(tmp_path / "model"),
+                "predict": lambda: agent.predict(np.zeros(3)),
+                "remember_best": lambda: agent.remember_best(1.0),
+                "state": lambda: agent.state,
+            }
+            calls[use]()
+
+    poison(agent, 1, np.nan)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL, look)
+    assert caught.value.step == 10
+    assert agent._run.step == 10
+    assert not (tmp_path / "model.safetensors").exists()
+    assert agent.best is None
+
+
+def test_parameters_that_are_not_finite_are_named_before_learning_begins():
+    agent = MAKE["SAC"]()
+    bad = agent.get_parameters()
+    bad["critics.head.bias"][0] = np.nan
+    agent.set_parameters(bad)
+    with pytest.raises(
+        NonFiniteError, match=r"^critics\.head\.bias \(nan\) of the agent's state is not finite"
+    ) as caught:
+        agent.learn(20)
+    assert caught.value.names == ("critics.head.bias",)
+    assert agent.num_timesteps == 0
+
+
+def test_parameters_put_in_place_while_learning_are_found_with_the_next_update(tmp_path):
+    agent = MAKE["SAC"]()
+    agent.report_folder = tmp_path
+
+    def spoil(agent, progress):
+        if progress.step == 15:
+            agent.set_parameters({"critics.head.bias": np.full((2, 1), np.inf, np.float32)}, exact_match=False)
+
+    with pytest.raises(NonFiniteError, match="critic_loss") as caught:
+        agent.learn(TOTAL, spoil)
+    assert caught.value.step == 16
+
+
+# Skipping
+
+
+@pytest.mark.parametrize("name", [name for name in MAKE if name not in SCANS])
+def test_skipping_an_update_is_as_if_its_batch_had_never_been_given(name):
+    which = 1 if name in ON_POLICY else 5
+    agent, twin = MAKE[name](nonfinite="skip"), MAKE[name](nonfinite="skip")
+    poison(agent, which, np.nan)
+
+    def nothing_learnt(state, batches, clock):
+        weighted = not isinstance(batches, Rollout) and batches.weight is not None
+        metrics = {"gradient_steps": 0.0}
+        readings = Readings(tuple(metrics), np.array([*metrics.values(), 0.0], np.float32))
+        return state, readings, np.full(batches.reward.shape, np.nan, np.float32) if weighted else None
+
+    replace_update(twin, which, nothing_learnt)
+    agent.learn(TOTAL)
+    twin.learn(TOTAL)
+    assert_same(agent.get_parameters(), twin.get_parameters())
+    assert agent.statistics()["train/skipped_updates"] == 1
+    assert twin.statistics()["train/skipped_updates"] == 0
+    if name == "DQN with priorities":
+        one, two = (a._run.replay.priorities for a in (agent, twin))
+        np.testing.assert_array_equal(one.tree.nodes, two.tree.nodes)
+        assert one.largest == two.largest
+        assert np.isfinite(one.tree.nodes).all()
+
+
+def test_of_a_scan_only_the_broken_step_is_skipped():
+    make = lambda: rejeu.SAC("MlpPolicy", box(), gradient_steps=4, nonfinite="skip", **OFF)  # noqa: E731
+    agent, twin = make(), make()
+    poison(agent, 2, np.nan)  # in the second of four batches
+    update = twin._compiled.update
+
+    def three_of_four(state, batches, clock):
+        for i in (0, 2, 3):
+            state, readings, td_error = update(state, jax.tree.map(lambda leaf, i=i: leaf[i], batches), clock)
+        return state, readings, td_error
+
+    replace_update(twin, 2, three_of_four)
+    last = lambda _, progress: progress.step < 11  # noqa: E731
+    agent.learn(TOTAL, last)
+    twin.learn(TOTAL, last)
+    assert agent.statistics()["train/skipped_updates"] == 1
+    assert all(np.isfinite(value) for name, value in agent.statistics().items() if name.startswith("train/"))
+    one, two = agent.get_parameters(), twin.get_parameters()
+    assert one["n_updates"] == two["n_updates"] == 11
+    for name, value in one.items():
+        np.testing.assert_allclose(value, two[name], rtol=1e-5, atol=1e-7, err_msg=name)  # two programs, two roundings
+
+
+def test_updates_that_are_all_skipped_are_an_error_in_the_end(tmp_path):
+    agent = MAKE["SAC"](nonfinite="skip")
+    agent.report_folder = tmp_path
+    agent.learn(20)
+    agent._run.replay.ring.records["reward"][:] = np.nan
+    draw = agent._run.replay.draw
+    spoiled = lambda batch, drawn: (batch._replace(reward=batch.reward * np.float32(np.nan)), drawn)  # noqa: E731
+    agent._run.replay.draw = lambda *a: spoiled(*draw(*a))
+    with pytest.raises(NonFiniteError, match=r"^100 updates in a row were skipped, .* the batch held reward") as caught:
+        agent.learn(200)
+    assert caught.value.batch.exists()
+    assert agent.statistics()["train/skipped_updates"] == 100
+
+
+def test_without_skipping_no_number_of_skipped_updates_is_reported():
+    assert "train/skipped_updates" not in MAKE["SAC"]().learn(10).statistics()
+
+
+def test_nonfinite_is_saved_with_the_model_and_checked(tmp_path):
+    path = MAKE["PPO"](nonfinite="skip").save(tmp_path / "model")
+    assert rejeu.PPO.load(path).config.nonfinite == "skip"
+    assert rejeu.PPO.load(path, nonfinite="stop").config.nonfinite == "stop"
+    with pytest.raises(ValueError, match="nonfinite='ignore' must be 'stop' or 'skip'"):
+        MAKE["SAC"](nonfinite="ignore")
+
+
+# What environments say
+
+
+class Saying(Counter):
+    """Returns a bad number in the observation of one step (of reset: 0) of one episode."""
+
+    def __init__(self, value=np.nan, at=(1, 2)):
+        super().__init__(lengths=(3,))
+        self.value, self.at = value, at
+
+    def _observe(self):
+        obs = super()._observe()
+        if (self.episode, self.time) == self.at:
+            obs[2] = self.value
+        return obs
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("make", [rejeu.SAC, rejeu.PPO, rejeu.RecurrentPPO])
+def test_an_observation_that_is_not_finite_ends_training_with_its_place(make, value):
+    agent = make("MlpPolicy", InProcess([Saying(at=(9, 9)), Saying(value)], seed=0), seed=0)
+    place = rf"Saying: returned an observation with {value} at \[2\] in environment 1 after 8 steps; .* finite"
+    with pytest.raises(BadEnvironmentError, match=place):
+        agent.learn(40)
+
+
+@pytest.mark.parametrize(("at", "steps"), [((0, 0), 0), ((1, 0), 6)])
+@pytest.mark.parametrize("make", [rejeu.SAC, rejeu.PPO])
+def test_so_does_one_that_reset_returns(make, at, steps):
+    agent = make("MlpPolicy", InProcess([Saying(at=at), Saying(at=(9, 9))], seed=0), seed=0)
+    with pytest.raises(
+        BadEnvironmentError, match=rf"reset returned an observation .* environment 0 after {steps} steps"
+    ):
+        agent.learn(40)
+
+
+class Lost(Reach):
+    """Forgets where it stands after two steps."""
+
+    def _observe(self):
+        obs = super()._observe()
+        return {**obs, "achieved_goal": obs["achieved_goal"] * (np.nan if self.time == 2 else 1)}
+
+
+def test_the_part_of_an_observation_is_named():
+    agent = rejeu.SAC("MultiInputPolicy", InProcess([Lost()], seed=0), replay_buffer_class="HerReplayBuffer", **OFF)
+    with pytest.raises(BadEnvironmentError, match=r"nan at \[0\] of 'achieved_goal' in environment 0 after 1 steps"):
+        agent.learn(40)
+
+
+class Echo(Sampled):
+    """Its observation is the action."""
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return np.full(3, action[0], np.float32), *rest
+
+
+def test_an_environment_is_not_blamed_for_an_action_that_was_not_finite():
+    agent = rejeu.SAC("MlpPolicy", InProcess([Echo(gym.spaces.Box(-1.0, 1.0, (3,)))], seed=0), **OFF).learn(12)
+    agent._run.action = np.full((1, 1), np.nan, np.float32)
+    with pytest.raises(NonFiniteError, match=r"the policy chose the action \[nan\] in environment 0 after 12 steps"):
+        agent.learn(3, reset_num_timesteps=False)
+
+
+def test_large_finite_observations_are_fine():
+    class Large(Sampled):
+        def reset(self, **keywords):
+            return np.full(3, 3e38, np.float32), super().reset(**keywords)[1]
+
+    rejeu.SAC(
+        "MlpPolicy", InProcess([Large(gym.spaces.Box(-np.inf, np.inf, (3,)))], seed=0), **{**OFF, "learning_starts": 99}
+    ).learn(20)
+
+
+# The parts
+
+
+@settings(max_examples=40)
+@given(
+    st.lists(st.integers(1, 700), min_size=1, max_size=3),
+    st.integers(0, 699),
+    st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 3e38, -3e38, 1e-45]),
+)
+def test_all_finite_is_numpys_answer(sizes, place, value):
+    vectors = [np.full(n, -1.5, np.float32) for n in sizes]
+    vectors[-1][place % sizes[-1]] = value
+    expected = all(np.isfinite(vector).all() for vector in vectors)
+    assert bool(finite.all_finite([*map(jnp.asarray, vectors), jnp.arange(3)], {})) == expected
+
+
+def test_whole_numbers_alone_are_finite():
+    assert bool(finite.all_finite([jnp.arange(3)], {}))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_losses_must_be_finite_and_other_metrics_need_not(value):
+    fine, bad = jnp.float32(1), jnp.float32(value)
+    assert not bool(finite.all_finite([jnp.zeros(3)], {"critic_loss": bad, "q_value": fine}))
+    assert not bool(finite.all_finite([], {"loss": jnp.stack([fine, bad])}))
+    assert bool(finite.all_finite([jnp.zeros(3)], {"policy_loss": fine, "explained_variance": bad}))
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_what_is_not_looked_at_are_targets_and_first_moments_only(name):
+    passed_over = {leaf for leaf in MAKE[name]().get_parameters() if finite.is_averaged(leaf)}
+    assert all(".mu." in f".{leaf}." or "target" in leaf for leaf in passed_over)
+    looked_at = {*MAKE[name]().get_parameters()} - passed_over
+    assert any(".nu" in leaf for leaf in looked_at)
+    assert any("optimizer" not in leaf for leaf in looked_at)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_td_errors_that_are_not_finite_leave_priorities_as_they_are(bad):
+    ring = Ring(8, 1, (Leaf("", "continuous", (1,), "float32"),), jax.tree.structure(0), (1,), np.dtype("float32"))
+    priorities = Priorities(ring, PriorityConfig(alpha=1.0, epsilon=1e-3))
+    ring.begin(np.zeros((1, 1), np.float32))
+    for _ in range(4):
+        priorities.add(*ring.add(np.zeros((1, 1)), np.zeros(1), np.zeros(1, bool), np.zeros((1, 1), np.float32)))
+    rows, _, drawn = priorities.draw(np.random.default_rng(0), 4, 0.0)
+    before = priorities.tree[rows.position].copy()
+    priorities.update([(drawn, np.array([2.0, bad, 0.5, bad], np.float32))])
+    after = priorities.tree[rows.position]
+    np.testing.assert_allclose(after, [2.001, before[1], 0.501, before[3]])
+    assert priorities.largest == pytest.approx(2.001)
+    assert priorities.tree.total == pytest.approx(after.sum())
+
+
+def test_statistics_pass_over_what_is_not_finite():
+    values = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    spoilt = np.insert(values, [2, 4], [[np.nan, 0, 0], [0, np.inf, 1]], axis=0).astype(np.float32)
+    one = merged(nothing((3,)), jnp.asarray(values), jnp.ones(6))
+    two = merged(nothing((3,)), jnp.asarray(spoilt), jnp.ones(8))
+    jax.tree.map(np.testing.assert_allclose, one, two)
+    assert float(two.n_seen) == 6
+
+
+def test_statistics_do_not_overflow():
+    known = merged(nothing((1,)), jnp.ones((4, 1)), jnp.ones(4))
+    after = merged(known, jnp.full((2, 1), 1e30), jnp.ones(2))
+    jax.tree.map(np.testing.assert_array_equal, known, after)
+
+
+def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_folder(tmp_path, capsys):
+    command = ["train", "Pendulum-v1", "--steps", "300", "--out", str(tmp_path / "run"), "--backend", "gymnasium"]
+    settings = ["learning_rate=1e30", "learning_starts=50", "batch_size=8", "policy_kwargs.net_arch=[8]"]
+    assert cli.main([*command, "--algo", "SAC", "--set", *settings]) == 2
+    said = capsys.readouterr().err.strip()
+    (batch,) = (tmp_path / "run").glob("nonfinite_batch_*.safetensors")
+    assert said.count("\n") == 0
+    assert str(batch) in said
+    assert "lower learning_rate (it is 1e+30)" in said
+    agent = rejeu.load(tmp_path / "run" / "agent")
+    assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+def test_a_saved_batch_whose_rewards_are_clipped_one_by_one_can_be_examined(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent = MAKE["SAC, normalised"](n_steps=3)
+    draw = agent._run.replay.draw
+    spoiled = lambda batch, drawn: (batch._replace(rewards=batch.rewards * np.float32(np.nan)), drawn)  # noqa: E731
+    agent._run.replay.draw = lambda *a: spoiled(*draw(*a))
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    assert "rewards (nan)" in finite.examine(agent, caught.value.batch).batch

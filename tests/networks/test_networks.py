@@ -1,0 +1,524 @@
+"""Networks against the same computation written once more in NumPy, in double precision."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium import spaces
+from scipy import signal, stats
+
+import rejeu
+from rejeu import validation
+from rejeu.algorithms import config as configs, sac
+from rejeu.core import ensemble
+from rejeu.errors import CheckpointError
+from rejeu.networks import (
+    BRANCHES,
+    CNN,
+    NATURE,
+    SMALL,
+    Actor,
+    Convolution,
+    Critic,
+    Encoder,
+    Linear,
+    PolicyConfig,
+    action_values,
+    channels_last,
+    convolutions,
+    encoder,
+    image_shape,
+)
+from rejeu.spaces import leaves
+
+DOCUMENT = {
+    "action_layers": (16, 32),
+    "state_layers": (17, 33),
+    "common_layers": (60, 70),
+    "critic_layers": (12,),
+    "actor_layers": (24,),
+}
+"""The example of branches in ``../shared/seeds/002_c02ee75899cc9380.txt``."""
+VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float32)
+RNG = np.random.default_rng(0)
+OBS = RNG.normal(size=(7, 5)).astype(np.float32)
+ACTION = RNG.uniform(-1, 1, (7, 3)).astype(np.float32)
+
+
+class OwnTorso(eqx.Module):
+    """One hidden layer whose output is concatenated with its input."""
+
+    weight: jax.Array
+    n_outputs: int = eqx.field(static=True)
+
+    def __init__(self, key, n_inputs, width=6):
+        self.weight = jax.random.normal(key, (n_inputs, width)) / np.sqrt(n_inputs)
+        self.n_outputs = n_inputs + width
+
+    def __call__(self, x):
+        return jnp.concatenate([x, jnp.tanh(x @ self.weight)], axis=-1)
+
+
+SHAPES = {
+    "mlp": {"net_arch": [6, 4]},
+    "layer norm": {"net_arch": [6, 4], "layer_norm": True},
+    "branches": DOCUMENT,
+    "branches, layer norm": {**DOCUMENT, "layer_norm": True},
+    "critic layers alone": {"critic_layers": (12,)},
+    "simba": {"architecture": "simba", "n_blocks": 2, "width": 6},
+    "own": {"torso": OwnTorso},
+}
+
+
+def make(shape, space=VECTOR):
+    """An actor of 4 outputs and a critic for 3-dimensional actions, with random parameters."""
+    shape = PolicyConfig(**shape)
+
+    def init(key):
+        actor = Actor(key, leaves(space), 4, shape.actor_widths((6, 4)), shape)
+        return actor, Critic(key, leaves(space), 3, shape.critic_widths((6, 4)), shape)
+
+    return filled(jax.eval_shape(init, jax.random.PRNGKey(0)))
+
+
+def filled(network):
+    """The network with every parameter drawn here: no scale of 1 and no offset of 0 can hide a mistake."""
+    rng = np.random.default_rng(3)
+    draw = lambda p: jnp.asarray(rng.normal(0.0, 1 / np.sqrt(p.size // p.shape[-1]), p.shape).astype(np.float32))  # noqa: E731
+    return jax.tree.map(draw, network)
+
+
+@jax.jit
+def call(network, *inputs):
+    return network(*inputs)
+
+
+def linear(layer, x):
+    return x @ np.asarray(layer.weight, np.float64) + np.asarray(layer.bias, np.float64)
+
+
+def normalised(norm, x):
+    mean, variance = x.mean(axis=1, keepdims=True), x.var(axis=1, keepdims=True)
+    return (x - mean) / np.sqrt(variance + 1e-5) * np.asarray(norm.scale) + np.asarray(norm.offset)
+
+
+def relu(x):
+    return np.maximum(x, 0)
+
+
+def mlp(net, x):
+    for i, layer in enumerate(net.layers):
+        x = linear(layer, x)
+        x = relu(normalised(net.norms[i], x) if net.norms else x)
+    return x
+
+
+def numpy_torso(torso, kind, state, action):
+    """What the hidden layers of that kind ought to give; ``action`` is None in an actor."""
+    joined = state if action is None else np.concatenate([state, action], axis=1)
+    if kind.startswith(("branches", "critic layers")):
+        x = mlp(torso.state, state)
+        if action is not None:
+            x = np.concatenate([x, mlp(torso.action, action)], axis=1)
+        return mlp(torso.last, mlp(torso.common, x))
+    if kind == "simba":
+        x = linear(torso.embedding, joined)
+        for block in torso.blocks:
+            x = x + linear(block.contract, relu(linear(block.expand, normalised(block.norm, x))))
+        return normalised(torso.norm, x)
+    if kind == "own":
+        return np.concatenate([joined, np.tanh(joined @ np.asarray(torso.weight, np.float64))], axis=1)
+    return mlp(torso, joined)
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_forward_passes_equal_numpy(kind, strict_dtypes):
+    actor, critic = make(SHAPES[kind])
+    state, action = OBS.astype(np.float64), ACTION.astype(np.float64)
+    outputs = linear(actor.head, numpy_torso(actor.torso, kind, state, None))
+    values = linear(critic.head, numpy_torso(critic.torso, kind, state, action))
+    assert outputs.shape == (7, 4)
+    assert values.shape == (7, 1)
+    np.testing.assert_allclose(call(actor, OBS), outputs, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(call(critic, OBS, ACTION), values, rtol=1e-4, atol=1e-4)
+
+
+def dense(*sizes):
+    """Parameters of linear layers between those sizes."""
+    return sum(i * o + o for i, o in pairwise(sizes))
+
+
+@pytest.mark.parametrize(
+    ("kind", "actor", "critic"),
+    [
+        ("mlp", dense(5, 6, 4, 4), dense(8, 6, 4, 1)),
+        ("layer norm", dense(5, 6, 4, 4) + 2 * 10, dense(8, 6, 4, 1) + 2 * 10),
+        (
+            "branches",
+            dense(5, 17, 33, 60, 70, 24, 4),
+            dense(5, 17, 33) + dense(3, 16, 32) + dense(33 + 32, 60, 70, 12, 1),
+        ),
+        ("critic layers alone", dense(5, 4), dense(8, 12, 1)),
+        # embedding, two blocks of 6-24-6 with a norm of 12, the last norm, the head
+        ("simba", dense(5, 6) + 2 * (12 + dense(6, 24, 6)) + 12 + dense(6, 4),
+         dense(8, 6) + 2 * (12 + dense(6, 24, 6)) + 12 + dense(6, 1)),
+        ("own", 5 * 6 + dense(11, 4), 8 * 6 + dense(14, 1)),
+    ],
+)  # fmt: skip
+def test_numbers_of_parameters(kind, actor, critic):
+    networks = make(SHAPES[kind])
+    assert [sum(p.size for p in jax.tree.leaves(network)) for network in networks] == [actor, critic]
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_gradients_reach_every_parameter(kind):
+    actor, critic = make(SHAPES[kind])
+    loss = lambda networks: jnp.sum(networks[0](OBS) ** 2) + jnp.sum(networks[1](OBS, ACTION) ** 2)  # noqa: E731
+    gradients = jax.jit(jax.grad(loss))((actor, critic))
+    for path, gradient in jax.tree_util.tree_leaves_with_path(gradients):
+        assert np.abs(gradient).max() > 0, jax.tree_util.keystr(path)
+
+
+def test_plain_networks_keep_the_names_of_their_parameters():
+    actor, critic = make({"net_arch": [6], "layer_norm": True})
+    expected = ["torso.layers.0.weight", "torso.layers.0.bias", "torso.norms.0.scale", "torso.norms.0.offset"]
+    expected += ["head.weight", "head.bias"]
+    for network in (actor, critic):
+        assert rejeu.io.checkpoint.names(network) == expected
+
+
+def test_action_values_are_those_of_each_critic():
+    shape = PolicyConfig(**DOCUMENT)
+    init = lambda key: Critic(key, leaves(VECTOR), 3, shape.critic_widths(()), shape)  # noqa: E731
+    critics = filled(jax.eval_shape(lambda key: ensemble(init, key, 3), jax.random.PRNGKey(0)))
+    together = jax.jit(action_values)(critics, OBS, ACTION)
+    for i in range(3):
+        one = jax.tree.map(lambda p, i=i: p[i], critics)
+        np.testing.assert_allclose(together[i], call(one, OBS, ACTION)[:, 0], rtol=1e-4, atol=1e-4)
+
+
+def test_the_default_widths_are_the_algorithms_own():
+    assert PolicyConfig().actor_widths((400, 300)) == (400, 300)
+    assert PolicyConfig(net_arch={"pi": [7], "qf": [8, 9]}).actor_widths((1,)) == (7,)
+    assert PolicyConfig(net_arch={"pi": [7], "qf": [8, 9]}).critic_widths((1,)) == (8, 9)
+    assert PolicyConfig(architecture="simba", width=32, n_blocks=3).critic_widths((1,)) == (32, 32, 32)
+    assert PolicyConfig(architecture="simba", net_arch={"pi": [8], "qf": [16, 16]}).actor_widths((1,)) == (8,)
+    assert PolicyConfig(**DOCUMENT).actor_widths((1,)) == (24,)
+    assert PolicyConfig(state_layers=[5]).critic_widths((1,)) == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"state_layers": [8], "net_arch": [8]}, "state_layers leaves net_arch without meaning"),
+        ({"common_layers": [8], "architecture": "simba"}, "common_layers leaves architecture='simba' without meaning"),
+        ({"torso": OwnTorso, "net_arch": {"pi": [8]}}, "torso leaves pi without meaning"),
+        ({"torso": OwnTorso, "layer_norm": True}, "torso leaves layer_norm without meaning"),
+        ({"architecture": "simba", "layer_norm": True}, "leaves layer_norm without meaning"),
+        ({"architecture": "simba", "net_arch": [8, 16]}, r"net_arch=\[8, 16\] must hold equal numbers"),
+        ({"architecture": "transformer"}, "must be 'mlp' or 'simba'"),
+        ({"actor_layers": [0]}, r"actor_layers=\[0\] must hold positive whole numbers"),
+        ({"width": 0}, "width=0 must be a whole number of at least 1"),
+        ({"n_blocks": True}, "n_blocks=True must be a whole number"),
+    ],
+)
+def test_contradictory_shapes_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        PolicyConfig(**given)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SHAPES if kind != "own"])
+def test_a_shape_survives_json(kind):
+    config = sac.Config(policy_kwargs=SHAPES[kind])
+    assert validation.build(sac.Config, configs.to_json(config)) == config
+    assert hash(config.policy_kwargs) == hash(PolicyConfig(**SHAPES[kind]))
+
+
+# --- encoders -------------------------------------------------------------------------------------------------------
+
+
+def one_hot(values, starts, sizes):
+    """Rows of zeros with one 1 a component, written out."""
+    rows = []
+    for row in values:
+        bits = []
+        for value, start, size in zip(row, starts, sizes, strict=True):
+            bits += [float(value == start + i) for i in range(size)]
+        rows.append(bits)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("space", "values", "expected"),
+    [
+        (spaces.Discrete(3, start=-1), [-1, 1, 0], one_hot([[-1], [1], [0]], [-1], [3])),
+        (
+            spaces.MultiDiscrete([2, 4], start=[5, -2]),
+            [[5, -2], [6, 1]],
+            np.array([[1, 0, 1, 0, 0, 0], [0, 1, 0, 0, 0, 1]]),
+        ),
+        (
+            spaces.MultiDiscrete([[2, 3], [2, 2]]),
+            [[[1, 2], [0, 1]]],
+            one_hot([[1, 2, 0, 1]], [0, 0, 0, 0], [2, 3, 2, 2]),
+        ),
+        (spaces.MultiBinary((2, 2)), [[[0, 1], [1, 1]]], np.array([[0, 1, 1, 1]])),
+        (spaces.Box(-1, 1, (2, 2)), [[[0.5, -1], [1, 0]]], np.array([[0.5, -1, 1, 0]])),
+    ],
+    ids=["discrete", "multi-discrete", "matrix of discrete", "multi-binary", "matrix"],
+)
+def test_spaces_are_encoded_as_vectors(space, values, expected):
+    encoder = Encoder(leaves(space))
+    np.testing.assert_array_equal(encoder(jnp.asarray(np.array(values, leaves(space)[0].dtype))), expected)
+    assert encoder.n_features == expected.shape[1]
+
+
+def test_nested_observations_are_encoded_leaf_by_leaf_in_the_order_of_sorted_keys():
+    space = spaces.Dict(
+        z=spaces.Discrete(2, start=7),
+        a=spaces.Tuple((spaces.MultiBinary(2), spaces.Box(-1, 1, (1,)))),
+        m=spaces.Dict(inner=spaces.MultiDiscrete([2, 2])),
+    )
+    obs = {
+        "z": np.array([8, 7], np.int32),
+        "a": (np.array([[0, 1], [1, 1]], np.int8), np.array([[0.25], [-0.5]], np.float32)),
+        "m": {"inner": np.array([[0, 1], [1, 1]], np.int32)},
+    }
+    expected = [[0, 1, 0.25, 1, 0, 0, 1, 0, 1], [1, 1, -0.5, 0, 1, 0, 1, 1, 0]]
+    np.testing.assert_array_equal(Encoder(leaves(space))(obs), expected)
+
+
+@pytest.mark.parametrize(
+    ("side", "kernel", "stride"), [((9, 12), 4, 2), ((11, 8), 8, 4), ((5, 6), 3, 1), ((10, 7), 2, 2)]
+)
+def test_a_convolution_equals_scipys_correlation(side, kernel, stride):
+    layer = filled(jax.eval_shape(lambda key: Convolution(key, 3, 5, kernel, stride), jax.random.PRNGKey(0)))
+    x = RNG.normal(size=(2, *side, 3)).astype(np.float32)
+    found = call(layer, x)
+    weight, bias = np.asarray(layer.weight, np.float64), np.asarray(layer.bias, np.float64)
+    for n in range(2):
+        for f in range(5):
+            channels = [signal.correlate(x[n, :, :, c].astype(float), weight[:, :, c, f], "valid") for c in range(3)]
+            expected = sum(channels)[::stride, ::stride] + bias[f]
+            np.testing.assert_allclose(found[n, :, :, f], expected, atol=2e-5)
+
+
+def numpy_cnn(cnn, pixels):
+    """Pixels ``(batch, height, width, channels)`` through the network, by explicit loops over rows and columns."""
+    x = pixels.astype(np.float64) / 255
+    for layer in cnn.layers:
+        weight, stride = np.asarray(layer.weight, np.float64), layer.stride
+        kernel = weight.shape[0]
+        rows, columns = ((side - kernel) // stride + 1 for side in x.shape[1:3])
+        out = np.empty((len(x), rows, columns, weight.shape[3]))
+        for i in range(rows):
+            for j in range(columns):
+                patch = x[:, i * stride : i * stride + kernel, j * stride : j * stride + kernel]
+                out[:, i, j] = np.einsum("nhwc,hwcf->nf", patch, weight) + np.asarray(layer.bias)
+        x = relu(out)
+    return relu(linear(cnn.linear, x.reshape(len(x), -1)))
+
+
+@pytest.mark.parametrize(("shape", "kind"), [((84, 84, 4), NATURE), ((36, 40, 1), NATURE), ((10, 8, 3), SMALL)])
+def test_the_convolutional_encoder_equals_loops(shape, kind):
+    (leaf,) = leaves(spaces.Box(0, 255, shape, np.uint8))
+    assert convolutions(leaf) == kind
+    cnn = filled(jax.eval_shape(lambda key: CNN(key, shape, kind), jax.random.PRNGKey(0)))
+    pixels = RNG.integers(0, 256, (2, *shape), dtype=np.uint8)
+    features = call(cnn, pixels)
+    assert features.shape == (2, kind.n_outputs)
+    np.testing.assert_allclose(features, numpy_cnn(cnn, pixels), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "fan_in"),
+    [(lambda key: Linear(key, 100, 200), 100), (lambda key: Convolution(key, 4, 200, 4, 2), 4 * 4 * 4)],
+    ids=["linear", "convolution"],
+)
+def test_weights_begin_uniform_within_the_inverse_root_of_the_number_of_inputs(make, fan_in):
+    layer = make(jax.random.PRNGKey(0))
+    bound = fan_in**-0.5
+    for parameters in (layer.weight, layer.bias):
+        values = np.asarray(parameters).ravel()
+        assert stats.kstest(values, stats.uniform(-bound, 2 * bound).cdf).pvalue > 1e-4
+
+
+def test_the_nature_network_has_the_published_number_of_parameters():
+    cnn = jax.eval_shape(lambda key: CNN(key, (84, 84, 4), NATURE), jax.random.PRNGKey(0))
+    expected = (8 * 8 * 4 + 1) * 32 + (4 * 4 * 32 + 1) * 64 + (3 * 3 * 64 + 1) * 64 + (7 * 7 * 64 + 1) * 512
+    assert sum(p.size for p in jax.tree.leaves(cnn)) == expected == 1_684_128
+
+
+def test_images_in_chunks_give_the_same_features_and_gradients(monkeypatch):
+    cnn, images = CNN(jax.random.PRNGKey(0), (8, 8, 1), SMALL), RNG.integers(0, 256, (7, 8, 8, 1), dtype=np.uint8)
+
+    def features_and_gradient():
+        loss = lambda cnn: (jnp.sum(jnp.square(cnn(images))), cnn(images))  # noqa: E731
+        return jax.tree.leaves(jax.jit(jax.grad(loss, has_aux=True))(cnn))
+
+    expected = features_and_gradient()
+    for size in (1, 3):  # without and with a rest
+        monkeypatch.setattr(encoder, "CHUNK", size)
+        for one, other in zip(features_and_gradient(), expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_the_memory_for_images_does_not_grow_with_their_number(monkeypatch):
+    """Each takes 102 kB in the convolutions (9 x 9 patches of 288 numbers and 11 x 11 of 16), and 1 kB as features."""
+    cnn = CNN(jax.random.PRNGKey(0), (24, 24, 1), SMALL)
+    loss = lambda cnn, images: jnp.sum(jnp.square(cnn(images)))  # noqa: E731
+
+    def temporaries(n):
+        images = jax.ShapeDtypeStruct((n, 24, 24, 1), np.uint8)
+        return jax.jit(jax.grad(loss)).lower(cnn, images).compile().memory_analysis().temp_size_in_bytes
+
+    whole = temporaries(256)
+    monkeypatch.setattr(encoder, "CHUNK", 16)
+    few, many = temporaries(64), temporaries(256)
+    assert many < whole / 5
+    assert many - few < (256 - 64) * 6_000
+
+
+def test_channels_are_found_where_stable_baselines3_finds_them():
+    last = RNG.integers(0, 256, (2, 9, 8, 3), dtype=np.uint8)
+    first = np.transpose(last, (0, 3, 1, 2))
+    np.testing.assert_array_equal(channels_last(jnp.asarray(first)), last)
+    np.testing.assert_array_equal(channels_last(jnp.asarray(last)), last)
+    assert image_shape((3, 9, 8)) == image_shape((9, 8, 3)) == (9, 8, 3)
+    stack = np.stack([last, last + 1, last + 2, last + 3], axis=1)
+    merged = channels_last(jnp.asarray(stack))
+    assert merged.shape == (2, *image_shape((4, 9, 8, 3))) == (2, 9, 8, 12)
+    for frame in range(4):
+        np.testing.assert_array_equal(merged[..., 3 * frame : 3 * frame + 3], stack[:, frame])
+
+
+def test_each_image_of_a_nested_observation_has_an_encoder_of_its_own():
+    space = spaces.Dict(
+        left=spaces.Box(0, 255, (9, 8, 3), np.uint8),
+        pose=spaces.Box(-1, 1, (2,)),
+        right=spaces.Box(0, 255, (3, 40, 36), np.uint8),
+        tiny=spaces.Box(0, 255, (4, 4, 1), np.uint8),
+    )
+    obs = {key: np.stack([part.sample(), part.sample()]) for key, part in space.spaces.items()}
+    actor, critic = make({}, space)
+    left, right = actor.encoder.images
+    right_last = np.transpose(obs["right"], (0, 2, 3, 1))
+    parts = [numpy_cnn(left, obs["left"]), obs["pose"], numpy_cnn(right, right_last), obs["tiny"].reshape(2, -1) / 255]
+    np.testing.assert_allclose(call(actor.encoder, obs), np.concatenate(parts, axis=1), rtol=1e-4, atol=1e-5)
+    assert actor.encoder.n_features == 256 + 2 + 512 + 16
+    loss = lambda networks: jnp.sum(networks[0](obs)) + jnp.sum(networks[1](obs, ACTION[:2]))  # noqa: E731
+    gradients = jax.jit(jax.grad(loss))((actor, critic))
+    assert all(np.abs(gradient).max() > 0 for gradient in jax.tree.leaves(gradients))
+
+
+def test_an_encoder_of_images_asks_for_its_key():
+    with pytest.raises(TypeError, match="needs a key"):
+        Encoder(leaves(spaces.Box(0, 255, (9, 8, 3), np.uint8)))
+
+
+# --- a user's own module --------------------------------------------------------------------------------------------
+
+
+class NoOutputs(eqx.Module):
+    weight: jax.Array
+
+    def __init__(self, key, n_inputs):
+        self.weight = jnp.ones((n_inputs, 2))
+
+
+class HoldsAFunction(eqx.Module):
+    mlp: eqx.nn.MLP
+    n_outputs: int = eqx.field(static=True)
+
+    def __init__(self, key, n_inputs):
+        self.mlp = eqx.nn.MLP(n_inputs, 4, 4, 1, key=key)
+        self.n_outputs = 4
+
+
+class DynamicOutputs(eqx.Module):
+    n_outputs: int
+
+    def __init__(self, key, n_inputs):
+        self.n_outputs = n_inputs
+
+
+@pytest.mark.parametrize(
+    ("torso", "message"),
+    [
+        (NoOutputs, "torso=NoOutputs needs the attribute n_outputs"),
+        (HoldsAFunction, r"torso=HoldsAFunction holds mlp\.activation, which is of type .* eqx.field\(static=True\)"),
+        (DynamicOutputs, "torso=DynamicOutputs holds n_outputs, which is of type int"),
+        (lambda key, n_inputs: jnp.ones(3), "expected an equinox.Module"),
+    ],
+)
+def test_a_module_that_cannot_be_learnt_is_refused(torso, message):
+    with pytest.raises(TypeError, match=message):
+        rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"torso": torso}, seed=0)
+
+
+def test_a_torso_must_be_callable():
+    with pytest.raises(TypeError, match="must be a class or function"):
+        PolicyConfig(torso="OwnTorso")
+
+
+def test_a_saved_torso_must_be_given_again(tmp_path):
+    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"torso": OwnTorso, "activation_fn": "tanh"}, seed=0)
+    path = agent.save(tmp_path / "own")
+    with pytest.raises(
+        CheckpointError, match=r"a torso of your own, 'OwnTorso', .* policy_kwargs=dict\(torso=OwnTorso\)"
+    ):
+        rejeu.SAC.load(path)
+    with pytest.raises(CheckpointError, match="OwnTorso"):
+        rejeu.SAC.load(path, gamma=0.9)
+    loaded = rejeu.load(path, policy_kwargs={"torso": OwnTorso})
+    assert loaded.config == agent.config
+    assert loaded.config.policy_kwargs.activation_fn == "tanh"
+    with pytest.raises(CheckpointError, match=r"torso\.weight is float32"):
+        rejeu.SAC.load(path, policy_kwargs={"torso": lambda key, n_inputs: OwnTorso(key, n_inputs, width=7)})
+
+
+# --- in an agent ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["branches", "own"])
+def test_an_agent_of_any_shape_learns(kind, tmp_path):
+    settings = {"policy_kwargs": SHAPES[kind], "learning_starts": 20, "batch_size": 8, "buffer_size": 300}
+    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings, seed=0)
+    before = agent.get_parameters()
+    agent.learn(200)
+    assert agent.n_updates == 180
+    for key, value in agent.get_parameters().items():
+        assert np.isfinite(value).all(), key
+        assert key == "key" or not np.array_equal(value, before[key]), key
+    check_saved(agent, tmp_path)
+
+
+def test_an_agent_of_simba_saves_and_loads(tmp_path):
+    check_saved(rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs=SHAPES["simba"], buffer_size=300, seed=0), tmp_path)
+
+
+def check_saved(agent, tmp_path):
+    again = {} if agent.config.policy_kwargs.torso is None else {"policy_kwargs": {"torso": OwnTorso}}
+    loaded = rejeu.SAC.load(agent.save(tmp_path / "agent"), **again)
+    assert loaded.config == agent.config
+    found = loaded.get_parameters()
+    assert all(np.array_equal(value, found[key]) for key, value in agent.get_parameters().items())
+    obs = np.array([0.6, -0.8, 2.0], np.float32)
+    action, expected = (a.predict(obs, deterministic=True)[0] for a in (loaded, agent))
+    np.testing.assert_array_equal(action, expected)
+
+
+def test_every_branch_setting_changes_the_number_of_parameters():
+    sizes = {}
+    for left_out in (None, *BRANCHES):
+        networks = make({key: value for key, value in DOCUMENT.items() if key != left_out})
+        sizes[left_out] = tuple(sum(p.size for p in jax.tree.leaves(network)) for network in networks)
+    actor, critic = sizes.pop(None)
+    for left_out, (fewer_actor, fewer_critic) in sizes.items():
+        assert (fewer_actor != actor) == (left_out not in ("action_layers", "critic_layers")), left_out
+        assert (fewer_critic != critic) == (left_out != "actor_layers"), left_out

@@ -1,0 +1,298 @@
+"""Stable-Baselines3's module paths and its self-resetting vector environments."""
+
+from __future__ import annotations
+
+import importlib
+import os
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.envs.auto_reset import DummyVecEnv, VecVideoRecorder, tile
+from rejeu.reporting.video import record_video, show_videos
+from tests.reporting.test_video import Lamp, decode
+
+
+@pytest.fixture
+def in_tmp_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_script_for_stable_baselines3_runs(in_tmp_path, capsys):
+    """The calls of the teaching document on hindsight replay in their order, shorter."""
+    import highway_env  # noqa: F401
+
+    from rejeu.sb3 import SAC, HerReplayBuffer
+    from rejeu.sb3.common.evaluation import evaluate_policy
+    from rejeu.sb3.common.monitor import Monitor
+    from rejeu.sb3.common.noise import NormalActionNoise
+    from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
+
+    env = gym.make("parking-v0")
+    obs, _ = env.reset()
+    assert obs["observation"].shape == obs["desired_goal"].shape == (6,)
+    n_actions = env.action_space.shape[0]
+
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        learning_starts=100,
+        buffer_size=50000,
+        batch_size=64,
+        action_noise=NormalActionNoise(mean=np.zeros(n_actions), sigma=0.2 * np.ones(n_actions)),
+        policy_kwargs={"net_arch": [64, 64]},
+        train_freq=1,
+        gradient_steps=1,
+        verbose=1,
+    )
+    model.learn(total_timesteps=300, log_interval=100)
+    before = model.predict(obs, deterministic=True)[0]
+    model.save("her_sac_parking")
+    model.save_replay_buffer("her_sac_parking_replay_buffer")
+    del model
+
+    model = SAC.load("her_sac_parking", env=env)
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], before)
+    eval_env = Monitor(env)
+    mean_reward, std_reward = evaluate_policy(model, eval_env, n_eval_episodes=2, deterministic=True)
+    assert mean_reward < 0 <= std_reward
+    np.testing.assert_allclose(np.mean(eval_env.get_episode_rewards()), mean_reward, rtol=1e-4)
+
+    assert model.replay_buffer.size() == 0
+    model.load_replay_buffer("her_sac_parking_replay_buffer")
+    assert model.replay_buffer.size() == 300
+    model.learn(50)
+    assert model.replay_buffer.size() == 350
+
+    def record_as_in_the_document(env_id, model, video_length=1000, prefix="", video_folder="videos/"):
+        eval_env = DummyVecEnv([lambda: gym.make(env_id, render_mode="rgb_array")])
+        eval_env = VecVideoRecorder(
+            eval_env,
+            video_folder,
+            record_video_trigger=lambda step: step == 0,
+            video_length=video_length,
+            name_prefix=prefix,
+        )
+        obs = eval_env.reset()
+        for _ in range(video_length):
+            action, _ = model.predict(obs, deterministic=True)
+            obs, _, _done, _info = eval_env.step(action)
+        eval_env.close()
+
+    record_as_in_the_document("parking-v0", model, video_length=10, prefix="sac-parking")
+    assert os.listdir("videos") == ["sac-parking-step-0-to-step-10.mp4"]
+    frames = decode(in_tmp_path / "videos" / "sac-parking-step-0-to-step-10.mp4").frames
+    assert frames.shape == (11, 300, 600, 3)
+    assert frames.std() > 10
+    assert "<video" in show_videos("videos", prefix="sac-parking").data
+
+
+def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
+    """highway-env's observations are an OrderedDict; the agent was made with a configuration of its own."""
+    import highway_env  # noqa: F401
+
+    env = gym.make("parking-v0", config={"screen_width": 300, "screen_height": 200})
+    agent = rejeu.SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0)
+    frames = decode(record_video(agent, tmp_path / "own", max_steps=3, seed=0)).frames
+    assert frames.shape == (4, 200, 300, 3)
+    assert frames.std() > 10
+
+
+@pytest.mark.parametrize(
+    ("module", "names"),
+    [
+        ("", ["SAC", "HerReplayBuffer"]),
+        (".sac", ["SAC"]),
+        (".her", ["HerReplayBuffer", "GoalSelectionStrategy"]),
+        (".her.goal_selection_strategy", ["GoalSelectionStrategy"]),
+        (".her.her_replay_buffer", ["HerReplayBuffer"]),
+        (".common.noise", ["NormalActionNoise", "OrnsteinUhlenbeckActionNoise"]),
+        (".common.evaluation", ["evaluate_policy"]),
+        (".common.buffers", ["ReplayBuffer"]),
+    ],
+)
+def test_paths_lead_to_the_same_objects(module, names):
+    for name in names:
+        assert getattr(importlib.import_module(f"rejeu.sb3{module}"), name) is getattr(rejeu, name)
+
+
+def test_what_is_missing_cannot_be_imported():
+    with pytest.raises(ImportError, match="NoSuchAlgorithm"):
+        exec("from rejeu.sb3 import NoSuchAlgorithm")
+
+
+class Corridor(gym.Env):
+    """Ends by itself after ``end`` steps, or by a time limit after ``limit``; one array is reused for observations."""
+
+    metadata = {"render_modes": []}
+    action_space = gym.spaces.Discrete(2)
+    observation_space = gym.spaces.Dict(
+        {"where": gym.spaces.Box(0, 99, (1,), np.float32), "kind": gym.spaces.Discrete(5), "pair": gym.spaces.Tuple(())}
+    )
+
+    def __init__(self, end=99, limit=99):
+        self.end, self.limit = end, limit
+        self.calls = []
+        self.where = np.zeros(1, np.float32)
+
+    def observe(self):
+        self.where[0] = self.time
+        return {"where": self.where, "kind": self.time % 5, "pair": ()}
+
+    def reset(self, *, seed=None, options=None):
+        self.calls.append((seed, options))
+        self.time = 0
+        return self.observe(), {"calls": len(self.calls)}
+
+    def step(self, action):
+        self.time += 1
+        return self.observe(), 10.0 * action, self.time == self.end, self.time == self.limit, {"time": self.time}
+
+    def double(self, number):
+        return 2 * number + self.end
+
+
+def test_observations_have_a_leading_axis_and_their_own_memory():
+    env = DummyVecEnv([Corridor, Corridor])
+    first = env.reset()
+    assert set(first) == {"where", "kind", "pair"}
+    assert first["where"].shape == (2, 1)
+    assert first["kind"].shape == (2,)
+    second, rewards, dones, infos = env.step(np.array([0, 1]))
+    np.testing.assert_array_equal(first["where"], [[0], [0]])
+    np.testing.assert_array_equal(second["where"], [[1], [1]])
+    np.testing.assert_array_equal(rewards, np.array([0, 10], np.float32))
+    assert (rewards.dtype, dones.dtype, dones.tolist()) == (np.float32, bool, [False, False])
+    assert [info["time"] for info in infos] == [1, 1]
+
+
+def test_an_ended_environment_is_reset_within_the_step():
+    env = DummyVecEnv([lambda: Corridor(end=2), Corridor])
+    env.reset()
+    env.step([0, 0])
+    obs, _, dones, infos = env.step([0, 0])
+    assert dones.tolist() == [True, False]
+    np.testing.assert_array_equal(obs["where"], [[0], [2]])
+    np.testing.assert_array_equal(infos[0]["terminal_observation"]["where"], [2])
+    assert "terminal_observation" not in infos[1]
+    assert env.reset_infos == [{"calls": 2}, {"calls": 1}]
+
+
+@pytest.mark.parametrize(("end", "limit", "expected"), [(1, 99, False), (99, 1, True), (1, 1, False), (99, 99, False)])
+def test_time_limit_is_told_from_termination(end, limit, expected):
+    env = DummyVecEnv([lambda: Corridor(end, limit)])
+    env.reset()
+    assert env.step([0])[3][0]["TimeLimit.truncated"] is expected
+
+
+def test_seeds_and_options_are_of_the_next_reset_only():
+    env = DummyVecEnv([Corridor, Corridor])
+    assert env.seed(5) == [5, 6]
+    env.set_options({"a": 1})
+    env.reset()
+    env.reset()
+    assert [e.calls for e in env.envs] == [[(5, {"a": 1}), (None, None)], [(6, {"a": 1}), (None, None)]]
+
+
+def test_attributes_and_methods_are_reached_through_wrappers():
+    wrapped = [lambda: gym.wrappers.TimeLimit(Corridor(end=3), 7), lambda: gym.wrappers.TimeLimit(Corridor(end=4), 7)]
+    env = DummyVecEnv(wrapped)
+    assert env.get_attr("end") == [3, 4]
+    assert env.get_attr("end", 1) == [4]
+    env.set_attr("end", 8, indices=[0])
+    assert [e.unwrapped.end for e in env.envs] == [8, 4]
+    assert env.env_method("double", 1, indices=[1, 0]) == [6, 10]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [True, True]
+    assert env.env_is_wrapped(gym.wrappers.ClipAction) == [False, False]
+    assert env.has_attr("end")
+    assert not env.has_attr("begin")
+
+
+def test_functions_must_be_functions_and_make_new_environments():
+    one = Corridor()
+    with pytest.raises(ValueError, match="the same environment"):
+        DummyVecEnv([lambda: one, lambda: one])
+    with pytest.raises(TypeError, match=r"DummyVecEnv\(\[lambda: "):
+        DummyVecEnv([one])
+    with pytest.raises(ValueError, match="empty"):
+        DummyVecEnv([])
+    with pytest.raises(ValueError, match="1 actions for 2 environments"):
+        DummyVecEnv([Corridor, Corridor]).step([0])
+
+
+def test_agents_learn_in_it_and_are_evaluated_in_it():
+    def make():
+        return DummyVecEnv([lambda: gym.make("Pendulum-v1", max_episode_steps=20)] * 2)
+
+    agent = rejeu.SAC("MlpPolicy", make(), learning_starts=20, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0)
+    agent.learn(60)
+    assert (agent.n_envs, agent.num_timesteps, agent.replay_buffer.size()) == (2, 60, 60)
+    assert agent.history["length"].tolist() == [20, 20]
+    assert len(rejeu.evaluate_policy(agent, make(), 4, return_episode_rewards=True)[0]) == 4
+    assert agent.predict(make().reset())[0].shape == (2, 1)
+
+
+def lamps(n):
+    return DummyVecEnv([lambda: Lamp("rgb_array")] * n)
+
+
+def test_recordings_begin_at_the_trigger_and_are_named_by_their_steps(tmp_path):
+    env = VecVideoRecorder(lamps(1), tmp_path, lambda step: step in (0, 5), video_length=3, name_prefix="v")
+    env.reset()
+    assert env.recording
+    for _ in range(7):
+        env.step(np.zeros((1, 1)))
+    assert env.recording
+    env.close()
+    # the lamp's grey value is 40 t and its episodes have 4 steps; the second recording is ended early by close
+    assert sorted(os.listdir(tmp_path)) == ["v-step-0-to-step-3.mp4", "v-step-5-to-step-8.mp4"]
+    for name, grey in (("v-step-0-to-step-3.mp4", [0, 40, 80, 120]), ("v-step-5-to-step-8.mp4", [40, 80, 120])):
+        found = decode(tmp_path / name)
+        np.testing.assert_allclose(found.frames[:, :33, :51].mean((1, 2, 3)), grey, atol=4)
+        assert found.fps == 8
+
+
+def test_several_environments_are_shown_side_by_side(tmp_path):
+    env = VecVideoRecorder(lamps(3), tmp_path, lambda step: step == 0, video_length=1)
+    env.reset()
+    env.step(np.zeros((3, 1)))
+    env.close()
+    assert decode(tmp_path / "rl-video-step-0-to-step-1.mp4").frames.shape == (2, 66, 102, 3)
+
+
+def test_tiles_fill_row_by_row():
+    pictures = [np.full((1, 1, 3), value, np.uint8) for value in (1, 2, 3)]
+    assert tile(pictures)[..., 0].tolist() == [[1, 2], [3, 0]]
+
+
+def test_recorder_hands_on_what_it_does_not_do_itself(tmp_path):
+    env = VecVideoRecorder(lamps(2), tmp_path, lambda step: False)
+    assert env.num_envs == 2
+    assert env.get_attr("closed") == [False, False]
+    assert env.seed(3) == [3, 4]
+    env.reset()
+    assert env.render().shape == (66, 51, 3)
+    assert rejeu.make_vector(env).venv is env
+    env.close()
+    assert env.get_attr("closed") == [True, True]
+    assert os.listdir(tmp_path) == []
+
+
+def test_recorder_needs_environments_that_render(tmp_path):
+    with pytest.raises(ValueError, match="render_mode='rgb_array'"):
+        VecVideoRecorder(DummyVecEnv([Lamp]), tmp_path, lambda step: True)
+
+
+def test_an_error_while_recording_leaves_no_file(tmp_path):
+    env = VecVideoRecorder(lamps(1), tmp_path, lambda step: step == 0)
+    env.reset()
+    env.venv.envs[0].render = lambda: None
+    with pytest.raises(ValueError, match="NoneType"):
+        env.step(np.zeros((1, 1)))
+    assert not env.recording
+    assert os.listdir(tmp_path) == []
