@@ -17,7 +17,7 @@ import gymnasium as gym
 
 import rejeu
 from rejeu import agents, spaces
-from rejeu.loops.learner import Compiled
+from rejeu.loops.learner import Learner
 from tests.algorithms.probes.environments import Discretely, Probe
 
 
@@ -66,7 +66,7 @@ KINDS = {
 LEARNING = {"learning_rate": 1e-2, "batch_size": 32, "tau": 0.05, "policy_kwargs": {"net_arch": [32]}}
 RUN = {"gamma": 0.5, "buffer_size": 2000, "learning_starts": 64, "seed": 0}
 
-_compiled: dict[Any, Compiled] = {}
+_compiled: dict[Any, Learner] = {}
 
 
 def env_of(kind: Kind, probe: Probe | None = None) -> gym.Env:
@@ -94,15 +94,15 @@ def shared_functions(kind: Kind) -> Iterator[None]:
         settings.append((_of_gradients(config), spaces.leaves(observation_space), actions))
         return make(config, observation_space, action_space)
 
-    def compile_once(algorithm: Any, noise: Any, skips: bool) -> Compiled:
+    def compile_once(algorithm: Any, noise: Any, skips: bool) -> Learner:
         key = settings.pop(), noise, skips
         if key not in _compiled:
-            _compiled[key] = Compiled(algorithm, noise, skips)
+            _compiled[key] = Learner(algorithm, noise, skips)
         return copy.copy(_compiled[key])
 
     with (
         mock.patch.object(kind.agent.algorithm, "make", noted),
-        mock.patch.object(agents.base, "Compiled", compile_once),
+        mock.patch.object(agents.base, "Learner", compile_once),
     ):
         yield
 

@@ -16,11 +16,11 @@ import rejeu
 from rejeu import agents, spaces
 from rejeu.algorithms import sac
 from rejeu.core import Algorithm
-from rejeu.loops.learner import Compiled
+from rejeu.loops.learner import Learner
 from rejeu.loops.packing import Readings
 
 _algorithms: dict[Any, Algorithm] = {}
-_compiled: dict[Any, Compiled] = {}
+_compiled: dict[Any, Learner] = {}
 
 
 def _make(config: sac.Config, observation_space: gym.Space, action_space: gym.Space, make: Any = sac.make) -> Algorithm:
@@ -30,10 +30,10 @@ def _make(config: sac.Config, observation_space: gym.Space, action_space: gym.Sp
     return _algorithms[key]
 
 
-def _compile(algorithm: Algorithm, *arguments: Any) -> Compiled:
+def _compile(algorithm: Algorithm, *arguments: Any) -> Learner:
     key = algorithm, *arguments
     if key not in _compiled:
-        _compiled[key] = Compiled(algorithm, *arguments)
+        _compiled[key] = Learner(algorithm, *arguments)
     return copy.copy(_compiled[key])
 
 
@@ -52,7 +52,7 @@ def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
         "seed": 0,
         **settings,
     }
-    with mock.patch.object(sac, "make", _make), mock.patch.object(agents.base, "Compiled", _compile):
+    with mock.patch.object(sac, "make", _make), mock.patch.object(agents.base, "Learner", _compile):
         return rejeu.SAC("MultiInputPolicy" if nested else "MlpPolicy", env, **settings)
 
 
@@ -64,7 +64,7 @@ def count_updates(agent: rejeu.SAC) -> list[int]:
         calls.append(1 if batches.reward.ndim == 1 else len(batches.reward))
         return leaves, Readings((), np.zeros(1)), None
 
-    agent._compiled.update = update
+    agent.learner.update = update
     return calls
 
 

@@ -578,12 +578,12 @@ def test_statistics_are_taken_of_copies_that_the_next_step_cannot_overwrite():
     """The device reads a large array when it gets to it, in warm-up after the environments have stepped again."""
     env = InProcess([Counter() for _ in range(2)], seed=0)
     agent = rejeu.SAC("MlpPolicy", env, normalize=True, **{**OFF, "learning_starts": 20})
-    observe, shared = agent._compiled.observe, []
+    observe, shared = agent.learner.observe, []
 
     def observing(state, obs, returns):
         shared.append(np.shares_memory(obs, env._obs))
         return observe(state, obs, returns)
 
-    agent._compiled.observe = observing
+    agent.learner.observe = observing
     agent.learn(40)
     assert shared == [False] * 20

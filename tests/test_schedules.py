@@ -102,13 +102,13 @@ def test_an_exponential_needs_positive_ends(ends):
 
 def progress_of_updates(agent, *calls):
     """Returns for each call of ``learn``, given by its arguments, the progress that every update was told."""
-    update, told = agent._compiled.update, []
+    update, told = agent.learner.update, []
 
     def updating(state, batches, clock):
         told[-1].append(float(clock.progress))
         return update(state, batches, clock)
 
-    agent._compiled.update = updating
+    agent.learner.update = updating
     for arguments in calls:
         told.append([])
         agent.learn(**arguments)

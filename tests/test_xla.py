@@ -12,7 +12,7 @@ from gymnasium import spaces
 from rejeu import xla
 from rejeu.algorithms import ddpg, dqn, sac, sac_discrete, td3, tqc
 from rejeu.core import Clock, Transition, descend, polyak
-from rejeu.loops.learner import Compiled
+from rejeu.loops.learner import Learner
 
 ON_CPU = pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA on CPUs")
 AS_USERS_DO = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
@@ -102,7 +102,7 @@ def compiled_update(module) -> str:
     discrete = module in (dqn, sac_discrete)
     action_space = spaces.Discrete(3) if discrete else spaces.Box(-1, 1, (2,), np.float32)
     config = module.Config(policy_kwargs={"net_arch": [32, 32]}, batch_size=32)
-    compiled = Compiled(module.make(config, spaces.Box(-np.inf, np.inf, (5,), np.float32), action_space), None)
+    compiled = Learner(module.make(config, spaces.Box(-np.inf, np.inf, (5,), np.float32), action_space), None)
     batch = Transition(
         obs=np.zeros((32, 5), np.float32),
         action=np.zeros(32, np.int32) if discrete else np.zeros((32, 2), np.float32),

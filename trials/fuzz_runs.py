@@ -192,14 +192,14 @@ class Runs:
                 raise AssertionError(f"what a resumed run saved is refused: {error}") from error
         if passed_over := [str(one.message) for one in said if "before it" in str(one.message)]:
             raise AssertionError(f"what a resumed run saved is refused: {passed_over[0]}")
-        if again._run.step != agent._run.step:
-            raise AssertionError(f"{again._run.step} steps were read where {agent._run.step} were written")
+        if again.run.step != agent.run.step:
+            raise AssertionError(f"{again.run.step} steps were read where {agent.run.step} were written")
 
     def learn_on(self, agent: Any) -> None:
         """Goes on with the call that was cut off, if it is not over, with checkpoints in the folder of the run."""
         from rejeu.callbacks import Checkpoint
 
-        run, call, before = agent._run, agent._call, agent._run.step
+        run, call, before = agent.run, agent._call, agent.run.step
         stop = lambda agent, turn: turn.step < before + N_STEPS  # noqa: E731
         is_over = call is None or call.is_over(run.step, run.episode)
         agent.report_folder = self.folder
@@ -216,7 +216,7 @@ class Runs:
         """Returns whether to learn: what is asked for is little, and compiled already, most of the time."""
         from rejeu.algorithms import config as configs
 
-        config, run = vars(agent.config), agent._run
+        config, run = vars(agent.config), agent.run
         asked = {key: config.get(key) or 0 for key in COSTLY}
         extra = run.steps_since_update if config.get("gradient_steps") == -1 else 0
         frequent = config.get("train_freq", 1)
@@ -254,13 +254,13 @@ def share_compiled() -> None:
         key = json.dumps([self.name, configs.to_json(self.config), described])
         if key in kept:
             self.observation_space, self.action_space = observation_space, action_space
-            self._obs_leaves, self._compiled = spaces.leaves(observation_space), copy.copy(kept[key])
+            self._obs_leaves, self.learner = spaces.leaves(observation_space), copy.copy(kept[key])
             return
         if len(kept) > 200:
             kept.clear()
             jax.clear_caches()
         build(self, observation_space, action_space, n_envs)
-        kept[key] = self._compiled
+        kept[key] = self.learner
 
     Agent._build = build_once  # type: ignore[method-assign]
 

@@ -155,7 +155,7 @@ def digest(agent: Any) -> dict[str, str]:
 
     rows = agent.history.table()
     rows[:, 5] = 0.0  # the clock
-    run = agent._run
+    run = agent.run
     best = {} if agent.best is None else {f"best.{i}": leaf for i, leaf in enumerate(agent.best.state)}
     arrays = {
         **agent.get_parameters(),

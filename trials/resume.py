@@ -50,7 +50,7 @@ def facts(agent: Any) -> dict[str, Any]:
     rows = agent.history.table()
     rows[:, 5] = 0.0  # the clock
     counters = np.array([agent.num_timesteps, agent.n_updates])
-    buffer = {f"buffer.{key}": value for key, value in agent._run.replay.arrays().items()}
+    buffer = {f"buffer.{key}": value for key, value in agent.run.replay.arrays().items()}
     return {**agent.get_parameters(), **buffer, "history": rows, "counters": counters}
 
 
@@ -101,15 +101,15 @@ def compiled_once() -> Iterator[None]:
     from unittest import mock
 
     import rejeu
-    from rejeu.loops.learner import Compiled
+    from rejeu.loops.learner import Learner
 
     made: list[Any] = []
 
     def make(*arguments: Any) -> Any:
-        made.extend([] if made else [Compiled(*arguments)])
+        made.extend([] if made else [Learner(*arguments)])
         return copy.copy(made[0])
 
-    with mock.patch.object(rejeu.agents.base, "Compiled", make):
+    with mock.patch.object(rejeu.agents.base, "Learner", make):
         yield
 
 

@@ -34,8 +34,8 @@ def assert_same_run(one, two):
         np.testing.assert_array_equal(array, second[name], err_msg=name)
     for column in ("step", "env", "return", "length", "success"):
         np.testing.assert_array_equal(one.history[column], two.history[column])
-    np.testing.assert_array_equal(one._run.action, two._run.action)
-    assert (one.n_updates, one._run.step) == (two.n_updates, two._run.step)
+    np.testing.assert_array_equal(one.run.action, two.run.action)
+    assert (one.n_updates, one.run.step) == (two.n_updates, two.run.step)
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -117,7 +117,7 @@ def test_evaluating_in_other_environments_does_not_change_training():
 def test_a_seed_decides_the_environments_too():
     """Given by a function, an environment gets its seed from the agent alone."""
     firsts = [
-        small_sac(lambda: Counter((5,)), seed=seed, learning_starts=99).learn(1)._run.obs[0, 2] for seed in (4, 4, 5)
+        small_sac(lambda: Counter((5,)), seed=seed, learning_starts=99).learn(1).run.obs[0, 2] for seed in (4, 4, 5)
     ]
     assert firsts[0] == firsts[1] != firsts[2]
 
@@ -148,5 +148,5 @@ def test_actions_follow_the_newest_update_unless_they_overlap_with_it(overlap):
         policy_kwargs={"net_arch": [8]},
         seed=0,
     ).learn(30)
-    newest = np.asarray(agent._compiled.exploit(agent._run.state, agent._run.obs))
-    assert (newest == agent._run.action).all() == (not overlap)
+    newest = np.asarray(agent.learner.exploit(agent.run.state, agent.run.obs))
+    assert (newest == agent.run.action).all() == (not overlap)

@@ -91,13 +91,13 @@ def test_an_off_policy_agent_may_be_evaluated_in_its_own_environment_while_it_le
 def test_an_on_policy_agent_may_be_evaluated_in_its_own_environment_while_it_learns(how):
     env, seen = Counter((5,)), []
     agent = rejeu.A2C("MlpPolicy", env, n_steps=12, policy_kwargs={"net_arch": [4]}, seed=0)
-    update = agent._compiled.update
+    update = agent.learner.update
 
     def keep(state, batch, clock):
         seen.append(jax.tree.map(np.array, batch))
         return update(state, batch, clock)
 
-    agent._compiled.update = keep
+    agent.learner.update = keep
     agent.learn(24, every(8, lambda agent: OWN[how](agent, env)))
     assert agent.num_timesteps == 24
     assert [batch.ended[:, 0].nonzero()[0].tolist() for batch in seen] == [[4, 7], [0, 3, 8]]

@@ -25,7 +25,7 @@ from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.hooks import BaseCallback, EvalCallback
 from rejeu.io import checkpoint, plain
-from rejeu.loops.learner import Compiled
+from rejeu.loops.learner import Learner
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
 from tests.every_agent import KINDS
@@ -73,7 +73,7 @@ CASES = {
 
 def facts(agent):
     """Everything of a run that does not depend on the clock."""
-    buffer = agent._run.replay.arrays()
+    buffer = agent.run.replay.arrays()
     history = np.array([(*e[:5], 0.0) for e in agent.history.episodes])
     return {
         **agent.get_parameters(),
@@ -110,10 +110,10 @@ def compiled_once():
     made = []
 
     def make(*arguments):
-        made.extend([Compiled(*arguments)] if not made else [])
+        made.extend([Learner(*arguments)] if not made else [])
         return copy.copy(made[0])
 
-    with mock.patch.object(rejeu.agents.base, "Compiled", make):
+    with mock.patch.object(rejeu.agents.base, "Learner", make):
         yield
 
 
@@ -308,9 +308,9 @@ def test_a_rollout_keeps_the_steps_of_the_episodes_that_cannot_go_on(tmp_path):
     make().learn(96, [Checkpoint(tmp_path, every=10), lambda agent, turn: turn.step < 40])
     with pytest.warns(UserWarning, match="cannot be carried"):
         agent = rejeu.PPO.resume(tmp_path, env())
-    assert agent._run.replay.size() == 8
+    assert agent.run.replay.size() == 8
     agent.learn(1, reset_num_timesteps=False)
-    assert agent._run.replay.ended[7, 0]
+    assert agent.run.replay.ended[7, 0]
 
 
 def test_another_process_is_told_that_the_run_is_in_use(tmp_path):
@@ -618,7 +618,7 @@ def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, tmp_
     with compiled_once():
         whole = make().learn(45).learn(50, reset_num_timesteps=False)
         cut_off = make().learn(45, Checkpoint(tmp_path))
-        assert cut_off._run.replay.size() == 13
+        assert cut_off.run.replay.size() == 13
         again = rejeu.AGENTS[name].resume(tmp_path, make_env())
         assert_same(facts(again), facts(cut_off))
         again.learn(50, reset_num_timesteps=False)

@@ -27,15 +27,15 @@ def small(env, algorithm=rejeu.A2C, **settings):
 
 def rollouts_of(agent, n_steps=None, **kwargs):
     """Trains, and returns what each update was given, and the state before it."""
-    seen, update = [], agent._compiled.update
+    seen, update = [], agent.learner.update
 
     def keep(state, batch, clock):
         seen.append((agent.state, jax.tree.map(np.array, batch)))
         return update(state, batch, clock)
 
-    agent._compiled.update = keep
+    agent.learner.update = keep
     agent.learn(n_steps, **kwargs)
-    agent._compiled.update = update
+    agent.learner.update = update
     return seen
 
 
@@ -50,7 +50,7 @@ def test_every_environment_plays_its_episodes_and_waits_for_the_others(n_episode
         shares = [sum(one[: (update + 1) * n_episodes]) for one in played]
         total = sum(shares)
         agent.learn(total - sum(sum(one[: update * n_episodes]) for one in played))
-        assert agent._run.step == total
+        assert agent.run.step == total
         assert [len(one.actions) for one in env.envs] == shares
         assert agent.n_updates == update + 1
     counts = np.bincount([e.env for e in agent.history.episodes])
@@ -80,7 +80,7 @@ def test_what_the_padding_holds_changes_nothing(algorithm):
     (state, rollout), *_ = rollouts_of(agent, 2 + 4 + 7)
     spoil = lambda x: np.where(rollout.valid.reshape(7, 3, *[1] * (x.ndim - 2)), x, x + x.dtype.type(77))  # noqa: E731
     fields = {key: spoil(getattr(rollout, key)) for key in ("obs", "action", "reward", "next_obs", "discount")}
-    inner = agent._compiled.algorithm
+    inner = agent.learner.algorithm
     clock = rejeu.core.Clock(np.uint32(0), np.uint32(0), np.float32(0))
     update = jax.jit(inner.update)
     one, other = update(state, rollout, clock)[0], update(state, rollout._replace(**fields), clock)[0]
@@ -211,7 +211,7 @@ def test_a_time_limit_sets_how_long_a_rollout_may_be():
 def test_without_a_time_limit_n_steps_says_how_long_a_rollout_may_be():
     """EnvPool's CliffWalking-v0 has none; 8 GiB were once reserved for it."""
     agent = small(make_vector("CliffWalking-v0", 1, "envpool", seed=0), n_episodes=2, n_steps=8).learn(40)
-    assert agent._run.replay.n_steps == 2 * 8
+    assert agent.run.replay.n_steps == 2 * 8
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, True])

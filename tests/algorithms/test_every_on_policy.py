@@ -144,7 +144,7 @@ def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_f
     agent = start(kind).learn(size)
     agent.remember_best(1.0)
     agent.learn(size - 1, reset_num_timesteps=False)
-    assert agent._run.replay.size() == size - 1
+    assert agent.run.replay.size() == size - 1
     if change == "set_parameters":
         agent.set_parameters(agent.get_parameters())
     elif change == "restore_best":
@@ -153,7 +153,7 @@ def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_f
         agent.set_env(wanderers(kind))
     n_updates = agent.n_updates
     agent.learn(size - 1, reset_num_timesteps=False)
-    assert (agent.n_updates, agent._run.replay.size()) == (n_updates, size - 1)
+    assert (agent.n_updates, agent.run.replay.size()) == (n_updates, size - 1)
     agent.learn(1, reset_num_timesteps=False)
     assert agent.n_updates > n_updates
 

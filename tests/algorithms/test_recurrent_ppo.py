@@ -234,7 +234,7 @@ def test_acting_step_by_step_gives_the_memories_that_learning_unrolls():
     carries, observations, begun = [], [], []
 
     def note(agent, progress):
-        run = agent._run
+        run = agent.run
         observations.append(np.array(run.obs))
         begun.append(run.ended.copy())
         carries.append(jax.tree.map(np.array, run.carry))

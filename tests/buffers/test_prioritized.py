@@ -368,8 +368,8 @@ def small_dqn(**settings) -> rejeu.DQN:
     env = InProcess([Sampled(spaces.Box(0.0, 1.0, (3,)), spaces.Discrete(3))], seed=0)
     settings = {"train_freq": 1, "gradient_steps": 1, **settings, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
     agent = rejeu.DQN("MlpPolicy", env, learning_starts=8, batch_size=4, buffer_size=300, priorities={}, **settings)
-    update = agent._compiled.update
-    agent._compiled.update = lambda state, batch, clock: (*update(state, batch, clock)[:2], batch.obs[..., 0])
+    update = agent.learner.update
+    agent.learner.update = lambda state, batch, clock: (*update(state, batch, clock)[:2], batch.obs[..., 0])
     return agent
 
 
@@ -404,12 +404,12 @@ def assert_priorities_are_of_their_steps(agent: rejeu.DQN, least: int) -> None:
 
 def assert_resumes(agent: rejeu.DQN, folder) -> None:
     """Fails unless a checkpoint of the run, taken now, can be resumed with everything that is outstanding."""
-    assert agent._run.td_errors
+    assert agent.run.td_errors
     Checkpoint(folder).save(agent)
     env = InProcess([Sampled(spaces.Box(0.0, 1.0, (3,)), spaces.Discrete(3))], seed=0)
     with pytest.warns(UserWarning, match="at the start of new episodes"):
         again = rejeu.DQN.resume(folder, env)
-    for (draw, td_error), (other, same) in zip(agent._run.td_errors, again._run.td_errors, strict=True):
+    for (draw, td_error), (other, same) in zip(agent.run.td_errors, again.run.td_errors, strict=True):
         np.testing.assert_array_equal(draw.position, other.position)
         np.testing.assert_array_equal(draw.time, other.time)
         np.testing.assert_array_equal(td_error, same)
@@ -442,7 +442,7 @@ def test_a_loaded_replay_buffer_forgets_the_td_errors_of_the_one_before(tmp_path
     agent.load_replay_buffer(tmp_path / "replay")
     Checkpoint(tmp_path / "run").save(agent)
     with pytest.warns(UserWarning, match="none was under way"):
-        assert rejeu.DQN.resume(tmp_path / "run", agent.env)._run.td_errors == []
+        assert rejeu.DQN.resume(tmp_path / "run", agent.env).run.td_errors == []
     agent.learn(60)
     assert_priorities_are_of_their_steps(agent, least=20)
 
@@ -451,13 +451,13 @@ def test_checkpoints_in_which_draws_have_lost_their_td_errors_are_read(tmp_path)
     """Older versions wrote such after an error: the draws ahead of the others had no TD errors any more."""
     agent = small_dqn().learn(40)
     path = Checkpoint(tmp_path).save(agent)
-    (draw, td_error), steps = agent._run.td_errors[0], np.arange(4)
+    (draw, td_error), steps = agent.run.td_errors[0], np.arange(4)
     header, arrays = checkpoint.read(path, "run")
     drawn = header["run"]["dict"]["buffer"]["dict"]["priorities"]["dict"]["drawn"]
     drawn.insert(0, [{"array": "run.lost"}, {"array": "run.lost"}])
     kept = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
     checkpoint.write(path, "run", {**arrays, "run.lost": steps}, kept)
     with pytest.warns(UserWarning, match="at the start of new episodes"):
-        ((same, error),) = rejeu.DQN.resume(tmp_path, agent.env)._run.td_errors
+        ((same, error),) = rejeu.DQN.resume(tmp_path, agent.env).run.td_errors
     np.testing.assert_array_equal(same.position, draw.position)
     np.testing.assert_array_equal(error, td_error)

@@ -384,7 +384,7 @@ def recorded(n_envs, total, lengths, ends, n_steps=4):
         rollouts.append(jax.tree.map(np.copy, rollout))
         return state, Readings((), np.zeros(1)), None
 
-    agent._compiled.update = update
+    agent.learner.update = update
     return rollouts, agent.learn(total)
 
 

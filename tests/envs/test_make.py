@@ -418,7 +418,7 @@ def test_training_begins_with_the_seeds_given_for_each_environment_and_not_with_
         env = make_vector("Pendulum-v1", 2, backend, seed=seeds)
         agent = small_sac(env, seed=agent_seed)
         seen = []
-        agent.learn(2, lambda agent, turn: seen.append(agent._run.replay.arrays()["obs.array"][:, 0]))
+        agent.learn(2, lambda agent, turn: seen.append(agent.run.replay.arrays()["obs.array"][:, 0]))
         return seen[0]
 
     expected = np.array(make_vector("Pendulum-v1", 2, backend, seed=[4, 9]).reset())

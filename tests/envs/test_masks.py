@@ -206,13 +206,13 @@ def recorded(kind):
     """An agent after one rollout, the rollout that it is about to learn from, and the environments."""
     env = vector(kind, n_envs=2)
     agent = small(env, n_steps=32)
-    rollouts, update = [], agent._compiled.update
+    rollouts, update = [], agent.learner.update
 
     def keep(state, batches, clock):
         rollouts.append((agent.state, jax.tree.map(np.array, batches)))
         return update(state, batches, clock)
 
-    agent._compiled.update = keep
+    agent.learner.update = keep
     agent.learn(64)
     return rollouts[0], env
 

@@ -323,4 +323,4 @@ def test_the_choice_is_said_in_a_line():
 
 def test_two_agents_of_one_seed_are_stepped_by_the_same_backend(folder):
     one, two = (rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=3, learning_starts=99).learn(30) for _ in range(2))
-    np.testing.assert_array_equal(one._run.obs, two._run.obs)
+    np.testing.assert_array_equal(one.run.obs, two.run.obs)

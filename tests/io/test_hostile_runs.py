@@ -35,7 +35,7 @@ def make_run(case, folder):
     agent._own_env = True  # its environments were made from an id
     keep = lambda agent, turn: agent.remember_best((0.5, 1.0)) if turn.step == 6 else None  # noqa: E731
     agent.learn(60, [keep, Checkpoint(folder, every=1000, keep=1), lambda agent, turn: turn.step < 24])
-    return rejeu.AGENTS[name], folder, agent._compiled
+    return rejeu.AGENTS[name], folder, agent.learner
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def resumed(run, tmp_path, change, **hyperparameters):
     header, arrays = checkpoint.read(path, "run")
     change(header, header["run"]["dict"], arrays)
     checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
-    with mock.patch.object(rejeu.agents.base, "Compiled", return_value=copy.copy(compiled)):
+    with mock.patch.object(rejeu.agents.base, "Learner", return_value=copy.copy(compiled)):
         return kind.resume(folder, **hyperparameters)
 
 
@@ -148,7 +148,7 @@ def test_the_same_run_goes_on_where_nothing_is_changed(run, tmp_path):
     """Else all would be refused for what is wrong with every one of them."""
     agent = resumed(run, tmp_path, lambda header, values, arrays: None)
     assert agent.resumed.exact
-    assert agent.learn(8, reset_num_timesteps=False)._run.step == agent.resumed.step + 8
+    assert agent.learn(8, reset_num_timesteps=False).run.step == agent.resumed.step + 8
 
 
 @pytest.mark.parametrize("run", ["rollout"], indirect=True)
@@ -179,7 +179,7 @@ def resumed_from(run, folder):
     """What becomes of it when the run in a folder is resumed and, if it can be, trained for some steps."""
     kind, _, compiled = run
     try:
-        shared = mock.patch.object(rejeu.agents.base, "Compiled", return_value=copy.copy(compiled))
+        shared = mock.patch.object(rejeu.agents.base, "Learner", return_value=copy.copy(compiled))
         with shared, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that it is not exact
             agent = kind.resume(folder)
@@ -257,7 +257,7 @@ def test_what_was_owed_may_be_more_where_the_user_learns_more_often(run, tmp_pat
     def owe(header, values, arrays):
         values["owed"], header["config"]["train_freq"] = 3, 5
 
-    assert resumed(run, tmp_path, owe, train_freq=1)._run.owed == 3
+    assert resumed(run, tmp_path, owe, train_freq=1).run.owed == 3
 
 
 def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):
@@ -292,7 +292,7 @@ def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):
 
 def test_a_rollout_under_way_needs_what_was_remembered_at_its_beginning():
     agent = rejeu.RecurrentPPO("MlpPolicy", BALL, n_steps=4, batch_size=4, **SMALL)
-    run, carry = agent._run, agent._compiled.initial_carry(1)
+    run, carry = agent.run, agent.learner.initial_carry(1)
     saved = {"rollout": run.replay.arrays(), "started": np.zeros(1, bool), "carry": []}
     with pytest.raises(ValueError, match=r"shorter|longer"):
         restore_buffer(run, saved, [], carry, begun=True)

@@ -86,13 +86,13 @@ ON_POLICY = ("PPO", "PPO, normalised", "A2C", "MaskablePPO", "RecurrentPPO")
 
 def replace_update(agent, which, instead):
     """Lets the ``which``-th call of the update, counted from 0, be ``instead(state, batches, clock)``."""
-    update, numbers = agent._compiled.update, itertools.count()
-    agent._compiled.update = lambda *arguments: (instead if next(numbers) == which else update)(*arguments)
+    update, numbers = agent.learner.update, itertools.count()
+    agent.learner.update = lambda *arguments: (instead if next(numbers) == which else update)(*arguments)
 
 
 def poison(agent, which, value):
     """Puts ``value`` into a reward of the ``which``-th sample or rollout, so that what is saved is what was learnt from."""
-    buffer, calls = agent._run.replay, []
+    buffer, calls = agent.run.replay, []
     name = "rollout" if isinstance(buffer, RolloutBuffer) else "draw"
     method = getattr(buffer, name)
 
@@ -139,7 +139,7 @@ def test_an_update_that_breaks_something_ends_training_with_the_state_before_it(
     twin = MAKE[name]()
     last = error.step // 2 if is_on_policy else error.step - turn
     twin.learn(TOTAL, lambda _, progress: progress.step < last)
-    assert twin._run.step == last
+    assert twin.run.step == last
     if name in SCANS:  # the second of the steps in one call was the broken one
         assert agent.state.n_updates == twin.state.n_updates + 1
     else:
@@ -162,7 +162,7 @@ def test_infinity_and_overflow_are_found_as_nan_is(name, value, tmp_path):
     poison(agent, 1, value)
     if name == "DQN with priorities" and value == 1e30:  # Huber's loss: finite, and so is its gradient
         agent.learn(12)
-        assert np.isfinite(agent._run.replay.priorities.tree.total)
+        assert np.isfinite(agent.run.replay.priorities.tree.total)
         return
     with pytest.raises(NonFiniteError, match=r"became no finite number|the batch held reward"):
         agent.learn(TOTAL)
@@ -228,7 +228,7 @@ def test_the_message_names_step_update_batch_model_and_what_to_try(tmp_path):
     agent = MAKE["SAC"]()
     agent.learn(20)
     model = agent.save(tmp_path / "model")
-    agent._run.replay.ring.records["reward"][:] = 1e30
+    agent.run.replay.ring.records["reward"][:] = 1e30
     with pytest.raises(NonFiniteError) as caught:
         agent.learn(5, reset_num_timesteps=False)
     message = str(caught.value)
@@ -332,7 +332,7 @@ def test_who_looks_at_the_agent_right_after_a_broken_update_is_told(use, tmp_pat
     with pytest.raises(NonFiniteError) as caught:
         agent.learn(TOTAL, look)
     assert caught.value.step == 10
-    assert agent._run.step == 10
+    assert agent.run.step == 10
     assert not (tmp_path / "model.safetensors").exists()
     assert agent.best is None
 
@@ -385,7 +385,7 @@ def test_skipping_an_update_is_as_if_its_batch_had_never_been_given(name):
     assert agent.statistics()["train/skipped_updates"] == 1
     assert twin.statistics()["train/skipped_updates"] == 0
     if name == "DQN with priorities":
-        one, two = (a._run.replay.priorities for a in (agent, twin))
+        one, two = (a.run.replay.priorities for a in (agent, twin))
         np.testing.assert_array_equal(one.tree.nodes, two.tree.nodes)
         assert one.largest == two.largest
         assert np.isfinite(one.tree.nodes).all()
@@ -395,7 +395,7 @@ def test_of_a_scan_only_the_broken_step_is_skipped():
     make = lambda: rejeu.SAC("MlpPolicy", box(), gradient_steps=4, nonfinite="skip", **OFF)  # noqa: E731
     agent, twin = make(), make()
     poison(agent, 2, np.nan)  # in the second of four batches
-    update = twin._compiled.update
+    update = twin.learner.update
 
     def three_of_four(state, batches, clock):
         for i in (0, 2, 3):
@@ -418,10 +418,10 @@ def test_updates_that_are_all_skipped_are_an_error_in_the_end(tmp_path):
     agent = MAKE["SAC"](nonfinite="skip")
     agent.report_folder = tmp_path
     agent.learn(20)
-    agent._run.replay.ring.records["reward"][:] = np.nan
-    draw = agent._run.replay.draw
+    agent.run.replay.ring.records["reward"][:] = np.nan
+    draw = agent.run.replay.draw
     spoiled = lambda batch, drawn: (batch._replace(reward=batch.reward * np.float32(np.nan)), drawn)  # noqa: E731
-    agent._run.replay.draw = lambda *a: spoiled(*draw(*a))
+    agent.run.replay.draw = lambda *a: spoiled(*draw(*a))
     with pytest.raises(NonFiniteError, match=r"^100 updates in a row were skipped, .* the batch held reward") as caught:
         agent.learn(200)
     assert caught.value.batch.exists()
@@ -500,7 +500,7 @@ class Echo(Sampled):
 
 def test_an_environment_is_not_blamed_for_an_action_that_was_not_finite():
     agent = rejeu.SAC("MlpPolicy", InProcess([Echo(gym.spaces.Box(-1.0, 1.0, (3,)))], seed=0), **OFF).learn(12)
-    agent._run.action = np.full((1, 1), np.nan, np.float32)
+    agent.run.action = np.full((1, 1), np.nan, np.float32)
     with pytest.raises(NonFiniteError, match=r"the policy chose the action \[nan\] in environment 0 after 12 steps"):
         agent.learn(3, reset_num_timesteps=False)
 
@@ -599,9 +599,9 @@ def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_
 def test_a_saved_batch_whose_rewards_are_clipped_one_by_one_can_be_examined(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     agent = MAKE["SAC, normalised"](n_steps=3)
-    draw = agent._run.replay.draw
+    draw = agent.run.replay.draw
     spoiled = lambda batch, drawn: (batch._replace(rewards=batch.rewards * np.float32(np.nan)), drawn)  # noqa: E731
-    agent._run.replay.draw = lambda *a: spoiled(*draw(*a))
+    agent.run.replay.draw = lambda *a: spoiled(*draw(*a))
     with pytest.raises(NonFiniteError) as caught:
         agent.learn(TOTAL)
     assert "rewards (nan)" in finite.examine(agent, caught.value.batch).batch

@@ -1,6 +1,6 @@
 """What an environment step costs in crossings between Python and XLA: counted, so that no machine's speed matters.
 
-Three things are counted. Calls of compiled functions, by wrapping each that ``Compiled`` makes, with the NumPy arrays among
+Three things are counted. Calls of compiled functions, by wrapping each that ``Learner`` makes, with the NumPy arrays among
 their arguments, each of which crosses to the device. Reads from the device, wherever a ``jax.Array`` becomes a NumPy array
 or a Python number. And compilations, by JAX's own events; as every program must be compiled again after
 ``jax.clear_caches()``, their number in a stretch after it is the number of different programs that ran there, which shows
@@ -244,11 +244,11 @@ def extra(agent: rejeu.agents.Agent, tally: Tally, what: Any) -> dict[str, int]:
 
 
 EXTRA = {
-    "a call": (lambda agent: agent._compiled.copy(agent._run.state), {"copy": 1}),
-    "an argument": (lambda agent: agent._compiled.copy([np.zeros(3)]), {"copy": 1, "copy in": 1}),
-    "np.asarray": (lambda agent: np.asarray(agent._run.metrics["q_value"].block_until_ready()), {"reads": 1}),
-    "float": (lambda agent: float(agent._run.metrics.vector[0]), {"reads": 1}),
-    "jax.device_get": (lambda agent: jax.device_get(agent._run.metrics.vector), {"reads": 1}),
+    "a call": (lambda agent: agent.learner.copy(agent.run.state), {"copy": 1}),
+    "an argument": (lambda agent: agent.learner.copy([np.zeros(3)]), {"copy": 1, "copy in": 1}),
+    "np.asarray": (lambda agent: np.asarray(agent.run.metrics["q_value"].block_until_ready()), {"reads": 1}),
+    "float": (lambda agent: float(agent.run.metrics.vector[0]), {"reads": 1}),
+    "jax.device_get": (lambda agent: jax.device_get(agent.run.metrics.vector), {"reads": 1}),
 }
 
 

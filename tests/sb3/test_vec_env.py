@@ -126,7 +126,7 @@ def taught(agent):
         rollouts.append([jax.tree.map(np.array, part) for part in batch[:5]])
         return state, Readings((), np.zeros(1)), None
 
-    agent._compiled.update = update
+    agent.learner.update = update
     return rollouts
 
 

@@ -88,7 +88,7 @@ def wait(agent: Any, library: str) -> None:
     if library == "rejeu":
         import jax
 
-        jax.block_until_ready(agent._run.state)
+        jax.block_until_ready(agent.run.state)
     elif library == "sbx":
         import jax
 

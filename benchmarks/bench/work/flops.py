@@ -89,7 +89,7 @@ def off_policy(agent: Any, n_envs: int) -> dict[str, float]:
 
     from rejeu.core import Clock
 
-    config, algorithm, shapes = agent.config, agent._compiled.algorithm, agent._compiled.shapes
+    config, algorithm, shapes = agent.config, agent.learner.algorithm, agent.learner.shapes
     batch = agent.replay_buffer.sample(np.random.default_rng(0), (config.batch_size,))
     clock = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
     update = flops(algorithm.update, shapes, batch, clock, taken=1.0 / getattr(config, "policy_delay", 1))
@@ -102,8 +102,8 @@ def on_policy(agent: Any, n_envs: int) -> dict[str, float]:
 
     from rejeu.core import Clock
 
-    config, algorithm, shapes = agent.config, agent._compiled.algorithm, agent._compiled.shapes
-    rollout = agent._run.replay.rollout()
+    config, algorithm, shapes = agent.config, agent.learner.algorithm, agent.learner.shapes
+    rollout = agent.run.replay.rollout()
     clock = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
     steps = config.n_steps * n_envs
     runs = config.n_epochs * -(-steps // config.batch_size) if hasattr(config, "n_epochs") else 1
@@ -113,10 +113,10 @@ def on_policy(agent: Any, n_envs: int) -> dict[str, float]:
 
 
 def _act(agent: Any, obs: Any, clock: Any) -> float:
-    algorithm = agent._compiled.algorithm
+    algorithm = agent.learner.algorithm
     n_envs = len(jax.tree.leaves(obs)[0])
 
     def act(state: Any, obs: Any, key: Any) -> Any:
         return algorithm.explore(algorithm.actor(state), obs, key, clock)
 
-    return flops(act, agent._compiled.shapes, obs, jax.random.PRNGKey(0)) / n_envs
+    return flops(act, agent.learner.shapes, obs, jax.random.PRNGKey(0)) / n_envs

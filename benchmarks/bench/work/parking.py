@@ -48,7 +48,7 @@ def rejeu_job(folder: Path, backend: str, n_envs: int, settings: dict[str, Any],
 
     def mark(agent: Any, progress: Any) -> None:
         if progress.step >= (warm_up, steps)[min(len(marks), 1)] and len(marks) < 2:
-            jax.block_until_ready(agent._run.state)
+            jax.block_until_ready(agent.run.state)
             marks.append((time.perf_counter(), progress.step, step.seconds, reset.seconds))
             parts.append(agent.seconds)
 

@@ -41,7 +41,7 @@ from rejeu.hooks import BaseCallback
 from rejeu.io import checkpoint
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops import finite
-from rejeu.loops.learner import Compiled, PackedState
+from rejeu.loops.learner import Learner, PackedState
 from rejeu.loops.run import Progress, Run, initial_run
 from rejeu.normalization import normalised
 from rejeu.reporting import summary
@@ -168,19 +168,19 @@ class Agent(ABC):
         if self.config.normalize is not None:
             explorer = exploration.make(algorithm, noise)
             algorithm = normalised(algorithm, explorer, self._obs_leaves, self.config.normalize, self.config.gamma)
-        self._compiled = Compiled(algorithm, noise, self.config.nonfinite == "skip")
+        self.learner = Learner(algorithm, noise, self.config.nonfinite == "skip")
 
     def _threads(self, n_envs: int) -> int:
         """Returns how many threads suit updates on ``n_envs`` environments, by the largest layer; for images all."""
         if any(leaf.kind == "image" for leaf in self._obs_leaves):
             return xla.cores()
-        weights = [leaf.size for leaf in jax.tree.leaves(self._compiled.shapes) if len(leaf.shape) > 1]
+        weights = [leaf.size for leaf in jax.tree.leaves(self.learner.shapes) if len(leaf.shape) > 1]
         return xla.threads_for(self._batch_size(n_envs) * max(weights, default=0))
 
     def _start(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
         """Begins a run on ``env`` with a fresh state, or the given one, and an empty buffer; None only predicts."""
         buffer, learn_from = (None, 0) if env is None else (self._make_buffer(env), self._learn_from(0))
-        self._run: Run = initial_run(env, buffer, self._compiled, learn_from, self.seed, state)
+        self.run: Run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
 
     @abstractmethod
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
@@ -223,7 +223,7 @@ class Agent(ABC):
 
         New ones begin with the next ``learn``; within one at once, so that a checkpoint of this step can hold them.
         """
-        self._run.obs = self._run.action = None
+        self.run.obs = self.run.action = None
         if self._learning:
             self._begin_episodes()
 
@@ -235,33 +235,33 @@ class Agent(ABC):
     @property
     def env(self) -> VectorEnv | None:
         """The environments it trains on; None after ``load`` without one."""
-        return self._run.env
+        return self.run.env
 
     @property
     def n_envs(self) -> int:
         """How many environments it steps at once."""
-        return self._run.env.n_envs if self._run.env is not None else 1
+        return self.run.env.n_envs if self.run.env is not None else 1
 
     @property
     def state(self) -> Any:
         """Everything learnt, as the algorithm's own class; a copy. Waits for the updates under way."""
         finite.settle(self)
-        return self._compiled.state(self._run.state)
+        return self.learner.state(self.run.state)
 
     @property
     def num_timesteps(self) -> int:
         """Environment steps taken since the last ``learn`` with ``reset_num_timesteps=True`` began."""
-        return self._run.step - self._steps_before
+        return self.run.step - self._steps_before
 
     @property
     def n_updates(self) -> int:
         """Gradient steps taken in all."""
-        return self._run.n_updates
+        return self.run.n_updates
 
     @property
     def seconds(self) -> dict[str, float]:
         """Wall time spent training, in all and by what it went into: ``env``, ``replay``, ``update``, ``total``."""
-        return dict(self._run.seconds)
+        return dict(self.run.seconds)
 
     def learn(
         self,
@@ -413,7 +413,7 @@ class Agent(ABC):
         it is a :class:`DummyVecEnv`. The episodes that ran there are given up: the next ``learn`` begins new ones. While
         it learns they are to be looked at only.
         """
-        env = self._run.env
+        env = self.run.env
         if env is None:
             return None
         if not self._learning:
@@ -429,7 +429,7 @@ class Agent(ABC):
 
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """Returns the ``VecNormalize`` around the environments it trains on, or None."""
-        env = self._run.env
+        env = self.run.env
         return None if env is None or env.venv is None else unwrap_vec_normalize(env.venv)
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
@@ -450,11 +450,11 @@ class Agent(ABC):
         vector = self._vector(env, 1, seed=self.seed)
         self._check_spaces(vector, "the new environment")
         self._own_env = isinstance(env, str)
-        run = self._run
+        run = self.run
         if run.env is None or run.env.n_envs != vector.n_envs:
             run.replay = self._make_buffer(vector)
             run.td_errors = []
-            run.carry = self._compiled.initial_carry(vector.n_envs)
+            run.carry = self.learner.initial_carry(vector.n_envs)
             run.learn_from = self._learn_from(run.step)
         else:
             self._keep_buffer(vector)
@@ -488,7 +488,7 @@ class Agent(ABC):
         if isinstance(source, str | Path):
             path = source
             with checkpoint.opened(path, "agent") as file:
-                shapes = self._compiled.shapes
+                shapes = self.learner.shapes
                 own = {} if exact_match else dict(zip(checkpoint.names(shapes), jax.tree.leaves(shapes), strict=True))
                 checkpoint.match(shapes, {**own, **file.specs}, path)
                 source = file.read()
@@ -496,8 +496,8 @@ class Agent(ABC):
         arrays = {key: np.asarray(value) for key, value in source.items()}
         if not exact_match:
             arrays = self.get_parameters() | arrays
-        state = checkpoint.arrays_to_tree(self._compiled.shapes, arrays, "set_parameters: the source")
-        self._run.state = self._compiled.pack(state)
+        state = checkpoint.arrays_to_tree(self.learner.shapes, arrays, "set_parameters: the source")
+        self.run.state = self.learner.pack(state)
         self._drop_rollout()
 
     def save(self, path: str | Path) -> Path:
@@ -562,11 +562,11 @@ class Agent(ABC):
 
     def summary(self) -> str:
         """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""
-        return summary.describe(self._compiled.shapes, self._obs_leaves)
+        return summary.describe(self.learner.shapes, self._obs_leaves)
 
     def __repr__(self) -> str:
-        where = self._run.env.env_id if self._run.env is not None else "no environment"
-        return f"<rejeu.{self.name} on {where}, {self._run.step} steps, {self._run.n_updates} updates>"
+        where = self.run.env.env_id if self.run.env is not None else "no environment"
+        return f"<rejeu.{self.name} on {where}, {self.run.step} steps, {self.run.n_updates} updates>"
 
     def __init_subclass__(cls) -> None:
         """Writes signature and docstring from the configuration, where every hyper-parameter is declared once."""

@@ -47,7 +47,7 @@ def remember(agent: Agent, score: float | tuple[float, ...], by: str) -> bool:
     if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
         return False
     finite.settle(agent)
-    agent.best = Best(score, by, agent._run.step, agent._compiled.copy(agent._run.state))
+    agent.best = Best(score, by, agent.run.step, agent.learner.copy(agent.run.state))
     return True
 
 
@@ -62,5 +62,5 @@ def restore(agent: Agent) -> None:
             f"no best weights are known yet: they are kept once {counted(agent.best_window, 'episode')} of training "
             "ended, and at every evaluation by rejeu.callbacks.Evaluate"
         )
-    agent._run.state = agent._compiled.copy(agent.best.state)
+    agent.run.state = agent.learner.copy(agent.best.state)
     agent._drop_rollout()

@@ -140,9 +140,9 @@ class Checkpoint:
             for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote
                 path.unlink(missing_ok=True)
             for path in run_files(self.folder):
-                if step_of(path) > agent._run.step:  # a damaged one, which resume has passed over
+                if step_of(path) > agent.run.step:  # a damaged one, which resume has passed over
                     path.rename(path.with_name(f"{path.name}.damaged"))
-            self._last_step, self._last_time = agent._run.step, time.monotonic()
+            self._last_step, self._last_time = agent.run.step, time.monotonic()
             if not run_files(self.folder):
                 self.save(agent)
             if agent.report_folder is None:
@@ -194,7 +194,7 @@ class Checkpoint:
         """
         began = time.monotonic()
         finite.settle(agent)
-        run = agent._run
+        run = agent.run
         if self._saved == (run.step, run.n_updates) and not reason:
             return None
         row_files = agent._rows.setdefault(self.folder.resolve(), RowFiles())
@@ -219,7 +219,7 @@ class Checkpoint:
 
     def save_after(self, error: Exception, agent: Agent) -> None:
         """Saves what is whole after an error in the course of a step: the run goes on at the start of new episodes."""
-        if any(array.is_deleted() for array in agent._run.state):
+        if any(array.is_deleted() for array in agent.run.state):
             return  # the error came between two states
         reason = f"the run ended with {type(error).__name__}"
         try:
@@ -278,7 +278,7 @@ def step_of(path: Path) -> int:
 
 def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Returns header and arrays of a run, the rows of its replay buffer left out."""
-    run = agent._run
+    run = agent.run
     states = None if reason or run.obs is None else run.env.snapshot()
     if states is None and not reason:
         where = f"{run.env.env_id} ({run.env.backend})"
@@ -287,7 +287,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
     best = None
     if agent.best is not None:
         best = {"score": agent.best.score, "by": agent.best.by, "step": agent.best.step}
-        whole_state = agent._compiled.state(agent.best.state)
+        whole_state = agent.learner.state(agent.best.state)
         arrays |= {f"best.{name}": array for name, array in checkpoint.tree_to_arrays(whole_state).items()}
     statistics = agent.get_vec_normalize_env()
     everything = {

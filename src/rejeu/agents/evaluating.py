@@ -43,7 +43,7 @@ def play(
         ValueError: without environments, or in those of other spaces or without the agent's ``VecNormalize``.
     """
     threshold = agent.success_threshold if success_threshold is None else success_threshold
-    run = agent._run
+    run = agent.run
     if episodes is None and minutes is None:
         episodes = USUAL_EPISODES
     episodes = None if episodes is None else whole("episodes", episodes, least=1)
@@ -95,7 +95,7 @@ def lent(agent: Agent, vector: VectorEnv, seeded: bool = False) -> Iterator[None
     Training goes on in new ones, whether it is under way or still to come; ``seeded`` says that the environments were seeded
     for the play, and gives them a seed of training again.
     """
-    run = agent._run
+    run = agent.run
     shared = run.env is not None and not identities(run.env).isdisjoint(identities(vector))
     if shared:
         run.obs = run.action = None  # also if playing fails

@@ -41,7 +41,7 @@ AGENT_ARGUMENTS = {
 
 def header(agent: Agent) -> dict[str, Any]:
     """Returns all of an agent that a model file holds beside its arrays, as JSON values."""
-    run = agent._run
+    run = agent.run
     return {
         "algorithm": agent.name,
         "config": configs.to_json(agent.config),
@@ -67,7 +67,7 @@ def header(agent: Agent) -> dict[str, Any]:
 
 def made_from(agent: Agent) -> dict[str, Any] | None:
     """Returns id and keyword arguments of an agent's environments for a header, None where a file may not hold them."""
-    source = agent._trained_on if agent._run.env is None else agent._run.env.made_from
+    source = agent._trained_on if agent.run.env is None else agent.run.env.made_from
     if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
         return None
     return {"env_id": source[0], "env_kwargs": dict(source[1])}
@@ -138,10 +138,10 @@ def load(
         agent._build(saved.observation_space, saved.action_space)
     except loading.WRONG as error:
         raise CheckpointError(f"{path}: {loading.brief(error)}") from None
-    checkpoint.match(agent._compiled.shapes, checkpoint.within(file.specs, prefix), path)
+    checkpoint.match(agent.learner.shapes, checkpoint.within(file.specs, prefix), path)
     arrays = checkpoint.within(file.read(prefix), prefix)
     checkpoint.require_finite(arrays, path)
-    state = checkpoint.arrays_to_tree(agent._compiled.shapes, arrays, path)
+    state = checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path)
     agent._trained_on = trained_on(header)
     vector = make_env(agent)
     if vector is not None:
@@ -159,8 +159,8 @@ def load(
 
 def stand(agent: Agent, vector: VectorEnv | None, state: Any, saved: loading.Saved) -> None:
     """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
-    agent._start(vector, agent._compiled.pack(state))
-    run, counters = agent._run, saved.counters
+    agent._start(vector, agent.learner.pack(state))
+    run, counters = agent.run, saved.counters
     run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
     run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": saved.rng}
     run.learn_from = agent._learn_from(run.step)

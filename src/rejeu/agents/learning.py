@@ -60,7 +60,7 @@ def begin(
     Raises:
         ValueError: without an environment; if no limit is given and there is no ``learn`` to go on with.
     """
-    run = agent._run
+    run = agent.run
     if run.env is None:
         raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
     goes_on = total_timesteps is None and minutes is None and episodes is None
@@ -99,7 +99,7 @@ def cut_off(agent: Agent) -> Call:
     call = agent._call if agent.resumed is not None else None
     if call is None:
         raise ValueError("learn needs total_timesteps, episodes or minutes (or an agent from resume(), to go on with)")
-    if call.is_over(agent._run.step, agent._run.episode):
+    if call.is_over(agent.run.step, agent.run.episode):
         raise ValueError(
             "the run is complete; to train on, say how long: total_timesteps (--steps), episodes or minutes (--minutes)"
         )
@@ -139,17 +139,17 @@ def carry_out(
         if progress_bar:
             from rejeu.callbacks import ProgressBar
 
-            taken = agent._run.step - call.first_step
+            taken = agent.run.step - call.first_step
             bar = ProgressBar(call.n_steps, call.seconds, taken=taken, spent=call.spent)
             held.callback(bar.close)
             callbacks.append(bar)
         agent.interrupted, agent.interrupted_by = False, None
-        agent._run.success_threshold = agent.success_threshold
+        agent.run.success_threshold = agent.success_threshold
         held.callback(_stop, agent, agent.logger.outputs)
         agent.logger.outputs, agent._learning = [*outputs], True
         for saver in savers:
             held.enter_context(saver.held(agent))
-        remaining = None if call.last_step is None else call.last_step - agent._run.step
+        remaining = None if call.last_step is None else call.last_step - agent.run.step
         hooks.begin(agent, remaining, arguments)
         saved, agent._saved_callbacks = agent._saved_callbacks, None
         if saved is not None:
@@ -176,7 +176,7 @@ def carry_out(
 def warn_without_noise(agent: Agent) -> None:
     """Warns, at the beginning of a run, if its policy is deterministic and nothing makes it try other actions."""
     deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
-    if deterministic and agent._noise() is None and agent._run.step == 0:
+    if deterministic and agent._noise() is None and agent.run.step == 0:
         warnings.warn(
             f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
             f"learning_starts={agent.config.learning_starts} it tries nothing new; set action_noise=0.1 (--set "
@@ -210,7 +210,7 @@ def _stop(agent: Agent, loggers: list[Sink]) -> None:
 
 def iterate(agent: Agent, call: Call, company: Company, interrupt: Interrupt) -> None:
     """Trains until a limit is reached, a callback says so or Ctrl-C is pressed."""
-    run, first = agent._run, agent._run.step
+    run, first = agent.run, agent.run.step
     remaining = None if call.last_step is None else call.last_step - first
     for turn in agent._turns(remaining, lambda taken: call.progress(first + taken, run.episode)):
         agent.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)

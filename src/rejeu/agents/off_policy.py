@@ -35,7 +35,7 @@ class OffPolicyAgent(Agent):
     @property
     def replay_buffer(self) -> ReplayBuffer | HerReplayBuffer:
         """The replay buffer."""
-        return self._run.replay
+        return self.run.replay
 
     def save_replay_buffer(self, path: str | Path) -> Path:
         """Writes the replay buffer to one safetensors file and returns its path."""
@@ -43,7 +43,7 @@ class OffPolicyAgent(Agent):
             "observation_space": spaces.describe(self.observation_space),
             "action_space": spaces.describe(self.action_space),
         }
-        return checkpoint.write(path, "replay", self._run.replay.arrays(), header)
+        return checkpoint.write(path, "replay", self.run.replay.arrays(), header)
 
     def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
         """Replaces the replay buffer by a saved one; learning can then go on at once.
@@ -56,22 +56,22 @@ class OffPolicyAgent(Agent):
         Raises:
             CheckpointError: if the file is damaged, or of another environment or buffer size; nothing is then changed.
         """
-        if self._run.replay is None:
+        if self.run.replay is None:
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
         try:
             with checkpoint.opened(path, "replay") as file:
                 for kind, own in (("observation", self.observation_space), ("action", self.action_space)):
                     loading.check_space(file.header.get(f"{kind}_space"), own, kind)
-                self._run.replay.ring.check(file.specs)
+                self.run.replay.ring.check(file.specs)
                 arrays = file.read()
             spaces.check_actions(self.action_space, arrays["action"], "the replay file")
-            self._run.replay.restore(arrays)
+            self.run.replay.restore(arrays)
         except CheckpointError:
             raise
         except ValueError as error:
             raise CheckpointError(f"{path}: {loading.brief(error)}") from None
-        self._run.learn_from = self.config.learning_starts
-        self._run.td_errors = []  # of steps that are gone
+        self.run.learn_from = self.config.learning_starts
+        self.run.td_errors = []  # of steps that are gone
         self._give_up_episodes()
 
     def q_values(
@@ -121,10 +121,10 @@ class OffPolicyAgent(Agent):
         return step + self.config.learning_starts
 
     def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        return off_policy(self._run, self._compiled, self.config, n_steps, progress)
+        return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def _begin_episodes(self) -> None:
-        begin_episodes(self._run)
+        begin_episodes(self.run)
 
     def _make_buffer(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
         config = self.config
@@ -152,8 +152,8 @@ class OffPolicyAgent(Agent):
         """Nothing: learners with a replay buffer use the experience of any policy."""
 
     def _keep_buffer(self, env: VectorEnv) -> None:
-        if isinstance(self._run.replay, HerReplayBuffer):
-            self._run.replay.goals = self._goals(env)
+        if isinstance(self.run.replay, HerReplayBuffer):
+            self.run.replay.goals = self._goals(env)
 
     @staticmethod
     def _goals(env: VectorEnv) -> GoalFunctions:

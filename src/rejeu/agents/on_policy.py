@@ -77,10 +77,10 @@ class OnPolicyAgent(Agent):
         return step
 
     def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        return on_policy(self._run, self._compiled, self.config, n_steps, progress)
+        return on_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def _begin_episodes(self) -> None:
-        begin_episodes(self._run, self.config)
+        begin_episodes(self.run, self.config)
 
     def _make_buffer(self, env: VectorEnv) -> RolloutBuffer:
         config = self.config
@@ -100,7 +100,7 @@ class OnPolicyAgent(Agent):
 
     def _drop_rollout(self) -> None:
         """Forgets the rollout under way; another begins with new episodes."""
-        run = self._run
+        run = self.run
         if run.replay is not None and run.replay.length:
             run.replay.length = 0
             run.obs = run.action = None

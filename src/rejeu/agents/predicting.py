@@ -85,22 +85,22 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
         ValueError: if ``memory`` is not of this policy, or of another number of episodes.
     """
     finite.settle(agent)
-    run, compiled, n = agent._run, agent._compiled, len(ended)
-    has_memory = compiled.algorithm.recall is not None
+    run, learner, n = agent.run, agent.learner, len(ended)
+    has_memory = learner.algorithm.recall is not None
     if deterministic and not has_memory:
-        return np.asarray(compiled.exploit(run.state, obs)), None
+        return np.asarray(learner.exploit(run.state, obs)), None
     if not has_memory:
         memory = ()
     elif memory is None:
-        memory = compiled.initial_carry(n)
+        memory = learner.initial_carry(n)
     else:
         check_memory(agent, memory, n)
     if deterministic:
-        action, memory = compiled.recall(run.state, memory, obs, ended)
+        action, memory = learner.recall(run.state, memory, obs, ended)
         return np.asarray(action), memory
     clock = clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent._n_predictions % 2**31))
     agent._n_predictions += 1
-    action, memory = compiled.sample(run.state, memory, obs, ended, run.key, clock)
+    action, memory = learner.sample(run.state, memory, obs, ended, run.key, clock)
     return np.asarray(action), memory if has_memory else None
 
 
@@ -116,7 +116,7 @@ def q_values(agent: Agent, observation: Any, action: Any, critics: str) -> np.nd
         raise ValueError(f"q_values needs actions of {space}: only of Discrete actions all can be rated at once")
     given = None if action is None else _actions(space, action, single, n)
     finite.settle(agent)
-    values = np.asarray(agent._compiled.action_values(agent._run.state, obs, None if is_discrete else given))
+    values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
     if is_discrete and given is not None:
         values = values[:, np.arange(n), given]
     if single:
@@ -148,23 +148,23 @@ def value(agent: Agent, observation: Any, memory: Any, episode_start: Any) -> np
         observation, _ = split(observation, None)
     obs, single = as_batch(observation, agent.observation_space, agent._obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
-    compiled = agent._compiled
+    learner = agent.learner
     finite.settle(agent)
-    if compiled.algorithm.recall is None:
+    if learner.algorithm.recall is None:
         memory = ()
     elif memory is None:
-        memory = compiled.initial_carry(n)
+        memory = learner.initial_carry(n)
     else:
         check_memory(agent, memory, n)
     ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
-    values = np.asarray(compiled.state_value(agent._run.state, memory, obs, ended))
+    values = np.asarray(learner.state_value(agent.run.state, memory, obs, ended))
     return values[0] if single else values
 
 
 def check_memory(agent: Agent, memory: Any, n: int) -> None:
     """Raises ``ValueError`` unless ``memory`` is what the agent's policy remembers of ``n`` episodes."""
     if agent._memory_form is None:  # found out once: it takes longer than a prediction
-        agent._memory_form = jax.eval_shape(lambda: agent._compiled.initial_carry(1))
+        agent._memory_form = jax.eval_shape(lambda: agent.learner.initial_carry(1))
     given = jax.tree.map(np.shape, memory)
     expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent._memory_form)
     if given != expected:

@@ -131,7 +131,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         best = checkpoint.within(file.read("best."), "best.")
         parts = [read_rows(path.parent / name, agent) for name in rows]
         reason = restore(agent, saved, parts, best, path)
-        agent.resumed = Resumed(agent._run.step, not reason, reason) if reason else compared(agent, header)
+        agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
         if "train_freq" not in changes:
             check_owed(agent)
         agent._run_id, agent._own_env = text(header["run_id"]), env is None
@@ -140,7 +140,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     except loading.WRONG as error:
         raise refusal(path, error) from error
     if parts:
-        ring = agent._run.replay.ring
+        ring = agent.run.replay.ring
         heads = [part["head"] for part in parts]
         agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
     return agent
@@ -154,11 +154,11 @@ def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
         ValueError: if the rest is larger than a run needs, and nearly all of it a hole in the file.
     """
     if best := checkpoint.within(file.specs, "best."):
-        checkpoint.match(agent._compiled.shapes, best, file.path)
+        checkpoint.match(agent.learner.shapes, best, file.path)
     for name in file.specs:
         if not name.startswith(("state.", "best.", "run.")):
             raise CheckpointError(f"{file.path} has {checkpoint.shown(name)}, which no checkpoint of a run has")
-    buffer = agent._run.replay
+    buffer = agent.run.replay
     if isinstance(buffer, RolloutBuffer):
         experience = buffer.nbytes
     else:
@@ -175,7 +175,7 @@ def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
         CheckpointError, ValueError: if they are not.
     """
     with checkpoint.opened(path, "rows") as file:
-        agent._run.replay.ring.check_rows(file.specs)
+        agent.run.replay.ring.check_rows(file.specs)
         return file.read()
 
 
@@ -183,9 +183,9 @@ def compared(agent: Agent, header: dict[str, Any]) -> Resumed:
     """Returns how a run resumes whose environments stand where they stood."""
     before, here = header.get("threads", xla.threads()), xla.threads()
     if before == here:
-        return Resumed(agent._run.step, True, "")
+        return Resumed(agent.run.step, True, "")
     return Resumed(
-        agent._run.step, False,
+        agent.run.step, False,
         f"where it stood, but JAX computes with {here} threads here and had {before}, so results may differ in their last "
         f"bits; resume in a new process, with the environment variable {xla.THREADS}={before} if JAX is used before",
     )  # fmt: skip
@@ -211,8 +211,8 @@ def check_owed(agent: Agent) -> None:
         ValueError: if more are, which nothing but a damaged file can ask for.
     """
     frequency = getattr(agent.config, "train_freq", 1)
-    if agent._run.owed >= (frequency if isinstance(frequency, int) else frequency[0]):
-        raise ValueError(f"owed={agent._run.owed} is not below train_freq={frequency!r}")
+    if agent.run.owed >= (frequency if isinstance(frequency, int) else frequency[0]):
+        raise ValueError(f"owed={agent.run.owed} is not below train_freq={frequency!r}")
 
 
 def threads(path: Path, header: dict[str, Any]) -> int | None:
@@ -254,13 +254,13 @@ def restore(
     Raises:
         LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
     """
-    run, compiled = agent._run, agent._compiled
+    run, learner = agent.run, agent.learner
     for key in SCALARS:
         setattr(run, key, whole(key, saved[key], least=0))
     whole("steps_since_update", run.steps_since_update, least=0, most=run.step)
     n_envs = run.env.n_envs
     run.rng.bit_generator.state = saved["rng"]
-    run.carry = like(compiled.initial_carry(n_envs), saved["carry"], "carry")
+    run.carry = like(learner.initial_carry(n_envs), saved["carry"], "carry")
     if saved["metrics"] is not None:
         metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved["metrics"].items()}
         run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
@@ -272,7 +272,7 @@ def restore(
         setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
     for part in rows:
         spaces.check_actions(agent.action_space, part["action"], "a file of rows")
-    restore_buffer(run, saved["buffer"], rows, compiled.initial_carry(n_envs), begun=saved["envs"] is not None)
+    restore_buffer(run, saved["buffer"], rows, learner.initial_carry(n_envs), begun=saved["envs"] is not None)
     if saved["buffer"].get("priorities") is not None:
         run.td_errors = with_draws(run.replay.priorities, saved["buffer"]["priorities"]["drawn"], td_errors)
     if isinstance(run.replay, RolloutBuffer):
@@ -285,7 +285,7 @@ def restore(
     agent.history.replace(saved["history"])
     agent._fill_windows()
     if saved["best"] is not None:
-        packed = compiled.pack(checkpoint.arrays_to_tree(compiled.shapes, best, path))
+        packed = learner.pack(checkpoint.arrays_to_tree(learner.shapes, best, path))
         checkpoint.require_finite(best, path)
         score, step = saved["best"]["score"], whole("step", saved["best"]["step"], least=0)
         scores = score if isinstance(score, tuple) else (score,)

@@ -39,7 +39,7 @@ def row(agent: Agent) -> dict[str, float]:
         numbers["rollout/ep_rew_best"] = agent.history.best_return
     if agent.ep_success_buffer:
         numbers["rollout/success_rate"] = float(np.mean(agent.ep_success_buffer))
-    run = agent._run
+    run = agent.run
     numbers["time/episodes"] = run.episode
     numbers["time/steps_per_second"] = float(agent.steps_per_second)
     numbers["time/seconds"] = run.seconds["total"]
@@ -47,7 +47,7 @@ def row(agent: Agent) -> dict[str, float]:
         numbers[f"time/{part}_share"] = share
     numbers["time/compile_seconds"] = xla.seconds()
     numbers["train/n_updates"] = run.n_updates
-    if agent._compiled.skips:
+    if agent.learner.skips:
         numbers["train/skipped_updates"] = run.watch.n_skipped
     for key, value in (run.metrics or {}).items():
         numbers[f"train/{key}"] = float(value)

@@ -82,6 +82,6 @@ def choose_limits(agent: Agent, arguments: Resume) -> Limits:
         return Limits(steps, minutes)
     assert agent._call is not None
     last = agent._call.last_step
-    if steps is not None and last is not None and agent._run.step + steps > last:
+    if steps is not None and last is not None and agent.run.step + steps > last:
         return Limits(steps)
     return Limits(pause_steps=steps, pause_minutes=minutes)

@@ -179,7 +179,7 @@ def evaluate_at(evaluate: Evaluate, agent: Agent) -> None:
 
 def has_reached_goal(agent: Agent) -> bool:
     """Returns whether the ``learn`` that an agent is or was in went as far as it was to go."""
-    return agent._call is None or agent._call.is_over(agent._run.step, agent._run.episode)
+    return agent._call is None or agent._call.is_over(agent.run.step, agent.run.episode)
 
 
 def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:

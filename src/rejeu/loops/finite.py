@@ -1,8 +1,8 @@
 """Numbers stay finite: how an update is looked at, and what is said of one that broke something.
 
 Every compiled update says whether what it left is finite (:func:`all_finite`), beside its metrics; the loop's
-:class:`rejeu.loops.nonfinite.Watch` looks one turn later, when it waits for the device anyway, and finds the batch to blame.
-:func:`reported` saves it and makes the error of it; :func:`examine` tries a saved one again.
+:class:`~rejeu.loops.nonfinite.NonFiniteMonitor` looks one turn later, when it waits for the device anyway, and finds the
+batch to blame. :func:`reported` saves it and makes the error of it; :func:`examine` tries a saved one again.
 
 With ``nonfinite="skip"`` an update that breaks something is undone on the device at once, and counted.
 """
@@ -24,7 +24,7 @@ from rejeu.io import checkpoint
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent
-    from rejeu.loops.learner import Compiled
+    from rejeu.loops.learner import Learner
 
 Nonfinite = Literal["stop", "skip"]
 CHOICES: tuple[Nonfinite, ...] = ("stop", "skip")
@@ -129,9 +129,9 @@ class Found(NamedTuple):
         return bool(self.losses or self.leaves)
 
 
-def effect(compiled: Compiled, state: PyTree, batch: Transition | Rollout, clock: Clock) -> tuple[PyTree, Found]:
+def effect(learner: Learner, state: PyTree, batch: Transition | Rollout, clock: Clock) -> tuple[PyTree, Found]:
     """Returns the state after an update on one batch, and what of it is not finite."""
-    after, metrics = jax.jit(compiled.algorithm.update)(state, batch, clock)
+    after, metrics = jax.jit(learner.algorithm.update)(state, batch, clock)
     losses = bad_leaves({name: value for name, value in metrics.items() if is_loss(name)})
     return after, Found(bad_leaves(batch._asdict()), losses, bad_leaves(after))
 
@@ -143,20 +143,20 @@ def settle(agent: Agent) -> None:
         NonFiniteError: if one of them left numbers that are not finite.
     """
     try:
-        agent._run.watch.read(agent._run, agent._compiled)
+        agent.run.watch.read(agent.run, agent.learner)
     except Broken as broken:
         raise reported(agent, broken) from None
 
 
 def reported(agent: Agent, broken: Broken) -> NonFiniteError:
     """Saves the batch that broke something and returns the error that says what, where and why."""
-    run, compiled, clock = agent._run, agent._compiled, broken.clock
-    state, found, batch = agent._compiled.state(run.state), Found([], [], []), broken.batches
+    run, learner, clock = agent.run, agent.learner, broken.clock
+    state, found, batch = agent.learner.state(run.state), Found([], [], []), broken.batches
     for i, one in enumerate(_one_by_one(broken.batches)):
-        after, found = effect(compiled, state, one, clock)
+        after, found = effect(learner, state, one, clock)
         if found:
             batch = one
-            run.state = compiled.pack(state) if i > 0 else run.state
+            run.state = learner.pack(state) if i > 0 else run.state
             break
         state = after
     names = [text.split(" ")[0] for text in (*found.losses, *found.leaves)]
@@ -217,7 +217,7 @@ def folder_of(agent: Agent) -> Path:
 
 def _save(agent: Agent, batch: Transition | Rollout, clock: Clock, names: list[str]) -> tuple[Path | None, str]:
     """Returns where the batch was written and a sentence about it; None where it could not be."""
-    run, step = agent._run, int(clock.step)
+    run, step = agent.run, int(clock.step)
     header = {
         "algorithm": agent.name,
         "env_id": None if run.env is None else run.env.env_id,
@@ -277,7 +277,7 @@ def _batch_like(agent: Agent, file: checkpoint.Contents) -> Transition | Rollout
     expected: Any
     if "ended" in file.specs:
         obs = Masked(obs, 0) if agent.takes_masks else obs
-        carry = jax.tree.map(lambda leaf: 0, agent._compiled.initial_carry(1))
+        carry = jax.tree.map(lambda leaf: 0, agent.learner.initial_carry(1))
         expected = Rollout(obs, 0, 0, obs, 0, 0, 0, 0, 0, carry)
     else:
         optional = {name: 0 for name in ("weight", "rewards") if name in file.specs}
@@ -297,4 +297,4 @@ def examine(agent: Agent, path: str | Path) -> Found:
     Empty, and false, where everything stays finite: with other weights or other hyper-parameters, say.
     """
     batch, clock = load_batch(agent, path)
-    return effect(agent._compiled, agent.state, batch, clock)[1]
+    return effect(agent.learner, agent.state, batch, clock)[1]

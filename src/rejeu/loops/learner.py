@@ -27,7 +27,7 @@ PackedState = list[Array]
 """The state of an algorithm as the vectors of its :class:`Packing`."""
 
 
-class Compiled:
+class Learner:
     """The pure functions of one algorithm, compiled; holds no state of its own."""
 
     def __init__(self, algorithm: Algorithm, noise: Noise | None, skips: bool = False) -> None:

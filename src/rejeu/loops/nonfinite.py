@@ -1,8 +1,8 @@
 """Which update was the first to leave numbers that are not finite.
 
 An update says with its metrics whether it did (:func:`rejeu.loops.finite.all_finite`), and is asked one turn later. So that
-the culprit can be named then, a :class:`Watch` keeps a copy of the state from some updates ago and what went into each since:
-from these the state before the one that broke is made again, bit for bit, and the agent is left in it. It also lets the update
+the culprit can be named then, :class:`NonFiniteMonitor` keeps a copy of the state from some updates ago and what went into each
+since: from these the state before the one that broke is made again, bit for bit, and the agent is left in it. It also lets the update
 pass over large arrays, of weights between wide layers: what is not finite there makes the next loss so, and the first update
 to blame is looked for among those that are kept.
 
@@ -23,7 +23,7 @@ from rejeu.core import Clock, Rollout, Transition
 from rejeu.loops.finite import MOST_SKIPPED, Broken
 
 if TYPE_CHECKING:
-    from rejeu.loops.learner import Compiled, PackedState
+    from rejeu.loops.learner import Learner, PackedState
     from rejeu.loops.packing import Readings
     from rejeu.loops.run import Run
 
@@ -46,14 +46,14 @@ class Stretch:
         self.previous: Stretch | None = None
         """The one before."""
 
-    def first_to_break(self, compiled: Compiled, last: int) -> tuple[PackedState, int]:
+    def first_to_break(self, learner: Learner, last: int) -> tuple[PackedState, int]:
         """Returns the first thing done, up to number ``last``, that left something not finite, and the state before it."""
-        state = compiled.copy(self.start)
+        state = learner.copy(self.start)
         for i, (function, arguments) in enumerate(self.done[:last]):
-            before = compiled.copy(state)
+            before = learner.copy(state)
             after = function(state, *arguments)
             state = after[0] if isinstance(after, tuple) else after
-            if compiled.bad_leaves(state):
+            if learner.bad_leaves(state):
                 return before, i
         return state, last
 
@@ -70,7 +70,7 @@ class Unread(NamedTuple):
     """Which of what was done in that stretch it is."""
 
 
-class Watch:
+class NonFiniteMonitor:
     """Looks after the updates of a run. Mutable."""
 
     def __init__(self) -> None:
@@ -87,46 +87,46 @@ class Watch:
         """Returns the number of updates whose outcome was not looked at."""
         return len(self._unread)
 
-    def update(self, run: Run, compiled: Compiled, batches: Transition | Rollout, clock: Clock) -> Array | None:
-        """Learns from batches as :meth:`Compiled.update` does, puts state and metrics into ``run``, returns TD errors."""
-        stretch = None if compiled.skips else self._on(run, compiled, batches)
+    def update(self, run: Run, learner: Learner, batches: Transition | Rollout, clock: Clock) -> Array | None:
+        """Learns from batches as :meth:`Learner.update` does, puts state and metrics into ``run``, returns TD errors."""
+        stretch = None if learner.skips else self._on(run, learner, batches)
         place = 0 if stretch is None else len(stretch.done)
-        run.state, run.metrics, td_error = compiled.update(run.state, batches, clock)
+        run.state, run.metrics, td_error = learner.update(run.state, batches, clock)
         self._unread.append(Unread(run.metrics, batches, clock, stretch, place))
         if stretch is not None:
-            stretch.done.append((compiled.update, (batches, clock)))
+            stretch.done.append((learner.update, (batches, clock)))
             stretch.n_updates += 1
         self._newest = run.state
         return td_error
 
-    def observe(self, run: Run, compiled: Compiled) -> None:
+    def observe(self, run: Run, learner: Learner) -> None:
         """Lets the state take in the present observations, if it has a use for them.
 
         They are copied: the device may read a large array after the environments have written the next step to it.
         """
-        if compiled.observe is None:
+        if learner.observe is None:
             return
         is_known = run.state is self._newest
         seen = (jax.tree.map(np.copy, run.obs), run.running_return)
-        run.state = compiled.observe(run.state, *seen)
+        run.state = learner.observe(run.state, *seen)
         if is_known and self._stretch is not None:
-            self._stretch.done.append((compiled.observe, seen))
+            self._stretch.done.append((learner.observe, seen))
             self._newest = run.state
 
-    def _on(self, run: Run, compiled: Compiled, batches: Transition | Rollout) -> Stretch:
+    def _on(self, run: Run, learner: Learner, batches: Transition | Rollout) -> Stretch:
         """Returns the present stretch, or a new one where that is long or something else has changed the state."""
         most = 1 if isinstance(batches, Rollout) else STRETCH
         if self._stretch is not None and self._stretch.n_updates == 1 and most > 1:
             size = sum(leaf.nbytes for leaf in jax.tree.leaves(batches))
             self._most = max(1, min(most, STRETCH_BYTES // max(size, 1)))
         if self._stretch is None or run.state is not self._newest or self._stretch.n_updates >= self._most:
-            new = Stretch(compiled.copy(run.state))
+            new = Stretch(learner.copy(run.state))
             if self._stretch is not None and run.state is self._newest:
                 new.previous, self._stretch.previous = self._stretch, None
             self._stretch, self._most = new, most
         return self._stretch
 
-    def read(self, run: Run, compiled: Compiled, n: int | None = None) -> None:
+    def read(self, run: Run, learner: Learner, n: int | None = None) -> None:
         """Looks at the oldest ``n`` updates (None: all); waits for them.
 
         Raises:
@@ -140,7 +140,7 @@ class Watch:
                 self._in_a_row = 0
                 continue
             if one.stretch is not None:
-                one = self._culprit(run, compiled, one)
+                one = self._culprit(run, learner, one)
             else:
                 self.n_skipped += n_bad
                 self._in_a_row += n_bad
@@ -154,13 +154,13 @@ class Watch:
             raise Broken(one.batches, one.clock, in_a_row)
 
     @staticmethod
-    def _culprit(run: Run, compiled: Compiled, one: Unread) -> Unread:
+    def _culprit(run: Run, learner: Learner, one: Unread) -> Unread:
         """Returns the first update to blame for what ``one`` found, and puts the state before it into ``run``."""
         stretch, last = one.stretch, one.place
         assert stretch is not None
-        if stretch.previous is not None and compiled.bad_leaves(stretch.start):
+        if stretch.previous is not None and learner.bad_leaves(stretch.start):
             stretch = stretch.previous
             last = len(stretch.done) - 1
-        run.state, place = stretch.first_to_break(compiled, last)
+        run.state, place = stretch.first_to_break(learner, last)
         _, arguments = stretch.done[place]
         return one._replace(batches=arguments[0], clock=arguments[1])

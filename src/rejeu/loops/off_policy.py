@@ -25,7 +25,7 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Clock
-from rejeu.loops.learner import Compiled
+from rejeu.loops.learner import Learner
 from rejeu.loops.run import (
     Progress,
     Run,
@@ -44,13 +44,13 @@ from rejeu.spaces import action_scaler, random_action
 
 
 def off_policy(
-    run: Run, compiled: Compiled, config: OffPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
+    run: Run, learner: Learner, config: OffPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
 ) -> Iterator[Progress]:
     """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
 
     Args:
         run: mutated; consistent whenever the generator has yielded.
-        compiled: the algorithm.
+        learner: the algorithm.
         config: its hyper-parameters.
         n_steps: over all environments; where their number does not divide it, the last turn keeps as many as remain.
         progress: gives the progress of schedules after so many steps.
@@ -64,12 +64,12 @@ def off_policy(
     first, last = run.step, None if n_steps is None else run.step + n_steps
     began = time.perf_counter() - run.seconds["total"]
     per_turn = updates_per_turn(config, n_envs)
-    check_state(run, compiled)
+    check_state(run, learner)
     while last is None or run.step < last:
         if run.obs is None or env.must_reset:
             begin_episodes(run)
         if run.action is None:
-            run.action = np.asarray(choose_or_draw(run, compiled, config, clock_of(run, progress(run.step - first))))
+            run.action = np.asarray(choose_or_draw(run, learner, config, clock_of(run, progress(run.step - first))))
         remaining = counted(run, n_envs, last)
         active = None if remaining is None else np.arange(remaining)
         t0 = time.perf_counter()
@@ -79,7 +79,7 @@ def off_policy(
         check_finite(run, step, run.step)
         if run.step >= run.next_look:
             look_at_bounds(run, step.obs)
-        if compiled.observe is not None:
+        if learner.observe is not None:
             run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
         run.replay.add(run.action, step.reward, step.terminated, step.obs, active)
         taken = n_envs if active is None else len(active)
@@ -93,15 +93,15 @@ def off_policy(
         if np.count_nonzero(run.ended):
             run.replay.begin(run.obs, np.flatnonzero(run.ended))
 
-        if compiled.observe is not None:
-            run.watch.observe(run, compiled)
+        if learner.observe is not None:
+            run.watch.observe(run, learner)
         done = progress(run.step - first)
         n_updates = due(run, config, taken, len(episodes))
         sizes = chunks(n_updates, per_turn)
         t4 = time.perf_counter()
         clock = clock_of(run, done)
         if config.overlap:
-            chosen = choose_or_draw(run, compiled, config, clock)
+            chosen = choose_or_draw(run, learner, config, clock)
         t5 = time.perf_counter()
         shapes = [(config.batch_size,) if size == 1 else (size, config.batch_size) for size in sizes]
         samples = [run.replay.draw(run.rng, shape, done) for shape in shapes]
@@ -110,14 +110,14 @@ def off_policy(
         run.td_errors = []
         n_before = len(run.watch)
         for batch, drawn in samples:
-            td_error = run.watch.update(run, compiled, batch, clock)
+            td_error = run.watch.update(run, learner, batch, clock)
             if td_error is not None:
                 run.td_errors.append((drawn, td_error))
         run.n_updates += n_updates
         if not config.overlap:
-            chosen = choose_or_draw(run, compiled, config, clock)
+            chosen = choose_or_draw(run, learner, config, clock)
         run.action = np.asarray(chosen)
-        run.watch.read(run, compiled, n_before)  # the actions came after them
+        run.watch.read(run, learner, n_before)  # the actions came after them
         t7 = time.perf_counter()
         run.seconds["env"] += (t1 - t0) + (t3 - t2)
         run.seconds["replay"] += (t2 - t1) + (t4 - t3) + (t6 - t5)
@@ -133,11 +133,11 @@ def begin_episodes(run: Run) -> None:
     run.replay.begin(run.obs)
 
 
-def choose_or_draw(run: Run, compiled: Compiled, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
+def choose_or_draw(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
     """Returns random actions at first, then the exploring policy's; see :func:`rejeu.loops.run.choose`."""
     if run.step < config.learning_starts:
         return random_action(run.env.action_space, run.env.n_envs, run.rng)
-    return choose(run, compiled, clock)
+    return choose(run, learner, clock)
 
 
 def due(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> int:
@@ -169,12 +169,12 @@ def reaches(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> bool:
 
 
 def updates_per_turn(config: OffPolicyConfig, n_envs: int) -> int:
-    """Returns how many gradient steps one turn usually owes: the size for which the scan is compiled, at most 64."""
+    """Returns how many gradient steps one turn usually owes: the size for which the scan is learner, at most 64."""
     if isinstance(config.train_freq, int) and config.gradient_steps > 0:
         return min(max(n_envs // config.train_freq, 1) * config.gradient_steps, 64)
     return 16
 
 
 def chunks(n: int, usual: int) -> list[int]:
-    """Returns ``n`` as a sum of the usual size and of ones, so that only two sizes are ever compiled."""
+    """Returns ``n`` as a sum of the usual size and of ones, so that only two sizes are ever learner."""
     return [usual] * (n // usual) + [1] * (n % usual)

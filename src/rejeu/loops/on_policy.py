@@ -19,7 +19,7 @@ import numpy as np
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.core import PyTree
 from rejeu.envs.make import Step
-from rejeu.loops.learner import Compiled
+from rejeu.loops.learner import Learner
 from rejeu.loops.run import (
     Progress,
     Run,
@@ -38,7 +38,7 @@ from rejeu.spaces import action_scaler
 
 
 def on_policy(
-    run: Run, compiled: Compiled, config: OnPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
+    run: Run, learner: Learner, config: OnPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
 ) -> Iterator[Progress]:
     """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
 
@@ -47,7 +47,7 @@ def on_policy(
 
     Args:
         run: mutated; consistent whenever the generator has yielded. ``run.replay`` is a rollout buffer.
-        compiled: the algorithm.
+        learner: the algorithm.
         config: its hyper-parameters.
         n_steps: over all environments; where their number does not divide it, the last turn keeps as many as remain.
         progress: gives the progress of schedules after so many steps.
@@ -60,13 +60,13 @@ def on_policy(
     env, n_envs, scale, rollout = run.env, run.env.n_envs, action_scaler(run.env.action_space), run.replay
     first, last = run.step, None if n_steps is None else run.step + n_steps
     began = time.perf_counter() - run.seconds["total"]
-    check_state(run, compiled)
+    check_state(run, learner)
     while last is None or run.step < last:
         if run.obs is None or (env.must_reset and not rollout.length):
             begin_episodes(run, config)
         t0 = time.perf_counter()
-        run.action = np.asarray(choose(run, compiled, clock_of(run, progress(run.step - first))))
-        run.watch.read(run, compiled)  # while the rollout that it learnt from still stands
+        run.action = np.asarray(choose(run, learner, clock_of(run, progress(run.step - first))))
+        run.watch.read(run, learner)  # while the rollout that it learnt from still stands
         rollout.observe(run.obs)
         t1 = time.perf_counter()
         stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
@@ -95,7 +95,7 @@ def on_policy(
         if is_done:
             clock = clock_of(run, progress(run.step - first))
             n_updates = config.gradient_steps(rollout.size())
-            run.watch.update(run, compiled, rollout.rollout(), clock)
+            run.watch.update(run, learner, rollout.rollout(), clock)
             assert run.metrics is not None
             run.n_updates += int(run.metrics["gradient_steps"]) if config.stops_early else n_updates
             begin(run, config)

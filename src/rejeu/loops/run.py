@@ -21,8 +21,8 @@ from rejeu.core import Clock, PyTree
 from rejeu.envs import faults
 from rejeu.envs.make import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError, NonFiniteError
-from rejeu.loops.learner import Compiled, PackedState
-from rejeu.loops.nonfinite import Watch
+from rejeu.loops.learner import Learner, PackedState
+from rejeu.loops.nonfinite import NonFiniteMonitor
 from rejeu.spaces import leaves
 
 VDOT_SIZE = 2**13
@@ -77,7 +77,7 @@ class Run:
     replay: Any
     """The replay buffer or the rollout buffer; None likewise."""
     state: PackedState
-    """The algorithm's state, packed (see :class:`Compiled`)."""
+    """The algorithm's state, packed (see :class:`Learner`)."""
     key: Array
     """Root of the randomness of exploration."""
     rng: np.random.Generator
@@ -116,7 +116,7 @@ class Run:
     """Wall time by what it went into; ``update`` is the time that the loop waited for the device."""
     next_look: float = 0
     """Environment steps from which on observations are next compared with their declared bounds."""
-    watch: Watch = field(default_factory=Watch)
+    watch: NonFiniteMonitor = field(default_factory=NonFiniteMonitor)
     """Looks after the updates: whether what they leave is finite."""
 
 
@@ -147,12 +147,12 @@ def restart(run: Run) -> None:
     run.action = None
 
 
-def choose(run: Run, compiled: Compiled, clock: Clock) -> Array:
+def choose(run: Run, learner: Learner, clock: Clock) -> Array:
     """Returns the exploring policy's actions for the present observations, and moves what it remembers on.
 
     They may still be under way on the device; ``run.obs`` must not change until they were read.
     """
-    action, run.carry = compiled.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+    action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
     return action
 
 
@@ -290,9 +290,9 @@ def _check_action(run: Run, taken: int) -> None:
         )
 
 
-def check_state(run: Run, compiled: Compiled) -> None:
+def check_state(run: Run, learner: Learner) -> None:
     """Raises ``NonFiniteError`` if the state is not finite before anything is learnt; waits for it."""
-    if bad := compiled.bad_leaves(run.state):
+    if bad := learner.bad_leaves(run.state):
         more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
         raise NonFiniteError(
             f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
@@ -304,7 +304,7 @@ def check_state(run: Run, compiled: Compiled) -> None:
 
 
 def initial_run(
-    env: VectorEnv | None, buffer: Any, compiled: Compiled, learn_from: int, seed: int, state: PackedState | None = None
+    env: VectorEnv | None, buffer: Any, learner: Learner, learn_from: int, seed: int, state: PackedState | None = None
 ) -> Run:
     """Returns the beginning of a run; ``seed`` determines everything that is drawn in it.
 
@@ -314,10 +314,10 @@ def initial_run(
     return Run(
         env=env,
         replay=buffer,
-        state=compiled.init(learner_key) if state is None else state,
+        state=learner.init(learner_key) if state is None else state,
         key=explore_key,
         rng=np.random.default_rng(seed),
-        carry=compiled.initial_carry(1 if env is None else env.n_envs),
+        carry=learner.initial_carry(1 if env is None else env.n_envs),
         learn_from=learn_from,
         seed=seed,
     )
