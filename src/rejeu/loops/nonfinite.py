@@ -1,12 +1,11 @@
 """Which update was the first to leave numbers that are not finite.
 
-An update says with its metrics whether it did (:func:`rejeu.loops.finite.all_finite`), and is asked one turn later. So that
-the culprit can be named then, :class:`NonFiniteMonitor` keeps a copy of the state from some updates ago and what went into each
-since: from these the state before the one that broke is made again, bit for bit, and the agent is left in it. It also lets the update
-pass over large arrays, of weights between wide layers: what is not finite there makes the next loss so, and the first update
-to blame is looked for among those that are kept.
+An update says with its metrics whether what it left is finite (:func:`rejeu.loops.finite.all_finite`). The answer is read one
+turn later. :class:`NonFiniteMonitor` keeps a copy of the state from some updates ago and the batches since. It repeats these
+updates to find the first one to blame, and leaves the agent in the state before it. Large arrays, of weights between wide
+layers, are not checked in every update: a number there that is not finite makes the next loss so.
 
-Where updates that break something are skipped they undo themselves, look at large arrays too, and are counted here.
+Where such updates are skipped, they undo themselves, check large arrays too, and are counted here.
 """
 
 from __future__ import annotations
