@@ -1,0 +1,226 @@
+"""Prints how large the package is and how its modules depend on each other. Standard library and SciPy only.
+
+    python scripts/structure.py [SRC] [--json]
+
+SRC is the folder that contains ``rejeu`` (default: ``src``). The layers are the list under "Layout" in docs/design.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import re
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "rejeu"
+ENFORCED: tuple[str, ...] = ()
+"""Counts that must be 0: ``"cycles"``, ``"private_accesses"``, ``"private_imports"``, ``"layering_violations"``."""
+PUBLIC_IN_SPITE_OF_ITS_NAME = {"_replace", "_asdict", "_fields", "_field_defaults", "_make", "_exit", "_getframe"}
+"""Documented methods of named tuples, and of ``os`` and ``sys``."""
+GYMNASIUM_STATE = {"_np_random", "_has_reset", "_elapsed_steps"}
+"""Attributes that a snapshot of an environment must contain and that Gymnasium has no public name for."""
+EXCEPTIONS = PUBLIC_IN_SPITE_OF_ITS_NAME | GYMNASIUM_STATE
+
+
+def parse(src: Path) -> dict[str, tuple[Path, ast.Module]]:
+    """Returns path and syntax tree of every module of the package, by dotted name."""
+    modules = {}
+    for path in sorted((src / PACKAGE).rglob("*.py")):
+        parts = path.relative_to(src).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        modules[name] = path, ast.parse(path.read_text(encoding="utf-8"))
+    return modules
+
+
+def is_type_checking(node: ast.AST) -> bool:
+    """Returns whether a statement is ``if TYPE_CHECKING``."""
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+
+
+def nodes(module: str, tree: ast.Module) -> Iterator[ast.AST]:
+    """Yields every node of a module; of the package's own ``__init__`` without the types of its lazy public names."""
+    for statement in tree.body:
+        if not (module == PACKAGE and is_type_checking(statement)):
+            yield from ast.walk(statement)
+
+
+def imports(module: str, path: Path, tree: ast.Module, known: set[str]) -> Iterator[tuple[str, ast.stmt]]:
+    """Yields each module of the package that a module imports, anywhere in it, and the statement that does so."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in nodes(module, tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package.rsplit(".", node.level - 1)[0] if node.level else ""
+            source = ".".join(filter(None, (base, node.module)))
+            submodules = {f"{source}.{alias.name}" for alias in node.names}
+            names = [*(submodules & known), *([source] if submodules - known else [])]
+        else:
+            continue
+        yield from ((name, node) for name in names if name in known and name != module)
+
+
+def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
+    """Returns the groups of modules that import each other, directly or not."""
+    names = sorted(edges)
+    number = {name: i for i, name in enumerate(names)}
+    pairs = [(number[a], number[b]) for a in names for b in edges[a]]
+    rows, columns = zip(*pairs, strict=True)
+    graph = coo_array(([1] * len(pairs), (rows, columns)), shape=(len(names), len(names)))
+    _, labels = connected_components(graph, connection="strong")
+    groups = defaultdict(list)
+    for name, label in zip(names, labels, strict=True):
+        groups[label].append(name)
+    return sorted((group for group in groups.values() if len(group) > 1), key=len, reverse=True)
+
+
+def is_private(name: str) -> bool:
+    """Returns whether a name begins with an underscore and is not a dunder."""
+    return name.startswith("_") and not (name.startswith("__") and name.endswith("__"))
+
+
+def private_accesses(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yields line and text of each ``x._y`` where ``x`` is neither ``self``, ``cls`` nor ``super()``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and is_private(node.attr) and node.attr not in EXCEPTIONS:
+            owner = ast.unparse(node.value)
+            if owner not in ("self", "cls", "super()"):
+                yield node.lineno, f"{owner}.{node.attr}"
+
+
+def private_imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yields line and name of each private name that is imported from a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            yield from ((node.lineno, alias.name) for alias in node.names if is_private(alias.name))
+
+
+def layers() -> list[str]:
+    """Returns the packages and modules of the list under "Layout" in docs/design.md, in its order."""
+    text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    listing = re.search(r"## Layout.*?```\nsrc/rejeu/\n(.*?)```", text, re.DOTALL)
+    assert listing is not None, 'docs/design.md has no list under "Layout"'
+    return re.findall(r"^  (\w+)(?:\.py|/)", listing[1], re.MULTILINE)
+
+
+def layering_violations(found: list[tuple[str, str, int]], order: list[str]) -> list[str]:
+    """Returns the imports from a layer further down the list. Every module may be imported by ``__init__``, and it by none."""
+    rank = {name: i for i, name in enumerate(order)} | {"__init__": len(order), "__main__": len(order)}
+    violations = []
+    for importer, imported, line in found:
+        a, b = ([*name.split("."), "__init__"][1] for name in (importer, imported))
+        if a in rank and b in rank and rank[a] < rank[b]:
+            violations.append(f"{importer}:{line} imports {imported}")
+    return violations
+
+
+def code_lines(path: Path, tree: ast.Module) -> list[str]:
+    """Returns a module's lines of code, stripped: no docstrings, comments, imports or lines without a word."""
+    skipped: set[int] = set()
+    for node in ast.walk(tree):
+        is_string = (
+            isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        )
+        if is_string or isinstance(node, (ast.Import, ast.ImportFrom)):
+            skipped.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    return [line for i, line in enumerate(lines, 1) if i not in skipped and re.search(r"\w", line) and line[0] != "#"]
+
+
+def repeated_lines(files: list[list[str]]) -> tuple[int, int]:
+    """Returns how many lines occur in three or more of the files, and how many lines there are."""
+    in_files = Counter(line for file in files for line in set(file))
+    lines = [line for file in files for line in file]
+    return sum(in_files[line] >= 3 for line in lines), len(lines)
+
+
+def longest_function(modules: dict[str, tuple[Path, ast.Module]]) -> tuple[int, str]:
+    """Returns the number of lines and the name of the longest function."""
+    return max(
+        (node.end_lineno - node.lineno + 1, f"{name}.{node.name}")
+        for name, (_, tree) in modules.items()
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.end_lineno is not None
+    )
+
+
+def measure(src: Path) -> dict[str, Any]:
+    """Returns every count, and the list behind those that should be 0."""
+    modules = parse(src)
+    lines: Counter[str] = Counter()
+    found = []
+    for name, (path, tree) in modules.items():
+        parts = path.relative_to(src / PACKAGE).parts
+        lines[parts[0] if len(parts) > 1 else "top level"] += len(path.read_text(encoding="utf-8").splitlines())
+        found += [(name, imported, node.lineno) for imported, node in imports(name, path, tree, set(modules))]
+    edges: dict[str, set[str]] = {name: set() for name in modules}
+    for importer, imported, _ in found:
+        edges[importer].add(imported)
+    algorithms = [code_lines(path, tree) for name, (path, tree) in modules.items() if ".algorithms" in name]
+    repeated, of = repeated_lines(algorithms)
+    length, function = longest_function(modules)
+    return {
+        "files": len(modules),
+        "lines": sum(lines.values()),
+        "lines_by_package": dict(lines.most_common()),
+        "top_level_modules": len(list((src / PACKAGE).glob("*.py"))),
+        "files_in_agents": len(list((src / PACKAGE / "agents").glob("*.py"))),
+        "repeated_lines_in_algorithms": repeated,
+        "repeated_share_in_algorithms": round(100 * repeated / of, 1),
+        "longest_function": length,
+        "longest_function_name": function,
+        "cycles": cycles(edges),
+        "private_accesses": [
+            f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_accesses(t)
+        ],
+        "private_imports": [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_imports(t)],
+        "layering_violations": layering_violations(found, layers()),
+    }
+
+
+def report(counts: dict[str, Any], verbose: bool) -> None:
+    """Prints the counts for a person."""
+    print(", ".join(f"{package} {n:,}" for package, n in counts["lines_by_package"].items()))
+    print(
+        f"{counts['lines']:,} lines in {counts['files']} files; {counts['top_level_modules']} modules at the top level,",
+        end=" ",
+    )
+    print(f"{counts['files_in_agents']} files in agents/")
+    print(f"{counts['repeated_share_in_algorithms']} % of the lines of algorithms/ occur in three or more of its files")
+    print(f"longest function: {counts['longest_function_name']}, {counts['longest_function']} lines")
+    for key in ("cycles", "private_accesses", "private_imports", "layering_violations"):
+        found = counts[key]
+        sizes = f" of {', '.join(str(len(cycle)) for cycle in found)} modules" if key == "cycles" and found else ""
+        print(f"{key.replace('_', ' ')}: {len(found)}{sizes}")
+        if verbose or (found and key in ENFORCED):
+            print("".join(f"    {entry if isinstance(entry, str) else ' '.join(entry)}\n" for entry in found), end="")
+
+
+def main() -> int:
+    """Runs the command and returns its exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("src", nargs="?", type=Path, default=ROOT / "src", help="the folder that contains rejeu")
+    parser.add_argument("--json", action="store_true", help="print the counts, and what they count, as JSON")
+    parser.add_argument(
+        "--verbose", "-v", action="store_true", help="list every access, import and cycle that is counted"
+    )
+    arguments = parser.parse_args()
+    counts = measure(arguments.src)
+    if arguments.json:
+        print(json.dumps(counts, indent=1))
+    else:
+        report(counts, arguments.verbose)
+    return int(any(counts[key] for key in ENFORCED))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
