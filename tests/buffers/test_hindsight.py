@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
-from rejeu.buffers.hindsight import GoalFunctions, GoalSelectionStrategy, HerReplayBuffer, HindsightConfig, counters
+from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer, HindsightConfig, counters
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
+from rejeu.envs.goals import GoalFunctions
 from tests.replay_model import GOAL_OBSERVATION, Model, Turn, make_ring, observe_goal, play, turns
 
 GAMMA = 0.9

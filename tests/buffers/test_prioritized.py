@@ -13,11 +13,12 @@ from hypothesis import given, settings, strategies as st
 from scipy.stats import chisquare
 
 import rejeu
-from rejeu.buffers.hindsight import GoalFunctions, HerReplayBuffer, HindsightConfig
+from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import Priorities, PriorityConfig, SumTree
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks import Checkpoint
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import InProcess
 from rejeu.errors import NonFiniteError
 from rejeu.io import checkpoint

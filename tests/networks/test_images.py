@@ -13,10 +13,11 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings, strategies as st
 
 import rejeu
-from rejeu.buffers.hindsight import GoalFunctions, HerReplayBuffer, HindsightConfig
+from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import Ring, check_memory
 from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.envs.goals import GoalFunctions
 from rejeu.spaces import leaves, structure
 
 SIZE = (2, 3)

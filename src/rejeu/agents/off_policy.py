@@ -15,10 +15,11 @@ from rejeu.agents.base import Agent
 from rejeu.agents.predicting import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.hindsight import GoalFunctions, HerReplayBuffer, counters
+from rejeu.buffers.hindsight import HerReplayBuffer, counters
 from rejeu.buffers.prioritized import Priorities
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions

@@ -1,8 +1,8 @@
 """Proximal policy optimisation: several epochs over each rollout, the policy held near the one that collected it.
 
 Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms" (arXiv 1707.06347, equations 7 and 9), with the
-advantages of Schulman et al. 2016 (see :mod:`rejeu.buffers.rollout`). With the policy ``pi``, the one that collected the
-rollout ``pi_old``, advantages ``A``, value ``V`` and its targets ``R = A + V_old``, over minibatches::
+advantages of Schulman et al. 2016 (see :mod:`rejeu.algorithms.actor_critic.gae`). With the policy ``pi``, the policy
+``pi_old`` that collected the rollout, advantages ``A``, value ``V`` and its targets ``R = A + V_old``, over minibatches::
 
     ratio    = pi(a | s) / pi_old(a | s)
     J_pi     = -mean min(ratio A, clip(ratio, 1 - epsilon, 1 + epsilon) A)

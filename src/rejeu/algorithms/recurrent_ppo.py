@@ -37,9 +37,9 @@ from rejeu.algorithms.actor_critic import (
     orthogonal,
     unmasked,
 )
+from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
-from rejeu.buffers.rollout import advantages
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew
 from rejeu.networks import Encoder

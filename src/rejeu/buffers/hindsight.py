@@ -16,11 +16,11 @@ kept as it was elsewhere: a crash remains a crash.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from rejeu.buffers.uniform import (
     look_ahead,
 )
 from rejeu.core import Transition
+from rejeu.envs.goals import GoalFunctions
 
 
 class GoalSelectionStrategy(str, Enum):
@@ -83,14 +84,6 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     if config is None or config.goal_selection_strategy == "random":
         return ()
     return ("since_start", "until_end") if config.goal_selection_strategy == "episode" else ("until_end",)
-
-
-class GoalFunctions(NamedTuple):
-    """The environment's own view of its goals, vectorised: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
-
-    reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    """None where the environment does not say; steps then keep their own."""
 
 
 class HerReplayBuffer:

@@ -1,12 +1,4 @@
-"""What on-policy learning keeps of experience: the steps since the policy last changed, and their advantages.
-
-Source of the advantages: Schulman et al. 2016, "High-Dimensional Continuous Control Using Generalized Advantage
-Estimation" (arXiv 1506.02438, equations 11 and 16), with the discount of each step in place of one gamma, so that a time
-limit bootstraps from the state it was reached in and a terminal state from nothing::
-
-    delta_t = r_t + discount_t V(s'_t) - V(s_t)
-    A_t     = delta_t + discount_t lambda A_{t+1},           the last term 0 where an episode or the rollout ends
-"""
+"""The rollout buffer: the steps of all environments since the policy last changed, for on-policy learning."""
 
 from __future__ import annotations
 
@@ -14,9 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from rejeu.core import PyTree, Rollout
 from rejeu.spaces import Leaf
@@ -166,29 +156,3 @@ class RolloutBuffer:
         for name, array in own.items():
             array[:n] = arrays[name]
         self.length = n
-
-
-def advantages(
-    reward: Array, value: Array, next_value: Array, discount: Array, ended: Array, gae_lambda: float
-) -> Array:
-    """Returns the generalised advantage estimates, ``(steps, n_envs)``.
-
-    Args:
-        reward: ``(steps, n_envs)``, as are all others.
-        value: of the states that were left.
-        next_value: of their true successors, also where an episode ended.
-        discount: gamma, and 0 where the MDP terminated.
-        ended: where an episode ended, by terminal state or time limit.
-        gae_lambda: in [0, 1]. With 1 the advantage is the discounted sum of rewards to the episode's end (or, where it
-            was cut, to the cut and the value there) minus the value; with 0 it is the TD error.
-    """
-    delta = reward + discount * next_value - value
-    factor = jnp.where(ended, 0.0, gae_lambda * discount)
-
-    def back(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        delta, factor = step
-        advantage = delta + factor * following
-        return advantage, advantage
-
-    _, result = jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, factor), reverse=True)
-    return result

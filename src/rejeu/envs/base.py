@@ -16,7 +16,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.buffers.hindsight import GoalFunctions
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError

@@ -10,10 +10,10 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
 from rejeu.envs.base import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.registry import in_envpool, make_env, newer_version, provider, register, unknown_environment
 from rejeu.envs.seeds import END, Seed, checked
 from rejeu.spaces import cast, leaves

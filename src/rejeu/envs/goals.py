@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs.faults import described
 from rejeu.errors import BadEnvironmentError
 
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
 """Weights of x, y, vx, vy, cos h, sin h in highway-env's ``parking-v0`` (1.12, default configuration)."""
+
+
+class GoalFunctions(NamedTuple):
+    """The reward and termination functions of a goal environment: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
+
+    reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """Returns the rewards."""
+    terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """Returns which steps are terminal; None if the environment does not define it. Steps then keep their own."""
 
 
 def parking_reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:

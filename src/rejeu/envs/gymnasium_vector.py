@@ -11,9 +11,9 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.base import SUCCESS_KEYS, Description, Step, VectorEnv, describe_spec, replaced
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.spaces import leaves, plain

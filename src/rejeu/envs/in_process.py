@@ -11,10 +11,10 @@ import jax
 import numpy as np
 from numpy import ndarray
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import answers, faults, goals as goals_module, snapshot
 from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, reward_of
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError

@@ -10,8 +10,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.core import Masked
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
 from rejeu.envs.mask_wrapper import MASK, OBSERVATION, MaskInObservation, n_choices
 from rejeu.envs.registry import maker

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import answers, faults, goals as goals_module
 from rejeu.envs.auto_reset import AutoResetView, DummyVecEnv
 from rejeu.envs.base import Step, VectorEnv, success_of
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.seeds import Seed
 from rejeu.envs.vec_env import VecEnv, is_vecenv_wrapped

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution
-from rejeu.buffers.rollout import advantages
 from rejeu.core import PyTree, Rollout
 from rejeu.distributions import TanhNormal, sum_of
 

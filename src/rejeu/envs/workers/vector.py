@@ -10,9 +10,9 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.buffers.hindsight import GoalFunctions
 from rejeu.envs import faults, goals as goals_module, snapshot
 from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
+from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.workers import process
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
