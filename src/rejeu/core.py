@@ -6,6 +6,7 @@ environment and the gradient as a :class:`Transition`. Nothing here knows of any
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -146,6 +147,16 @@ TD_ERROR = "td_error"
 """Name among the metrics of an update for the absolute TD error of each transition, ``(batch,)``."""
 
 
+AVERAGED = {"averaged": True}
+"""Metadata of a field of a state that only averages other fields, such as a target network::
+
+    class State(eqx.Module):
+        critics: QNetwork
+        target_critics: QNetwork = eqx.field(metadata=AVERAGED)
+
+Such a field is finite as long as the others are, so the check for NaN leaves it out, and so does an agent's summary."""
+
+
 def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[..., Any]:
     """Returns ``jax.value_and_grad(loss, has_aux=has_aux)``, kept as a function of its own in a compiled update."""
     return outlined(jax.value_and_grad(loss, has_aux=has_aux))
@@ -183,6 +194,34 @@ def tau_at(n_updates: Array, tau: float, interval: int) -> Any:
     [0.0, 0.0, 0.5, 0.0]
     """
     return tau if interval == 1 else jnp.where(n_updates % interval == 0, tau, 0.0)
+
+
+def averaged_fields(kind: type) -> set[str]:
+    """Returns the names of the fields of a class that are declared :data:`AVERAGED`.
+
+    Adam's first moment counts as one: it averages gradients whose squares are in the second moment.
+    """
+    if kind is optax.ScaleByAdamState:
+        return {"mu"}
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    return {field.name for field in fields if field.metadata.get("averaged", False)}
+
+
+def averaged_leaves(state: PyTree) -> list[bool]:
+    """Returns for each leaf of ``state``, in the order of ``jax.tree.leaves``, whether it is in an averaged field."""
+
+    def is_averaged(path: tuple[Any, ...]) -> bool:
+        node = state
+        for key in path:
+            if isinstance(key, jax.tree_util.GetAttrKey):
+                if key.name in averaged_fields(type(node)):
+                    return True
+                node = getattr(node, key.name)
+            else:
+                node = node[key.idx if isinstance(key, jax.tree_util.SequenceKey) else key.key]
+        return False
+
+    return [is_averaged(path) for path, _ in jax.tree_util.tree_leaves_with_path(state)]
 
 
 def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:

@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 
 import rejeu
-from rejeu.core import ensemble
+from rejeu.core import AVERAGED, ensemble
 from rejeu.networks import Actor, Critic, PolicyConfig
 from rejeu.reporting.summary import describe, draw, n_parameters
 from rejeu.spaces import leaves
@@ -40,7 +40,7 @@ FIGURE_OF_THE_ACTOR = """
 class State(eqx.Module):
     actor: Actor
     critics: Critic
-    target_critics: Critic
+    target_critics: Critic = eqx.field(metadata=AVERAGED)
     n_updates: jax.Array
 
 

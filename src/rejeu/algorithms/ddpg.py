@@ -27,6 +27,7 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.core import (
+    AVERAGED,
     TD_ERROR,
     Algorithm,
     Clock,
@@ -75,8 +76,8 @@ class State(eqx.Module):
 
     actor: Actor
     critic: Critic
-    target_actor: Actor
-    target_critic: Critic
+    target_actor: Actor = eqx.field(metadata=AVERAGED)
+    target_critic: Critic = eqx.field(metadata=AVERAGED)
     actor_optimizer: PyTree
     critic_optimizer: PyTree
     n_updates: Array

@@ -24,6 +24,7 @@ from jax import Array
 from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, Config
 from rejeu.core import (
+    AVERAGED,
     TD_ERROR,
     Algorithm,
     Clock,
@@ -52,8 +53,8 @@ class State(eqx.Module):
     actor: Actor
     critic: Actor
     """Values of all actions, ``(batch, n_actions)``."""
-    target_actor: Actor
-    target_critic: Actor
+    target_actor: Actor = eqx.field(metadata=AVERAGED)
+    target_critic: Actor = eqx.field(metadata=AVERAGED)
     actor_optimizer: PyTree
     critic_optimizer: PyTree
     n_updates: Array

@@ -32,6 +32,7 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.core import (
+    AVERAGED,
     TD_ERROR,
     Algorithm,
     Clock,
@@ -113,7 +114,7 @@ class State(eqx.Module):
     """Everything that DQN learns, every leaf an array."""
 
     network: Actor | Dueling
-    target_network: Actor | Dueling
+    target_network: Actor | Dueling = eqx.field(metadata=AVERAGED)
     optimizer: PyTree
     step: Array
     """Environment steps at the newest gradient step, ``uint32[]``: tells when the target is to move next."""

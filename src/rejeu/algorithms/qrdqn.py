@@ -41,7 +41,7 @@ from rejeu.algorithms.dqn import (
     taken,
 )
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, weighted_mean
+from rejeu.core import AVERAGED, TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, copy, descend, weighted_mean
 from rejeu.networks import Actor, Widths
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import leaves
@@ -94,7 +94,7 @@ class State(eqx.Module):
     """Everything that QR-DQN learns, every leaf an array."""
 
     network: QuantileNetwork
-    target_network: QuantileNetwork
+    target_network: QuantileNetwork = eqx.field(metadata=AVERAGED)
     optimizer: PyTree
     step: Array
     """Environment steps at the newest gradient step, ``uint32[]``: tells when the target is to move next."""

@@ -30,6 +30,7 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import (
+    AVERAGED,
     TD_ERROR,
     Algorithm,
     Clock,
@@ -90,7 +91,7 @@ class State(eqx.Module):
     actor: Actor
     critics: Critic
     """All critics, stacked along a leading axis."""
-    target_critics: Critic
+    target_critics: Critic = eqx.field(metadata=AVERAGED)
     log_alpha: Array
     actor_optimizer: PyTree
     critics_optimizer: PyTree

@@ -27,6 +27,7 @@ from jax import Array
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.algorithms.ddpg import HIDDEN_LAYERS, actor_loss, policy
 from rejeu.core import (
+    AVERAGED,
     TD_ERROR,
     Algorithm,
     Clock,
@@ -82,8 +83,8 @@ class State(eqx.Module):
     actor: Actor
     critics: Critic
     """All critics, stacked along a leading axis."""
-    target_actor: Actor
-    target_critics: Critic
+    target_actor: Actor = eqx.field(metadata=AVERAGED)
+    target_critics: Critic = eqx.field(metadata=AVERAGED)
     actor_optimizer: PyTree
     critics_optimizer: PyTree
     actor_loss: Array

@@ -25,6 +25,7 @@ import jax
 from rejeu import normalization
 from rejeu.algorithms.actor_critic import ActorCritic
 from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
+from rejeu.core import averaged_fields
 from rejeu.networks import MLP, Actor, Branches, Critic, SimBa, convolutions
 from rejeu.spaces import Leaf
 
@@ -35,16 +36,16 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
     """Returns the drawing of every network of an algorithm's state, and what ``state`` is made of.
 
     Args:
-        state: the algorithm's state, of arrays or of their shapes; its fields named ``target_...`` are passed over.
+        state: the algorithm's state, of arrays or of their shapes; its averaged fields (target networks) are left out.
         leaves: those of the observations.
     """
     if isinstance(state, normalization.State):
         state = state.learner
-    fields = [(field.name, getattr(state, field.name)) for field in dataclasses.fields(state)]
+    names = [field.name for field in dataclasses.fields(state) if field.name not in averaged_fields(type(state))]
     networks = {
         name: network
-        for name, network in fields
-        if isinstance(network, eqx.Module) and not name.startswith("target_") and jax.tree.leaves(network)
+        for name in names
+        if isinstance(network := getattr(state, name), eqx.Module) and jax.tree.leaves(network)
     }
     reach = max((branch_width(network) for network in networks.values()), default=0)
     paragraphs = [f"{name}: {count(network)}\n{draw(network, reach)}" for name, network in networks.items()]
