@@ -6,6 +6,7 @@ and a window is closed after a few turns. What a page takes from the reader, it 
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shlex
 import sys
@@ -160,3 +161,17 @@ def test_the_commands_of_a_page_are_understood(page, arguments, monkeypatch, cap
 def test_blocks_are_found_in_the_pages():
     assert sum(block.language == "python" for page in PAGES for block in blocks(page)) > 20
     assert len(COMMANDS) > 10
+
+
+def test_figures_in_pages_are_those_of_the_data():
+    spec = importlib.util.spec_from_file_location("figures", ROOT / "scripts" / "figures.py")
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    outdated = [path for path, text in figures.rendered() if path.read_text(encoding="utf-8") != text]
+    assert not outdated, "run: python scripts/figures.py"
+
+
+def test_links_between_pages_lead_somewhere():
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        for target in re.findall(r"\]\((?!https?:)([^)#\s]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"

@@ -1,5 +1,4 @@
 import dataclasses
-from pathlib import Path
 
 import pytest
 
@@ -40,28 +39,16 @@ def test_a_preset_cannot_be_changed():
     assert hash(preset)
 
 
-ROOT = Path(__file__).parents[2]
-PAGES = {
-    "parking-v0 SAC": "README.md",
-    "rejeu/Ball-v0 TD3": "docs/ball.md",
-    "rejeu/Ball-v0 DDPG": "docs/ball.md",
-    "rejeu/Ball-v0 SAC": "docs/ball.md",
-    "rejeu/CartPoleNoVelocity-v0 RecurrentPPO": "docs/algorithms/ppo.md",
-}
-"""Where results are stated, if not on the page of the algorithm."""
-
-
 def test_every_preset_has_a_result_and_every_result_a_preset():
-    assert {f"{preset.env_id} {preset.algorithm}" for preset in presets.ALL} == set(presets.results())
+    found = {(result.env_id, result.algorithm) for result in presets.results()}
+    assert found == {(preset.env_id, preset.algorithm) for preset in presets.ALL}
 
 
-@pytest.mark.parametrize("name", presets.results())
-def test_results_are_the_same_in_the_documentation(name):
-    page = PAGES.get(name, f"docs/algorithms/{name.split()[1].lower()}.md")
-    text = " ".join((ROOT / page).read_text(encoding="utf-8").split()).replace("**", "")
-    figures = presets.results()[name]["figures"]
-    if name.startswith("rejeu/Ball-v0"):  # a cell for each algorithm
-        assert f"| {figures} |" in text
-    else:
-        assert figures in text
-    assert figures in next(p.result for p in presets.ALL if f"{p.env_id} {p.algorithm}" == name)
+def test_result_shows_mean_interval_and_seeds():
+    result = presets.find_result("Pendulum-v1", "TD3")
+    assert str(result) == f"mean return {result.mean:.1f} ({result.low:.1f} to {result.high:.1f}), {result.seeds} seeds"
+
+
+def test_first_result_is_of_the_preset_as_it_is():
+    assert presets.find_result("CartPole-v1", "PPO").setting == ""
+    assert presets.find_result("Taxi-v3", "DQN") is None

@@ -24,9 +24,11 @@ def run(arguments: List) -> int:
         of_env = [preset for preset in presets.ALL if preset.env_id == env_id]
         for i, preset in enumerate(of_env):
             first = env_id if i == 0 else ""
-            rows.append((first, preset.algorithm, f"{preset.total_steps:,} steps", preset.result or preset.source))
+            result = presets.find_result(preset.env_id, preset.algorithm)
+            rows.append((first, preset.algorithm, f"{preset.total_steps:,} steps", str(result or preset.source)))
     print(columns(rows))
-    print("\nAny other Gymnasium or EnvPool id is trained with the algorithm's defaults. Intervals are of 95 %.")
+    print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
+    print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
     return 0
 
 

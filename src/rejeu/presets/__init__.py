@@ -1,4 +1,4 @@
-"""Tuned hyper-parameters as data, one file a family of environments.
+"""Tuned hyperparameters as data, one file for each family of environments, and their measured results.
 
 >>> find("parking-v0").algorithm
 'SAC'
@@ -7,17 +7,18 @@
 from __future__ import annotations
 
 from rejeu.presets import ball, box2d, classic_control, parking, robotics
-from rejeu.presets.preset import Preset, results
+from rejeu.presets.preset import Preset
+from rejeu.presets.result import Result, find_result, results
 
 ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PRESETS, *ball.PRESETS, *robotics.PRESETS)
-"""Every preset; of several for one environment the first is the best."""
+"""Every preset. The first one of an environment is the one that ``rejeu train`` uses."""
 
 ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "MultiBinary": "PPO"}
-"""The algorithm to begin with in an environment without a preset, by the class of its action space."""
+"""The default algorithm of an environment without a preset, by the class of its action space."""
 
 
 def default(env_id: str, algorithm: str) -> Preset:
-    """Returns what an environment without a preset is trained with: the algorithm's own defaults."""
+    """Returns a preset with the algorithm's default hyperparameters, for an environment that has no preset."""
     return Preset(
         env_id=env_id,
         algorithm=algorithm,
@@ -31,8 +32,8 @@ def default(env_id: str, algorithm: str) -> Preset:
 
 
 def find(env_id: str, algorithm: str | None = None) -> Preset | None:
-    """Returns the preset of an environment, the best or that of ``algorithm``, or None where there is none."""
+    """Returns the preset of an environment, the first one or that of ``algorithm``, or None if there is none."""
     return next((p for p in ALL if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
 
 
-__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "default", "find", "results"]
+__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "Result", "default", "find", "find_result", "results"]

@@ -1,17 +1,16 @@
-"""The ball that must be kept in its box."""
+"""Ball-v0, a toy environment: keep a ball inside a box."""
 
 from __future__ import annotations
 
 from rejeu.presets.preset import Preset
 
 LINEAR_ACTOR = {"net_arch": {"pi": [], "qf": [256]}}
-"""The push is a tanh of a linear function of the position: near the middle all pushes are worth nearly the same, and a
-larger actor follows the critic's errors there."""
+"""A linear actor. Near the center all actions have nearly the same value, and a larger actor fits errors of the critic."""
 
 OBSERVATIONS = {"norm_obs": True, "norm_reward": False}
 
 PRESETS = (
-    # Strong noise on the target's actions loses more balls in the critic's eyes, so that it tells good pushes from bad.
+    # Strong target policy noise increases the differences between the values of good and bad actions.
     Preset(
         env_id="rejeu/Ball-v0",
         algorithm="TD3",
@@ -31,10 +30,10 @@ PRESETS = (
         evaluate_every=15_000,
         evaluate_episodes=50,
         backend="gymnasium",
-        source="rejeu's own tuning on seeds 100 to 104",
+        source="tuned for rejeu on seeds 100 to 104",
     ),
-    # The same by strong noise on the actions taken, which returns of four steps contain. Many steps for few updates: the
-    # longer its actor learns, the harder it pushes near the middle.
+    # The same by strong action noise with 4-step returns. Few updates per step: with more updates the actions near the
+    # center grow too large.
     Preset(
         env_id="rejeu/Ball-v0",
         algorithm="DDPG",
@@ -55,7 +54,7 @@ PRESETS = (
         evaluate_every=35_000,
         evaluate_episodes=50,
         backend="gymnasium",
-        source="rejeu's own tuning on seeds 100 to 104",
+        source="tuned for rejeu on seeds 100 to 104",
     ),
     Preset(
         env_id="rejeu/Ball-v0",
@@ -73,6 +72,6 @@ PRESETS = (
         evaluate_every=15_000,
         evaluate_episodes=50,
         backend="gymnasium",
-        source="rejeu's own tuning",
+        source="tuned for rejeu",
     ),
 )

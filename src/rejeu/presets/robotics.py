@@ -1,4 +1,4 @@
-"""Goal environments of Gymnasium-Robotics: a robot arm is told where to put its hand, or a thing."""
+"""Gymnasium-Robotics: goal environments with a robot arm."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ FETCH_REACH = {
     "learning_starts": 1_000,
     "buffer_size": 100_000,
 }
-"""Layer norm stands in for the zoo's normalisation of observations: without either, learning takes twice the steps."""
+"""Layer norm replaces the Zoo's observation normalization. Without either, learning takes twice as many steps."""
 
-SOURCE = "RL Baselines3 Zoo, hyperparams/{}.yml, FetchReach-v1, with layer norm instead of normalised observations"
+SOURCE = "RL Baselines3 Zoo, hyperparams/{}.yml, FetchReach-v1, with layer norm instead of normalized observations"
 
 PRESETS = (
     Preset(

@@ -1,0 +1,282 @@
+"""Writes every figure of README and documentation from the measured data.
+
+    python scripts/figures.py            # rewrites src/rejeu/presets/results.json and the marked blocks of the pages
+    python scripts/figures.py --check    # changes nothing; exits with 1 if something is out of date
+
+A marked block stands between ``<!-- figures: NAME ARGUMENTS -->`` and ``<!-- end of figures -->``. The data is in
+``benchmarks/results``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "src")]
+
+from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
+from benchmarks.bench.text import table, times  # noqa: E402
+from rejeu.presets.result import Result  # noqa: E402
+
+DATA = ROOT / "benchmarks" / "results"
+PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
+JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
+"""Environments whose result is the success rate."""
+PAGE_OF = {"RecurrentPPO": "ppo", "MaskablePPO": "ppo"}
+"""Algorithms without a page of their own."""
+
+
+def load(name: str) -> Any:
+    """Returns the data of a file in ``benchmarks/results``."""
+    return json.loads((DATA / name).read_text(encoding="utf-8"))
+
+
+def measured() -> list[Result]:
+    """Returns the results of all presets from ``benchmarks/results/learning``, the preset as it is first."""
+    found = [
+        result_of(json.loads(path.read_text(encoding="utf-8"))) for path in sorted((DATA / "learning").glob("*.json"))
+    ]
+    return sorted(found, key=lambda result: (result.env_id, result.algorithm, result.setting))
+
+
+def result_of(data: dict[str, Any]) -> Result:
+    """Returns the result that a file of ``benchmarks/learning.py`` or of ``rejeu train`` and ``evaluate`` holds."""
+    words = shlex.split(data["command"])
+    runs = data["runs"]
+    env_id, algorithm = (words[2], words[3]) if words[0] == "python" else (words[2], "SAC")
+    options = {word: words[i + 1] for i, word in enumerate(words[:-1]) if word.startswith("--")}
+    settings = ["best weights"] if "--best" in words else []
+    settings += [f"sigma={v:g}" for k, v in json.loads(options.get("--env", "{}")).items() if k == "sigma"]
+    is_success = env_id in JUDGED_BY_SUCCESS
+    values = [run["success_rate" if is_success else "mean_return"] for run in runs]
+    low, high = (min(values), max(values)) if is_success else data["summary"]["mean_return"]["interval"]
+    minutes = options.get("--minutes")
+    seconds = [run["seconds"] for run in runs]
+    return Result(
+        env_id=env_id,
+        algorithm=algorithm,
+        setting=", ".join(settings),
+        measure="success rate" if is_success else "mean return",
+        mean=round(sum(values) / len(values), 4),
+        low=round(low, 4),
+        high=round(high, 4),
+        seeds=len(runs),
+        episodes=runs[0]["episodes"],
+        budget=f"{minutes} minute" if minutes else f"{runs[0]['steps']:,} steps",
+        seconds=(min(seconds), max(seconds)),
+        command=data["command"],
+    )
+
+
+def results(*algorithms: str) -> str:
+    """The results of some algorithms, one row for each environment and setting."""
+    rows = []
+    for result in measured():
+        if result.algorithm in algorithms and result.env_id != "rejeu/Ball-v0":
+            env = result.env_id + (f" ({result.algorithm})" if len(algorithms) > 1 else "")
+            setting = f", {result.setting}" if result.setting else ""
+            figures = f"{result.measure} {result.figures}"
+            rows.append(
+                (env + setting, result.budget, figures, str(result.seeds), time_of(result), f"`{result.command}`")
+            )
+    return table(("environment", "trained for", "result", "seeds", "time for each seed", "command"), rows)
+
+
+def time_of(result: Result) -> str:
+    """Returns the range of the training times of a result's seeds."""
+    low, high = (round(seconds) for seconds in result.seconds)
+    return f"{low} s" if low == high else f"{low} to {high} s"
+
+
+def ball() -> str:
+    """The success rates on Ball-v0, one row for each ``sigma``."""
+    found = [result for result in measured() if result.env_id == "rejeu/Ball-v0"]
+    algorithms = ("TD3", "DDPG", "SAC")
+    rows = []
+    for setting in sorted({result.setting for result in found}):
+        cells = {result.algorithm: result.figures for result in found if result.setting == setting}
+        rows.append((setting.removeprefix("sigma="), *(cells[name] for name in algorithms)))
+    return table(("`sigma`", *algorithms), rows)
+
+
+def parking() -> str:
+    """What ``rejeu train parking-v0`` takes and reaches."""
+    result = next(result for result in measured() if result.env_id == "parking-v0")
+    low, high = (100 * share for share in (result.low, result.high))
+    return (
+        f"Training takes {time_of(result)} on two CPU cores, compilation included ({result.seeds} seeds). The trained models "
+        f"succeed in\n{low:g} to {high:g} % of {result.episodes} episodes of highway-env's `parking-v0`."
+    )
+
+
+def speed() -> str:
+    """Speed against Stable-Baselines3 and SBX, first on the same environments."""
+    samples = load("bench.json")["samples"]
+
+    def row(text: str, case: str, name: str, peer_name: str = "") -> tuple[str, ...]:
+        own = step_seconds(samples, case, name, "rejeu")
+        peers = [step_seconds(samples, case, peer_name or name, library) for library in ("sb3", "sbx")]
+        return (text, *(f"{times(ratio(peer, own))}x" if peer else "" for peer in peers))
+
+    def parking_row(text: str, name: str) -> tuple[str, ...]:
+        own, peer = (
+            by_round(best(samples, "parking", n, library), lambda sample: sample["result"]["training_steps_per_second"])
+            for n, library in ((name, "rejeu"), ("highway-env", "sb3"))
+        )
+        return (text, f"{times(ratio(own, peer))}x", "")
+
+    rows = [
+        row("SAC, Pendulum-v1, 64-64, batches of 64", "steps", "SAC"),
+        row("SAC, Pendulum-v1, 256-256, batches of 256", "steps", "SAC, 256-256"),
+        row("TD3, Pendulum-v1, 128-128, batches of 128", "steps", "TD3"),
+        row("DQN, MountainCar-v0, 128-128, batches of 128", "steps", "DQN"),
+        row("PPO, LunarLanderContinuous-v3, 16 environments", "rollouts", "PPO, 16 on gymnasium"),
+        parking_row("SAC with HER, parking-v0 (Python simulator)", "highway-env"),
+        row("PPO, 16 environments; rejeu on EnvPool", "rollouts", "PPO, 16 on envpool", "PPO, 16 on gymnasium"),
+        row("PPO, 64 environments; rejeu on EnvPool", "rollouts", "PPO, 64 on envpool", "PPO, 64 on gymnasium"),
+        parking_row("SAC with HER, parking-v0; rejeu on EnvPool, 8 environments", "EnvPool, 8 environments"),
+    ]
+    return table(("training steps per second", "vs. Stable-Baselines3", "vs. SBX"), rows)
+
+
+def backends() -> str:
+    """Steps per second of each backend."""
+    names = ("envpool", "gymnasium", "gymnasium-async")
+    rows = []
+    for entry in load("backends.json")["results"]:
+        rates = [entry["steps_per_second"].get(name) for name in names]
+        rows.append(
+            (f"`{entry['env']}`", str(entry["n_envs"]), *("" if rate is None else f"{rate:,.0f}" for rate in rates))
+        )
+    return table(("environment", "`n_envs`", *(f"`{name}`" for name in names)), rows)
+
+
+def mountain_car() -> str:
+    """The exercise on MountainCar, one row for each seed."""
+    rows = [
+        (
+            str(run["seed"]),
+            f"{run['seconds']:.1f}",
+            f"{100 * run['reached']:.1f} %",
+            f"{100 * run['reached_in_last_100']:.0f} %",
+            f"{run['greedy_return']:.1f}",
+        )
+        for run in load("mountain_car_document.json")["runs"]
+    ]
+    header = (
+        "seed",
+        "seconds",
+        "training episodes that reach the flag",
+        "of the last 100",
+        "greedy return, 50 episodes",
+    )
+    return table(header, rows)
+
+
+def lunar_lander() -> str:
+    """Ten iterations on LunarLander, one row for each set of hyperparameters, means over the seeds."""
+    rows = []
+    for name, runs in load("lunar_lander_document.json")["runs"].items():
+        keys = ("steps", "seconds", "last_training_return", "mean_return", "success_rate")
+        steps, seconds, training, deterministic, success = (sum(run[key] for run in runs) / len(runs) for key in keys)
+        cells = (f"{steps:,.0f}", f"{seconds:.1f}", f"{training:.0f}", f"{deterministic:.0f}", f"{100 * success:.0f} %")
+        rows.append((name, str(len(runs)), *cells))
+    header = (
+        "hyperparameters",
+        "seeds",
+        "steps",
+        "seconds",
+        "last training return",
+        "deterministic return",
+        "success rate",
+    )
+    return table(header, rows)
+
+
+def size() -> str:
+    """The structure of the package before and after its restructuring, from ``scripts/structure.py --json``."""
+    before, after = load("structure/before.json"), load("structure/after.json")
+    names = {
+        "lines": "lines in `src`",
+        "files": "files",
+        "top_level_modules": "modules at the top level",
+        "files_in_agents": "files in `agents/`",
+        "cycles": "modules in import cycles",
+        "private_accesses": "accesses to private attributes of other objects",
+        "layering_violations": "imports against the order of the layers",
+        "repeated_share_in_algorithms": "lines of `algorithms/` that occur in three or more files, %",
+        "longest_function": "lines of the longest function",
+    }
+
+    def count(value: Any) -> str:
+        if isinstance(value, list):
+            value = sum(len(entry) if isinstance(entry, list) else 1 for entry in value)
+        return f"{value:,}"
+
+    rows = [(text, count(before[key]), count(after[key])) for key, text in names.items()]
+    # The order of the layers is that of the new layout.
+    rows = [(text, "" if "layers" in text else b, a) for text, b, a in rows]
+    packages = sorted(before["lines_by_package"].keys() | after["lines_by_package"].keys())
+    for package in packages:
+        lines = (data["lines_by_package"].get(package) for data in (before, after))
+        rows.append((f"lines in {package}", *("" if n is None else f"{n:,}" for n in lines)))
+    return table(("", "before", "after"), rows)
+
+
+BLOCKS: dict[str, Callable[..., str]] = {
+    "results": results,
+    "ball": ball,
+    "parking": parking,
+    "speed": speed,
+    "backends": backends,
+    "mountain-car": mountain_car,
+    "lunar-lander": lunar_lander,
+    "size": size,
+}
+
+
+def render(text: str) -> str:
+    """Returns a page with every marked block written anew."""
+
+    def block(match: re.Match[str]) -> str:
+        name, *arguments = match[2].split()
+        return f"{match[1]}{BLOCKS[name](*arguments)}\n{match[3]}"
+
+    return BLOCK.sub(block, text)
+
+
+def rendered() -> Iterator[tuple[Path, str]]:
+    """Yields each file with generated figures, and the text that it should have."""
+    entries = [result.__dict__ for result in measured()]
+    yield PRESET_RESULTS, json.dumps(entries, indent=1) + "\n"
+    for page in PAGES:
+        yield page, render(page.read_text(encoding="utf-8"))
+
+
+def main() -> int:
+    """Runs the command and returns its exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="change nothing, and exit with 1 if a file is out of date")
+    check = parser.parse_args().check
+    outdated = []
+    for path, text in rendered():
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            outdated.append(path.relative_to(ROOT))
+            if not check:
+                path.write_text(text, encoding="utf-8")
+    for path in outdated:
+        print(f"{path} is out of date; run: python scripts/figures.py" if check else f"wrote {path}")
+    return int(check and bool(outdated))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
