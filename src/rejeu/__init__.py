@@ -6,27 +6,66 @@
 100
 """
 
-from rejeu.agents import interrupt
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+from rejeu import interrupt
 
 interrupt.guard_imports()
+if not interrupt.is_command():  # which imports it when it makes an environment
+    importlib.import_module("rejeu.envs")  # registers rejeu's environments
 
-from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
-from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
-from rejeu.buffers.replay_memory import ReplayMemory
-from rejeu.buffers.uniform import ReplayBuffer
-from rejeu.envs.checker import check_env
-from rejeu.envs.make import make_vector
-from rejeu.envs.monitor import Monitor
-from rejeu.envs.time_limit import TimeLimitTerminates
-from rejeu.errors import BadEnvironmentError, CheckpointError, MissingExtra, WorkerError
-from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-from rejeu.exploration.parameter_space import ParameterNoise
-from rejeu.reporting import plots
-from rejeu.reporting.evaluation import Evaluation, evaluate_policy
-from rejeu.reporting.video import record_video, show_videos
-from rejeu.schedules import Exponential, Linear
+if TYPE_CHECKING:
+    from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
+    from rejeu.agents.off_policy import OffPolicyAgent
+    from rejeu.agents.on_policy import OnPolicyAgent
+    from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
+    from rejeu.buffers.replay_memory import ReplayMemory
+    from rejeu.buffers.uniform import ReplayBuffer
+    from rejeu.core import Algorithm, Clock, Rollout, Transition
+    from rejeu.envs.checker import check_env
+    from rejeu.envs.make import make_vec, make_vector
+    from rejeu.envs.monitor import Monitor
+    from rejeu.envs.time_limit import TimeLimitTerminates
+    from rejeu.errors import (
+        BadEnvironmentError,
+        CheckpointError,
+        MissingExtra,
+        NonFiniteError,
+        RunInUseError,
+        WorkerError,
+    )
+    from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+    from rejeu.exploration.parameter_space import ParameterNoise
+    from rejeu.reporting import plots
+    from rejeu.reporting.evaluation import Evaluation, evaluate_policy
+    from rejeu.reporting.video import record_video, show_videos
+    from rejeu.schedules import Exponential, Linear
 
 __version__ = "0.1.0"
+
+_MODULES = {
+    "rejeu.agents": "A2C AGENTS DDPG DQN PPO QRDQN SAC TD3 TQC CrossQ MaskablePPO RecurrentPPO load",
+    "rejeu.agents.off_policy": "OffPolicyAgent",
+    "rejeu.agents.on_policy": "OnPolicyAgent",
+    "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
+    "rejeu.buffers.replay_memory": "ReplayMemory",
+    "rejeu.buffers.uniform": "ReplayBuffer",
+    "rejeu.core": "Algorithm Clock Rollout Transition",
+    "rejeu.envs.checker": "check_env",
+    "rejeu.envs.make": "make_vec make_vector",
+    "rejeu.envs.monitor": "Monitor",
+    "rejeu.envs.time_limit": "TimeLimitTerminates",
+    "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
+    "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",
+    "rejeu.exploration.parameter_space": "ParameterNoise",
+    "rejeu.reporting": "plots",
+    "rejeu.reporting.evaluation": "Evaluation evaluate_policy",
+    "rejeu.reporting.video": "record_video show_videos",
+    "rejeu.schedules": "Exponential Linear",
+}
+"""The public names by the module that defines them."""
 
 __all__ = [
     "A2C",
@@ -38,8 +77,10 @@ __all__ = [
     "SAC",
     "TD3",
     "TQC",
+    "Algorithm",
     "BadEnvironmentError",
     "CheckpointError",
+    "Clock",
     "CrossQ",
     "Evaluation",
     "Exponential",
@@ -49,19 +90,43 @@ __all__ = [
     "MaskablePPO",
     "MissingExtra",
     "Monitor",
+    "NonFiniteError",
     "NormalActionNoise",
+    "OffPolicyAgent",
+    "OnPolicyAgent",
     "OrnsteinUhlenbeckActionNoise",
     "ParameterNoise",
     "RecurrentPPO",
     "ReplayBuffer",
     "ReplayMemory",
+    "Rollout",
+    "RunInUseError",
     "TimeLimitTerminates",
+    "Transition",
     "WorkerError",
     "check_env",
     "evaluate_policy",
     "load",
+    "make_vec",
     "make_vector",
     "plots",
     "record_video",
     "show_videos",
 ]
+
+if not TYPE_CHECKING:  # type checkers find the names above, and report misspelt ones
+
+    def __getattr__(name: str) -> Any:
+        """Imports a public name or a submodule when it is first used (PEP 562)."""
+        module = next((module for module, names in _MODULES.items() if name in names.split()), None)
+        if module is not None:
+            value = getattr(importlib.import_module(module), name)
+        elif not name.startswith("_") and importlib.util.find_spec(f"rejeu.{name}") is not None:
+            value = importlib.import_module(f"rejeu.{name}")
+        else:
+            raise AttributeError(f"module 'rejeu' has no attribute {name!r}")
+        globals()[name] = value
+        return value
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

@@ -15,9 +15,9 @@ from rejeu.agents import resuming, statistics
 from rejeu.agents.best import note_training_return
 from rejeu.agents.call import Call
 from rejeu.agents.checkpoints import Checkpoint
-from rejeu.agents.interrupt import Interrupt
 from rejeu.errors import NonFiniteError
 from rejeu.hooks import Hooks, told_apart
+from rejeu.interrupt import Interrupt
 from rejeu.io.failed_writes import RetryingSink
 from rejeu.loops import finite
 from rejeu.reporting.logging import Console, Sink, TensorBoard, next_folder

@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from rejeu.agents import interrupt
+from rejeu import interrupt
 from rejeu.cli import arguments, check, evaluate, list as listing, play, record, resume, train, watch
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {

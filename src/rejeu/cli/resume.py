@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from rejeu.agents.interrupt import Interrupt
 from rejeu.cli import run_folder
 from rejeu.cli.environment import RunOptions
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.running import Limits, Session, Watch, carry_out, has_reached_goal, make_evaluation_env
 from rejeu.cli.telling import say
+from rejeu.interrupt import Interrupt
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rejeu.agents.interrupt import Interrupt, leaving
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.cli.telling import reporter, say, summary
+from rejeu.interrupt import Interrupt, leaving
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

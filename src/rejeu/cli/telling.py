@@ -7,9 +7,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rejeu.agents.interrupt import NAMES
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
+from rejeu.interrupt import NAMES
 from rejeu.reporting.text import counted
 
 if TYPE_CHECKING:

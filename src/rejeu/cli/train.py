@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from rejeu.agents.interrupt import Interrupt
 from rejeu.cli import run_folder, settings
 from rejeu.cli.environment import Environment, EnvironmentOptions, named
 from rejeu.cli.run_folder import RunConfig
 from rejeu.cli.running import Limits, Session, Watch, carry_out, make_agent, make_evaluation_env
 from rejeu.cli.telling import header, say
+from rejeu.interrupt import Interrupt
 
 if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv

@@ -26,7 +26,17 @@ from rejeu.envs.workers.vector import InWorkers
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
 
-__all__ = ["Backend", "EnvPool", "GymnasiumVector", "InProcess", "InWorkers", "Step", "VectorEnv", "make_vector"]
+__all__ = [
+    "Backend",
+    "EnvPool",
+    "GymnasiumVector",
+    "InProcess",
+    "InWorkers",
+    "Step",
+    "VectorEnv",
+    "make_vec",
+    "make_vector",
+]
 
 
 def make_vector(
@@ -80,6 +90,10 @@ def make_vector(
     if isinstance(seed, tuple):
         vector.seeds = seed
     return vector
+
+
+make_vec = make_vector
+"""Gymnasium's name of :func:`make_vector`."""
 
 
 def _made(

@@ -16,10 +16,10 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import Agent
-from rejeu.agents.interrupt import Interrupt
 from rejeu.envs.faults import id_of
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env
+from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Pace, Player
 from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for

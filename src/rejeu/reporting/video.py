@@ -22,12 +22,12 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
-from rejeu.agents.interrupt import Interrupt
 from rejeu.envs.make import InProcess
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env, provider, register
 from rejeu.envs.vec_env import VecEnvWrapper
 from rejeu.errors import MissingExtra
+from rejeu.interrupt import Interrupt
 from rejeu.validation import number, whole
 
 DEFAULT_FPS = 30.0

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import rejeu
-from rejeu.agents import interrupt
-from rejeu.agents.interrupt import Interrupt
+from rejeu import interrupt
+from rejeu.interrupt import Interrupt
 from tests.cli.test_cli import TINY
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")

@@ -1,0 +1,44 @@
+"""What importing the package costs and gives."""
+
+import json
+import subprocess
+import sys
+
+import rejeu
+
+
+def fresh(program: str) -> str:
+    """Returns what a program prints in a new interpreter."""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def test_importing_rejeu_registers_its_environments_and_imports_no_jax():
+    program = """
+import json, sys
+import rejeu
+import gymnasium
+print(json.dumps({"loaded": sorted(sys.modules), "ids": [i for i in gymnasium.registry if i.startswith("rejeu/")]}))
+"""
+    found = json.loads(fresh(program))
+    assert found["ids"] == ["rejeu/Ball-v0", "rejeu/CartPoleNoVelocity-v0"]
+    loaded = set(found["loaded"])
+    assert not loaded & {"jax", "equinox", "optax", "scipy", "tyro", "rich", "envpool", "rejeu.agents"}
+
+
+def test_every_public_name_can_be_imported():
+    missing = [name for name in rejeu.__all__ if not hasattr(rejeu, name)]
+    assert not missing
+    assert {*rejeu.__all__} <= {*dir(rejeu)}
+
+
+def test_submodules_are_imported_on_access():
+    assert fresh("import rejeu; print(rejeu.callbacks.Evaluate.__name__)") == "Evaluate\n"
+
+
+def test_a_misspelt_name_is_an_attribute_error():
+    assert not hasattr(rejeu, "SACC")
+
+
+def test_make_vec_is_make_vector():
+    assert rejeu.make_vec is rejeu.make_vector
