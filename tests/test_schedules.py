@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.call import Call
+from rejeu.agents.training import Call
 from rejeu.callbacks import Checkpoint
 from rejeu.schedules import Exponential, Linear, at, parse, to_json
 from tests.environments import Counter

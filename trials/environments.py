@@ -36,7 +36,7 @@ from gymnasium import spaces
 from provenance import provenance
 
 import rejeu
-from rejeu.agents.checkpoints import run_files
+from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint
 from trials.environment_kinds import ENDS, RAISES, REFUSED, TRAINS, WORKERS, Kind, kinds
 

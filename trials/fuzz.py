@@ -343,13 +343,13 @@ def table_reader(path: Path) -> Callable[[], None]:
 def header_reader(path: Path) -> Callable[[], None]:
     """Returns what interprets headers, of whichever algorithm, and builds nothing."""
     from rejeu import agents
-    from rejeu.agents import loading
+    from rejeu.agents import model_files
     from rejeu.io import checkpoint
 
     def read() -> None:
-        header, arrays = checkpoint.read(path, "agent")
+        header = checkpoint.read_header(path, "agent")
         kind = agents.AGENTS.get(str(header.get("algorithm")), agents.SAC)
-        loading.interpret(header, arrays, kind.algorithm.Config, kind._check_policy, {}, {})
+        model_files.interpret(header, path.stat().st_size, kind.algorithm.Config, {}, {})
 
     return read
 

@@ -40,7 +40,7 @@ def make_runs(folder: Path) -> list[tuple[Path, list[Path]]]:
     import gymnasium as gym
 
     import rejeu
-    from rejeu.agents.checkpoints import run_files
+    from rejeu.agents.run_files import run_files
     from rejeu.callbacks import Checkpoint
 
     if BITS not in gym.registry:

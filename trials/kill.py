@@ -41,7 +41,7 @@ def make() -> object:
 def live(folder: str, last: int) -> None:
     """Trains until step ``last``, from the newest checkpoint if there is one, and says every step."""
     import rejeu
-    from rejeu.agents.checkpoints import run_files
+    from rejeu.agents.run_files import run_files
     from rejeu.callbacks import Checkpoint
 
     def say(agent: rejeu.SAC, turn: object) -> bool:

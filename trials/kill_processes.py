@@ -99,7 +99,7 @@ def vector(case: Case) -> Any:
 def live(name: str, folder: str, kept: bool) -> None:
     """Trains to the end, from the newest checkpoint if there is one; says where it began and a digest of all at the end."""
     import rejeu
-    from rejeu.agents.checkpoints import run_files
+    from rejeu.agents.run_files import run_files
     from rejeu.callbacks import Checkpoint
 
     case = CASES[name]

@@ -8,7 +8,7 @@ import pytest
 
 import rejeu
 from rejeu import callbacks
-from rejeu.agents import files
+from rejeu.agents import model_files
 from rejeu.envs.make import InProcess
 from rejeu.errors import CheckpointError
 from tests.environments import Counter, Reach, Sampled
@@ -659,7 +659,7 @@ def test_a_loaded_agent_evaluates_where_it_was_trained(tmp_path):
     ],
 )
 def test_a_file_names_no_environment_that_is_imported(said):
-    assert files.trained_on({"made_from": said}) is None
+    assert model_files.trained_on({"made_from": said}) is None
 
 
 def test_an_agent_of_an_environment_that_was_given_has_none_after_loading(tmp_path):

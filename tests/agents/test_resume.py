@@ -20,7 +20,7 @@ import pytest
 
 import rejeu
 from rejeu import xla
-from rejeu.agents.checkpoints import run_files
+from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.hooks import BaseCallback, EvalCallback
@@ -409,7 +409,7 @@ def test_signals_end_training_with_a_checkpoint(number, tmp_path):
 
 def test_minutes_between_checkpoints(tmp_path, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(rejeu.agents.checkpoints.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rejeu.agents.run_files.time, "monotonic", lambda: now[0])
 
     def tick(agent, turn):
         now[0] += 7.0

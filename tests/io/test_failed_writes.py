@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.checkpoints import run_files
+from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.hooks import CheckpointCallback, EvalCallback
 from rejeu.io import failed_writes
@@ -152,7 +152,7 @@ def test_a_disk_that_stays_full_is_reported_at_the_end(tmp_path, disk):
 
 def test_a_checkpoint_that_failed_is_tried_again_after_a_minute(tmp_path, disk, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(rejeu.agents.checkpoints.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rejeu.agents.run_files.time, "monotonic", lambda: now[0])
 
     def tick(agent, turn):
         now[0] += 10.0

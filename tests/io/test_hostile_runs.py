@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.checkpoints import run_files
-from rejeu.agents.resuming import like, restore_buffer
+from rejeu.agents.resume import like, restore_buffer
+from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, tensors

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rejeu.agents import files
+from rejeu.agents import model_files
 from rejeu.agents.base import Agent, Callback, whole_seed
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ
 from rejeu.agents.on_policy import A2C, PPO, MaskablePPO, RecurrentPPO
@@ -20,7 +20,7 @@ AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent i
 
 def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
     """Returns the agent of a model file or a run folder, whichever algorithm it is of; see :meth:`Agent.load`."""
-    path = files.find(path)
+    path = model_files.find(path)
     name = checkpoint.read_header(path, "agent").get("algorithm")
     if not isinstance(name, str) or name not in AGENTS:
         raise CheckpointError(f"{path} holds an agent of {str(name)[:40]!r}; this rejeu has {', '.join(AGENTS)}")

@@ -21,14 +21,13 @@ import jax
 import numpy as np
 
 from rejeu import spaces, validation, xla
-from rejeu.agents import best, evaluating, files, learning, predicting, resuming, statistics
-from rejeu.agents.call import Call
-from rejeu.agents.checkpoints import RowFiles
+from rejeu.agents import model_files, policy as policies, resume, training
 from rejeu.agents.description import ClassOnly, describe
-from rejeu.agents.files import AGENT_ARGUMENTS
-from rejeu.agents.loading import whole_seed
-from rejeu.agents.policies import check_policy
-from rejeu.agents.resuming import Resumed
+from rejeu.agents.model_files import AGENT_ARGUMENTS, BEST_WINDOW, whole_seed
+from rejeu.agents.policy import check_policy
+from rejeu.agents.resume import Resumed
+from rejeu.agents.run_files import RowFiles
+from rejeu.agents.training import Best, Call
 from rejeu.algorithms import config as configs
 from rejeu.envs.auto_reset import AutoResetView, around
 from rejeu.envs.make import Backend, InProcess, VectorEnv
@@ -77,7 +76,7 @@ class Agent(ABC):
         tensorboard_log: str | Path | None = None,
         stats_window_size: int = 100,
         success_threshold: float | None = None,
-        best_window: int = best.BEST_WINDOW,
+        best_window: int = BEST_WINDOW,
         device: str = "auto",
         **hyperparameters: Any,
     ) -> None:
@@ -130,7 +129,7 @@ class Agent(ABC):
         """Takes further numbers for the rows of statistics."""
         self.failed_writes = FailedWrites()
         """What ``learn`` could not write, such as checkpoints and log rows on a full disk; training continues without."""
-        self.best: best.Best | None = None
+        self.best: Best | None = None
         """The best weights so far, by smoothed training return or by evaluation."""
         self.steps_per_second = math.nan
         """Environment steps per second of the present or last ``learn``."""
@@ -303,14 +302,14 @@ class Agent(ABC):
         Raises:
             ValueError: without an environment, or if no limit is given.
         """
-        call = learning.begin(self, total_timesteps, episodes, minutes, log_interval, reset_num_timesteps)
+        call = training.begin(self, total_timesteps, episodes, minutes, log_interval, reset_num_timesteps)
         arguments = {"log_interval": log_interval, "reset_num_timesteps": reset_num_timesteps}
-        learning.carry_out(self, call, callback, tb_log_name, progress_bar, sinks, arguments)
+        training.carry_out(self, call, callback, tb_log_name, progress_bar, sinks, arguments)
         return self
 
     def _fill_windows(self) -> None:
         """Fills the windows of statistics from the history."""
-        statistics.fill_windows(self)
+        training.fill_windows(self)
 
     def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
         """Keeps the present weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
@@ -319,10 +318,10 @@ class Agent(ABC):
         episode), :class:`rejeu.callbacks.Evaluate` with success rate and mean return; once it was called with the score of
         an evaluation, evaluations alone count. Scores of one kind must compare with each other.
         """
-        return best.remember(self, score, by)
+        return training.remember_best(self, score, by)
 
     def _put_best(self, score: float | tuple[float, ...], by: str, step: int, state: PackedState) -> None:
-        self.best = best.Best(score, by, step, state)
+        self.best = Best(score, by, step, state)
 
     def restore_best(self) -> Self:
         """Puts back the best weights so far: actor, critics, their targets and optimizers as they were together.
@@ -330,12 +329,12 @@ class Agent(ABC):
         Raises:
             ValueError: if none were kept yet, which takes ``best_window`` finished episodes or one evaluation.
         """
-        best.restore(self)
+        training.restore_best(self)
         return self
 
     def statistics(self) -> dict[str, float]:
         """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
-        return statistics.row(self)
+        return training.statistics_row(self)
 
     def predict(
         self,
@@ -364,11 +363,11 @@ class Agent(ABC):
         """
         if self.takes_masks:
             observation, action_masks = split(observation, action_masks)
-        batch, single = predicting.as_batch(observation, self.observation_space, self._obs_leaves)
+        batch, single = policies.as_batch(observation, self.observation_space, self._obs_leaves)
         batch = self._with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
-        action, memory = predicting.act(self, batch, deterministic, state, ended)
+        action, memory = policies.act(self, batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
         return (scaled[0] if single else scaled), state if memory is None else memory
 
@@ -404,7 +403,7 @@ class Agent(ABC):
         It may be called by a callback while the agent learns. Where it plays in the environments that the agent trains
         on, be they given or not, training goes on in new episodes.
         """
-        return evaluating.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
+        return policies.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
 
     def get_env(self) -> VecEnv | None:
         """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
@@ -510,7 +509,7 @@ class Agent(ABC):
 
     def snapshot(self, path: str | Path) -> Callable[[], Path]:
         """Returns a function that does what :meth:`save` does, with the model as it is now, whenever it is called."""
-        arrays, header = self.get_parameters(), files.header(self)
+        arrays, header = self.get_parameters(), model_files.header(self)
 
         def write() -> Path:
             self.last_saved = checkpoint.write(path, "agent", arrays, header)
@@ -532,8 +531,8 @@ class Agent(ABC):
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged, of another algorithm, environment, schema or shape; it says which.
         """
-        with checkpoint.opened(files.find(path), "agent") as file:
-            agent = files.load(
+        with checkpoint.opened(model_files.find(path), "agent") as file:
+            agent = model_files.load(
                 cls, file, lambda agent: None if env is None else agent._vector(env, seed=agent.seed), changes
             )
         agent._own_env = isinstance(env, str)
@@ -558,7 +557,7 @@ class Agent(ABC):
             FileNotFoundError: if there is no checkpoint.
             CheckpointError: if the checkpoints are damaged, or of another algorithm or environment.
         """
-        return resuming.resume(cls, Path(folder), env, changes)
+        return resume.resume(cls, Path(folder), env, changes)
 
     def summary(self) -> str:
         """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""

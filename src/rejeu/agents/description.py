@@ -6,7 +6,7 @@ import inspect
 from typing import TYPE_CHECKING, Any
 
 from rejeu import validation
-from rejeu.agents.files import AGENT_ARGUMENTS
+from rejeu.agents.model_files import AGENT_ARGUMENTS
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent

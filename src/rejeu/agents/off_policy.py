@@ -10,9 +10,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from rejeu import spaces
-from rejeu.agents import loading, predicting
+from rejeu.agents import model_files, policy
 from rejeu.agents.base import Agent
-from rejeu.agents.predicting import refuse_masks
+from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
@@ -62,7 +62,7 @@ class OffPolicyAgent(Agent):
         try:
             with checkpoint.opened(path, "replay") as file:
                 for kind, own in (("observation", self.observation_space), ("action", self.action_space)):
-                    loading.check_space(file.header.get(f"{kind}_space"), own, kind)
+                    model_files.check_space(file.header.get(f"{kind}_space"), own, kind)
                 self.run.replay.ring.check(file.specs)
                 arrays = file.read()
             spaces.check_actions(self.action_space, arrays["action"], "the replay file")
@@ -70,7 +70,7 @@ class OffPolicyAgent(Agent):
         except CheckpointError:
             raise
         except ValueError as error:
-            raise CheckpointError(f"{path}: {loading.brief(error)}") from None
+            raise CheckpointError(f"{path}: {model_files.brief(error)}") from None
         self.run.learn_from = self.config.learning_starts
         self.run.td_errors = []  # of steps that are gone
         self._give_up_episodes()
@@ -103,7 +103,7 @@ class OffPolicyAgent(Agent):
         >>> agent.q_values(obs, np.ones((50, 1))).shape, agent.q_values(obs[0], [1.0]).shape
         ((50,), ())
         """
-        return predicting.q_values(self, observation, action, critics)
+        return policy.q_values(self, observation, action, critics)
 
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return make_vector(env, n_envs, backend, seed)

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from rejeu import spaces
-from rejeu.agents import predicting
+from rejeu.agents import policy
 from rejeu.agents.base import Agent
-from rejeu.agents.predicting import refuse_masks
+from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.buffers.rollout import RolloutBuffer
@@ -52,7 +52,7 @@ class OnPolicyAgent(Agent):
         >>> agent.value(np.zeros((50, 4), np.float32)).shape
         (50,)
         """
-        return predicting.value(self, observation, state, episode_start)
+        return policy.value(self, observation, state, episode_start)
 
     def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)

@@ -5,7 +5,7 @@ A callback is anything that ``agent.learn`` can call after every step of the env
 whatever the number of environments.
 """
 
-from rejeu.agents.checkpoints import Checkpoint
+from rejeu.agents.run_files import Checkpoint
 from rejeu.callbacks.due import crossed, step_before
 from rejeu.callbacks.evaluate import EVALUATED, EVALUATION, Evaluate, Evaluated, better, merit
 from rejeu.callbacks.film import Film

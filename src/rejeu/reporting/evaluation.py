@@ -204,7 +204,7 @@ def evaluate_policy(
         TypeError: if the model takes action masks, and those of the environment cannot be reached.
     """
     from rejeu.agents import Agent  # which imports this module
-    from rejeu.agents.evaluating import lent
+    from rejeu.agents.policy import lent
 
     agent = model if isinstance(model, Agent) else None
     vector = make_masked(env) if agent is not None and agent.takes_masks else make_vector(env)

@@ -30,7 +30,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rejeu import xla
-from rejeu.agents import files
+from rejeu.agents import model_files
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
@@ -314,7 +314,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "vec_normalize": None if statistics is None else statistics.statistics(),
     }
     header = {
-        **files.header(agent),
+        **model_files.header(agent),
         "run_id": agent._run_id,
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,

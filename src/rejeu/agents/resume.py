@@ -15,9 +15,9 @@ import numpy as np
 from jax import Array
 
 from rejeu import spaces, xla
-from rejeu.agents import files, loading
-from rejeu.agents.call import Call
-from rejeu.agents.checkpoints import PER_ENV, ROWS_FILE, SCALARS, RowFiles, run_files
+from rejeu.agents import model_files
+from rejeu.agents.run_files import PER_ENV, ROWS_FILE, SCALARS, RowFiles, run_files
+from rejeu.agents.training import Call
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
@@ -103,7 +103,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         counted = " or ".join(str(buffer[name].size) for name in PER_BUFFER if name in buffer)
         if counted != str(header["n_envs"]):
             raise ValueError(f"it is of {header['n_envs']} environments, and its replay buffer of {counted or 'none'}")
-    except loading.WRONG as error:
+    except model_files.WRONG as error:
         raise refusal(path, error) from error
 
     def make_env(agent: Agent) -> VectorEnv:
@@ -119,12 +119,12 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
             agent._check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:
             raise CheckpointError(
-                f"{path}: the environments of the run cannot be made again ({loading.brief(error)}); give them: "
+                f"{path}: the environments of the run cannot be made again ({model_files.brief(error)}); give them: "
                 "resume(folder, env=...)"
             ) from error
         return vector
 
-    agent = files.load(cls, file, make_env, changes, threads(path, header), "state.")
+    agent = model_files.load(cls, file, make_env, changes, threads(path, header), "state.")
     try:
         check_specs(agent, file)
         saved = plain.decode(header["run"], file.read("run."))
@@ -137,7 +137,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         agent._run_id, agent._own_env = text(header["run_id"]), env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
-    except loading.WRONG as error:
+    except model_files.WRONG as error:
         raise refusal(path, error) from error
     if parts:
         ring = agent.run.replay.ring
@@ -195,7 +195,7 @@ def refusal(path: Path, error: BaseException) -> CheckpointError:
     """Returns what a checkpoint is refused with, from what was raised while its values were put in place."""
     if isinstance(error, CheckpointError):
         return error
-    return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {loading.brief(error)}")
+    return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {model_files.brief(error)}")
 
 
 def _rows_name(name: Any) -> str:
@@ -281,7 +281,7 @@ def restore(
     if saved["envs"] is not None:
         reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
     elif saved["seed"] is not None:
-        run.seed = loading.whole_seed(saved["seed"])
+        run.seed = model_files.whole_seed(saved["seed"])
     agent.history.replace(saved["history"])
     agent._fill_windows()
     if saved["best"] is not None:
@@ -349,7 +349,7 @@ def restore_buffer(
 
     Args:
         run: mutated.
-        saved: what :func:`rejeu.agents.checkpoints.buffer_content` returned.
+        saved: what :func:`rejeu.agents.run_files.buffer_content` returned.
         rows: of a ring.
         carry: what exploration remembers, for its form.
         begun: whether a rollout is under way; before the first there is nothing that was remembered at its beginning.
@@ -421,25 +421,3 @@ def exactly(array: Any, shape: tuple[int, ...], dtype: Any, name: str) -> np.nda
         found = f"{array.dtype}{list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
         raise ValueError(f"{name} is {found}, expected {np.dtype(dtype)}{list(shape)}")
     return array.copy()
-
-
-def restore_callbacks(callbacks: Sequence[Any], saved: Sequence[Any]) -> None:
-    """Gives callbacks what those of the same kind remembered when the run was saved, in order.
-
-    Those for which nothing was saved begin anew, with a warning, and what was saved for others is passed over likewise.
-    """
-    left = [(name, state) for name, state in saved]
-    for one in callbacks:
-        name = type(one).__name__
-        match = next((entry for entry in left if entry[0] == name), None)
-        if match is None:
-            warnings.warn(f"the run was saved without a {name}; it begins anew", UserWarning, stacklevel=4)
-            continue
-        left.remove(match)
-        try:
-            one.load_state_dict(match[1])
-        except loading.WRONG as error:
-            raise CheckpointError(f"what {name} remembered is damaged: {loading.brief(error)}") from error
-    if left:
-        names = ", ".join(name for name, _ in left)
-        warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=4)
