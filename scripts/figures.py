@@ -31,8 +31,6 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
-PAGE_OF = {"RecurrentPPO": "ppo", "MaskablePPO": "ppo"}
-"""Algorithms without a page of their own."""
 
 
 def load(name: str) -> Any:

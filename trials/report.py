@@ -466,7 +466,7 @@ ones.
 
 {table(("trial", "commit", "date", "command"), rows)}
 
-How runs resume is described under [resume](resume.md), the files under [files](files.md).
+How runs resume is described under [resume](resume.md), the files under [file format](file-format.md).
 
 {sections}
 ## What was not tested

@@ -2,7 +2,7 @@
 
 Reading builds every object from rejeu's own classes and from the caller's expectations; the file supplies numbers and
 plain JSON values only, and names, shapes and dtypes must match. There is no second, laxer way to read. What a file holds
-and what is promised of it is said in ``docs/files.md``.
+and what is promised of it is said in ``docs/file-format.md``.
 
 Checksums tell damage by chance: any few bits that flip are noticed. They are no protection against someone who changes a
 file on purpose and the checksums with it; against that, nothing in a file is ever run.
