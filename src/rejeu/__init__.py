@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rejeu.core import Algorithm, Clock, Rollout, Transition
     from rejeu.envs.checker import check_env
     from rejeu.envs.make import make_vec, make_vector
-    from rejeu.envs.monitor import Monitor
     from rejeu.envs.time_limit import TimeLimitTerminates
     from rejeu.errors import (
         BadEnvironmentError,
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from rejeu.reporting import plots
     from rejeu.reporting.evaluation import Evaluation, evaluate_policy
     from rejeu.reporting.video import record_video, show_videos
+    from rejeu.sb3.common.monitor import Monitor
     from rejeu.schedules import Exponential, Linear
 
 __version__ = "0.1.0"
@@ -55,7 +55,7 @@ _MODULES = {
     "rejeu.core": "Algorithm Clock Rollout Transition",
     "rejeu.envs.checker": "check_env",
     "rejeu.envs.make": "make_vec make_vector",
-    "rejeu.envs.monitor": "Monitor",
+    "rejeu.sb3.common.monitor": "Monitor",
     "rejeu.envs.time_limit": "TimeLimitTerminates",
     "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",

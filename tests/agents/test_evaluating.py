@@ -9,10 +9,10 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
-from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.make import InProcess, make_vector
 from rejeu.hooks import BaseCallback, EvalCallback
 from rejeu.reporting.evaluation import evaluate_policy
+from rejeu.sb3.common.vec_env import DummyVecEnv
 from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
 
@@ -269,7 +269,7 @@ def test_eval_callback_keeps_to_the_masks(masked):
 
 
 def test_an_evaluation_whose_masks_cannot_be_reached_is_refused_before_training(masked):
-    from rejeu.envs.vec_wrappers import VecMonitor
+    from rejeu.sb3.common.vec_env import VecMonitor
 
     with pytest.raises(TypeError, match="the masks of SelfResetting cannot be reached"):
         masked.learn(12, callback=EvalCallback(VecMonitor(DummyVecEnv([One])), eval_freq=12))

@@ -136,11 +136,11 @@ from rejeu.agents import AGENTS
 from rejeu.algorithms import config as configs
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
-from rejeu.envs.auto_reset import DummyVecEnv, VecVideoRecorder
 from rejeu.envs.make import InProcess
 from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.io import checkpoint
 from rejeu.reporting.logging import Console, CsvFile
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter, Reach, Sampled
 from tests.every_agent import KINDS, env_of, shared_functions, small

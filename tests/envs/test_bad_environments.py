@@ -13,16 +13,14 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 import rejeu
 from rejeu import presets
 from rejeu.cli import main
-from rejeu.envs.auto_reset import DummyVecEnv
 from rejeu.envs.checker import findings
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
-from rejeu.envs.subproc import SubprocVecEnv
-from rejeu.envs.vec_wrappers import VecMonitor
 from rejeu.envs.workers import pool
 from rejeu.errors import BadEnvironmentError
 from rejeu.loops import run
 from rejeu.loops.run import check_finite
+from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac
 

@@ -178,7 +178,7 @@ def test_only_environments_made_here_are_closed(lamp, tmp_path):
 
 def test_own_environment_is_made_again_with_its_arguments_and_wrappers(tmp_path):
     import rejeu
-    from rejeu.envs.monitor import Monitor
+    from rejeu.sb3.common.monitor import Monitor
 
     gym.register("Lamp-v0", f"{__name__}:Lamp", max_episode_steps=2)
     try:

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.envs.make_vec_env import make_vec_env
-from rejeu.envs.vec_normalize import VecNormalize
 from rejeu.hooks import (
     BaseCallback,
     CallbackList,
@@ -23,6 +21,8 @@ from rejeu.hooks import (
     StopTrainingOnRewardThreshold,
 )
 from rejeu.reporting.logging import CsvFile, Logger, configure
+from rejeu.sb3.common.env_util import make_vec_env
+from rejeu.sb3.common.vec_env import VecNormalize
 from tests.golden.vec_env_script import Walk
 from tests.sb3.test_vec_env import taught
 
@@ -186,7 +186,7 @@ def test_statistics_are_shared_with_the_evaluation():
     np.testing.assert_array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
     assert eval_env.ret_rms.count == env.ret_rms.count
     assert evaluate.last_mean_reward == 6.0
-    with pytest.raises(ValueError, match="wrap both alike"):
+    with pytest.raises(ValueError, match="wrap both in the same way"):
         agent.learn(16, callback=EvalCallback(make_vec_env(Walk, 1), eval_freq=8))
 
 

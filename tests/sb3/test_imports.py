@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.envs.auto_reset import DummyVecEnv, VecVideoRecorder, tile
 from rejeu.reporting.video import record_video, show_videos
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
+from rejeu.sb3.common.vec_env.base_vec_env import tile_images
 from tests.reporting.test_video import Lamp, decode
 
 
@@ -267,7 +268,7 @@ def test_several_environments_are_shown_side_by_side(tmp_path):
 
 def test_tiles_fill_row_by_row():
     pictures = [np.full((1, 1, 3), value, np.uint8) for value in (1, 2, 3)]
-    assert tile(pictures)[..., 0].tolist() == [[1, 2], [3, 0]]
+    assert tile_images(pictures)[..., 0].tolist() == [[1, 2], [3, 0]]
 
 
 def test_recorder_hands_on_what_it_does_not_do_itself(tmp_path):

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu.envs.monitor import Monitor, monitor_path
+from rejeu.sb3.common.monitor import Monitor, monitor_path
 
 
 class Stairs(gym.Env):

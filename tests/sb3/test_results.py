@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
-from rejeu.results import (
+from rejeu.sb3.common.monitor import LoadMonitorResultsError
+from rejeu.sb3.common.results_plotter import (
     X_EPISODES,
     X_TIMESTEPS,
     X_WALLTIME,
-    LoadMonitorResultsError,
     load_results,
     plot_curves,
     ts2xy,
@@ -45,9 +45,9 @@ def test_a_folder_without_monitor_files_is_an_error(tmp_path):
     with pytest.raises(LoadMonitorResultsError, match=r"no files \*monitor\.csv"):
         load_results(tmp_path)
     (tmp_path / "x.monitor.csv").write_text("something else\n")
-    with pytest.raises(LoadMonitorResultsError, match="no file that Monitor wrote"):
+    with pytest.raises(LoadMonitorResultsError, match="was not written by Monitor"):
         load_results(tmp_path)
     (tmp_path / "x.monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n')
     (tmp_path / "y.monitor.csv").write_text('#{"t_start": 0}\nr,l,t,won\n')
-    with pytest.raises(LoadMonitorResultsError, match="the files before it"):
+    with pytest.raises(LoadMonitorResultsError, match="other files have"):
         load_results(tmp_path)

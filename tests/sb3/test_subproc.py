@@ -8,10 +8,9 @@ import signal
 import numpy as np
 import pytest
 
-from rejeu.envs.monitor import Monitor
-from rejeu.envs.subproc import SubprocVecEnv
-from rejeu.envs.vec_wrappers import VecMonitor
 from rejeu.errors import WorkerError
+from rejeu.sb3.common.monitor import Monitor
+from rejeu.sb3.common.vec_env import SubprocVecEnv, VecMonitor
 from tests.golden.vec_env_script import Walk
 from tests.sb3.test_vec_env import replayed, walks
 

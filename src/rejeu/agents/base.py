@@ -29,11 +29,9 @@ from rejeu.agents.resume import Resumed
 from rejeu.agents.run_files import RowFiles
 from rejeu.agents.training import Best, Call
 from rejeu.algorithms import config as configs
-from rejeu.envs.auto_reset import AutoResetView, around
-from rejeu.envs.make import Backend, InProcess, VectorEnv
+from rejeu.envs.adapters import vec_env_view
+from rejeu.envs.make import Backend, VectorEnv
 from rejeu.envs.masks import split
-from rejeu.envs.vec_env import VecEnv
-from rejeu.envs.vec_normalize import VecNormalize, unwrap_vec_normalize
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.hooks import BaseCallback
@@ -405,7 +403,7 @@ class Agent(ABC):
         """
         return policies.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
 
-    def get_env(self) -> VecEnv | None:
+    def get_env(self) -> Any:
         """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
 
         That is the vector environment it was given, if it was given one that resets itself; around a Gymnasium environment
@@ -418,18 +416,17 @@ class Agent(ABC):
         if not self._learning:
             self._give_up_episodes()
         if env.venv is None:
-            inside = env.envs if isinstance(env, InProcess) else []
-            env.venv = around(inside) if inside else AutoResetView(env)
+            env.venv = vec_env_view(env)
         return env.venv
 
     def set_logger(self, logger: Logger) -> None:
         """Lets rows of statistics go to the outputs of a logger, in place of console and TensorBoard."""
         self.logger = logger
 
-    def get_vec_normalize_env(self) -> VecNormalize | None:
+    def get_vec_normalize_env(self) -> Any:
         """Returns the ``VecNormalize`` around the environments it trains on, or None."""
         env = self.run.env
-        return None if env is None or env.venv is None else unwrap_vec_normalize(env.venv)
+        return None if env is None else env.vec_normalize
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Gives the agent another environment of the same spaces; its episodes start anew.

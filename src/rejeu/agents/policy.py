@@ -11,12 +11,10 @@ import jax
 import numpy as np
 
 from rejeu import spaces
-from rejeu.envs.auto_reset import identities
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
-from rejeu.envs.vec_normalize import unwrap_vec_normalize
 from rejeu.loops import finite
 from rejeu.loops.run import clock_of
 from rejeu.reporting.evaluation import Evaluation, evaluate
@@ -278,7 +276,7 @@ def lent(agent: Agent, vector: VectorEnv, seeded: bool = False) -> Iterator[None
     for the play, and gives them a seed of training again.
     """
     run = agent.run
-    shared = run.env is not None and not identities(run.env).isdisjoint(identities(vector))
+    shared = run.env is not None and not run.env.identities().isdisjoint(vector.identities())
     if shared:
         run.obs = run.action = None  # also if playing fails
     yield
@@ -302,8 +300,7 @@ def policy(agent: Agent, deterministic: bool) -> Callable[[Any, np.ndarray], np.
 
 def check_scaled(agent: Agent, vector: VectorEnv) -> None:
     """Raises ``ValueError`` if the agent learns from a ``VecNormalize`` and ``vector`` is none."""
-    has_statistics = vector.venv is not None and unwrap_vec_normalize(vector.venv) is not None
-    if agent.get_vec_normalize_env() is not None and not has_statistics:
+    if agent.get_vec_normalize_env() is not None and vector.vec_normalize is None:
         raise ValueError(
             "this agent learns in a VecNormalize, so it must be evaluated in one that has the same statistics; wrap the "
             "environment alike and use sync_envs_normalization, or let the agent scale: normalize=True"

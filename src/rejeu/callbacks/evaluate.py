@@ -11,7 +11,6 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.due import crossed, step_before
-from rejeu.envs.auto_reset import identities
 from rejeu.envs.make import VectorEnv, make_vector
 from rejeu.loops.run import Progress
 from rejeu.reporting.evaluation import Evaluation
@@ -93,7 +92,7 @@ class Evaluate:
         Raises:
             ValueError: if the environments are those that the agent trains on.
         """
-        if agent.env is not None and identities(agent.env) & identities(self.env):
+        if agent.env is not None and agent.env.identities() & self.env.identities():
             raise ValueError("Evaluate was given the environments that the agent trains on; give it others, or an id")
         root = agent.seed if self.seed is None else self.seed
         seed = int(np.random.SeedSequence([root, step, EVALUATION]).generate_state(1)[0])

@@ -18,7 +18,6 @@ import numpy as np
 
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed
-from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError
 
 SUCCESS_KEYS = ("is_success", "success")
@@ -85,8 +84,12 @@ class VectorEnv(ABC):
     """The time limit, where it is known."""
     reward_threshold: float | None = None
     """The return at which the environment counts as solved, where it declares one."""
-    venv: VecEnv | None = None
-    """The vector environment with automatic resets that these are or came from, if there is one."""
+    venv: Any = None
+    """The vector environment with automatic resets that this was made from, or that was made of it; None if there is none."""
+    wrapped_by: str | None = None
+    """Name of the outermost wrapper around the whole vector, if there is one."""
+    vec_normalize: Any = None
+    """The wrapper that normalizes what the vector returns by running statistics, if there is one."""
     _obs: Any
     """The observations last returned."""
 
@@ -159,6 +162,13 @@ class VectorEnv(ABC):
     @abstractmethod
     def goals(self) -> GoalFunctions | None:
         """Returns the goal functions, or None for environments without goals."""
+
+    def identities(self) -> set[int]:
+        """Returns the ids of the vector and, where they are known, of the environments in it.
+
+        Two vectors share environments if these sets intersect.
+        """
+        return {id(self)}
 
     @property
     def must_reset(self) -> bool:

@@ -175,6 +175,9 @@ class GymnasiumVector(VectorEnv):
             self._make_one = unwrapped.env_fns[0]
         return None if self._make_one is None else goals_module.goal_functions(self._make_one())
 
+    def identities(self) -> set[int]:
+        return {id(self), id(self.env.unwrapped)}
+
     def close(self) -> None:
         self.env.close()
 

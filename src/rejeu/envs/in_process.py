@@ -16,7 +16,6 @@ from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, reward_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
-from rejeu.envs.vec_env import VecEnv
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves, structure
 
@@ -30,7 +29,7 @@ class InProcess(VectorEnv):
 
     backend = "gymnasium"
 
-    def __init__(self, envs: Sequence[gym.Env], seed: Seed = None, venv: VecEnv | None = None) -> None:
+    def __init__(self, envs: Sequence[gym.Env], seed: Seed = None, venv: Any = None) -> None:
         if len({id(env) for env in envs}) < len(envs):
             raise ValueError(
                 "the same environment was given more than once; the function must make a new one each time"
@@ -126,6 +125,9 @@ class InProcess(VectorEnv):
 
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])
+
+    def identities(self) -> set[int]:
+        return {id(self), *(id(env.unwrapped) for env in self.envs)}
 
     def goals(self) -> GoalFunctions | None:
         return goals_module.goal_functions(self.envs[0])

@@ -1,25 +1,23 @@
 """Many environments stepped as one: :func:`make_vector` chooses and makes the backend.
 
 Each backend has a module of its own: :mod:`rejeu.envs.in_process`, :mod:`rejeu.envs.workers.vector`,
-:mod:`rejeu.envs.envpool`, :mod:`rejeu.envs.gymnasium_vector` and :mod:`rejeu.envs.self_resetting`. What they have in common
-is :mod:`rejeu.envs.base`.
+:mod:`rejeu.envs.envpool` and :mod:`rejeu.envs.gymnasium_vector`. Their common interface is :mod:`rejeu.envs.base`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal
 
 import gymnasium as gym
 
 from rejeu.envs import measuring, seeds
+from rejeu.envs.adapters import adapter_of
 from rejeu.envs.base import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.registry import maker
 from rejeu.envs.seeds import Seed
-from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.workers.pool import TIMEOUT, check_options
 from rejeu.envs.workers.vector import InWorkers
 
@@ -40,7 +38,7 @@ __all__ = [
 
 
 def make_vector(
-    env: str | gym.Env | Callable[[], gym.Env] | gym.vector.VectorEnv | VecEnv | VectorEnv,
+    env: Any,
     n_envs: int = 1,
     backend: Backend = "auto",
     seed: Seed = None,
@@ -83,7 +81,7 @@ def make_vector(
     if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
     check_workers(env, backend, worker_timeout, restart_workers)
-    if isinstance(env, VectorEnv | gym.vector.VectorEnv | VecEnv):
+    if isinstance(env, VectorEnv | gym.vector.VectorEnv) or adapter_of(env) is not None:
         n_envs = env.n_envs if isinstance(env, VectorEnv) else env.num_envs
     seed = seeds.checked(seed, n_envs)
     vector = _made(env, n_envs, backend, seed, worker_timeout, restart_workers, env_kwargs)
@@ -108,10 +106,8 @@ def _made(
     """Returns what :func:`make_vector` does, for arguments that were checked."""
     if isinstance(env, VectorEnv):
         return env
-    if isinstance(env, VecEnv):
-        from rejeu.envs.self_resetting import without_resets  # which imports this module
-
-        return without_resets(env, seed)
+    if (adapter := adapter_of(env)) is not None:
+        return adapter(env, seed)
     if isinstance(env, gym.vector.VectorEnv):
         return GymnasiumVector(env, seed)
     if isinstance(env, gym.Env):
@@ -181,4 +177,4 @@ def check_workers(env: Any, backend: Backend, worker_timeout: float | None, rest
 
 def is_maker(env: Any) -> bool:
     """Returns whether this is a function that makes environments, rather than environments."""
-    return callable(env) and not isinstance(env, gym.Env | gym.vector.VectorEnv | VecEnv | VectorEnv)
+    return callable(env) and not isinstance(env, gym.Env | gym.vector.VectorEnv | VectorEnv) and adapter_of(env) is None

@@ -11,12 +11,12 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.core import Masked
+from rejeu.envs.adapters import adapter_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
 from rejeu.envs.mask_wrapper import MASK, OBSERVATION, MaskInObservation, n_choices
 from rejeu.envs.registry import maker
 from rejeu.envs.seeds import Seed
-from rejeu.envs.vec_env import VecEnv
 from rejeu.envs.workers.pool import TIMEOUT
 from rejeu.spaces import Leaf
 
@@ -72,6 +72,9 @@ class MaskedVector(VectorEnv):
     def restore(self, saved: Any, obs: Masked) -> list[int]:
         return self.inner.restore(saved, {OBSERVATION: obs.obs, MASK: obs.mask.astype(np.int8)})
 
+    def identities(self) -> set[int]:
+        return {id(self)} | self.inner.identities()
+
     def close(self) -> None:
         self.inner.close()
 
@@ -114,7 +117,7 @@ def make_masked(
         ValueError: for worker options out of range, or ``restart_workers`` where there are no worker processes.
     """
     check_workers(env, backend, worker_timeout, restart_workers)
-    if isinstance(env, VecEnv):
+    if adapter_of(env) is not None:
         env = make_vector(env, seed=seed)
     if isinstance(env, MaskedVector):
         return env

@@ -7,7 +7,8 @@ ball, and any environment or wrapper with the two methods ::
     set_state(state)
 
 which then answer for themselves and everything inside, random numbers included; around them, the wrappers of Gymnasium and
-rejeu that are listed here. It cannot be saved of Box2D and highway-env, whose worlds are not plain data.
+rejeu that are listed here, and wrappers with the two methods ``get_wrapper_state`` and ``set_wrapper_state``, which answer
+for the wrapper alone. It cannot be saved of Box2D and highway-env, whose worlds are not plain data.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from gymnasium.envs import classic_control
 
 from rejeu.envs.ball.ball import Ball
 from rejeu.envs.mask_wrapper import MaskInObservation
-from rejeu.envs.monitor import Monitor
 
 STATELESS = (
     wrappers.ClipAction,
@@ -45,7 +45,6 @@ REMEMBERED: dict[type, tuple[str, ...]] = {
     wrappers.OrderEnforcing: ("_has_reset",),
     wrappers.PassiveEnvChecker: (),
     wrappers.RecordEpisodeStatistics: ("episode_count", "episode_returns", "episode_lengths"),
-    Monitor: ("rewards", "needs_reset", "episode_returns", "episode_lengths", "episode_times", "total_steps"),
     classic_control.CartPoleEnv: ("state", "steps_beyond_terminated"),
     classic_control.MountainCarEnv: ("state",),
     classic_control.Continuous_MountainCarEnv: ("state",),
@@ -64,8 +63,6 @@ SIZES: dict[type, int] = {
 MUJOCO = "gymnasium.envs.mujoco."
 OPTIONAL = ("state", "steps_beyond_terminated", "last_u", "_elapsed_steps")
 """Attributes that may be None, or not be there yet."""
-LISTS = ("rewards", "episode_returns", "episode_lengths", "episode_times")
-"""Attributes of a Monitor that are lists of numbers, one for each step or episode."""
 ABSENT = "absent"
 """Stands for an attribute that is not there yet, as ``last_u`` before the first step."""
 
@@ -89,6 +86,8 @@ def state_of(env: gym.Env) -> list[Any] | None:
         kind = type(layer)
         if kind in STATELESS:
             layers.append({})
+        elif saves_itself(layer):
+            layers.append(layer.get_wrapper_state())  # type: ignore[attr-defined]
         elif kind in REMEMBERED:
             layers.append({name: getattr(layer, name, ABSENT) for name in REMEMBERED[kind]})
         elif not is_mujoco(layer):
@@ -112,6 +111,8 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
         state = left.pop(0)
         if answers_for_itself(layer):
             layer.set_state(state)  # type: ignore[attr-defined]
+        elif saves_itself(layer):
+            layer.set_wrapper_state(state)  # type: ignore[attr-defined]
         elif type(layer) in STATELESS or type(layer) in REMEMBERED:
             expected = {*REMEMBERED.get(type(layer), ())} | ({"rng"} if not isinstance(layer, gym.Wrapper) else set())
             if {*state} != expected:
@@ -147,7 +148,7 @@ def is_over(env: gym.Env) -> bool:
     """Returns whether an environment must be reset before it can be stepped, as far as its layers say so."""
     layer = env
     while isinstance(layer, gym.Wrapper):
-        if isinstance(layer, Monitor) and layer.needs_reset:
+        if saves_itself(layer) and getattr(layer, "needs_reset", False):
             return True
         if isinstance(layer, wrappers.OrderEnforcing) and not layer._has_reset:
             return True
@@ -162,19 +163,18 @@ def _check_form(layer: gym.Env, name: str, value: Any) -> None:
     if name in OPTIONAL and (value is None or (isinstance(value, str) and value == ABSENT)):
         return
     if name == "state":  # an array, or after some steps a tuple of numbers
-        whole = isinstance(value, np.ndarray) or (isinstance(value, tuple) and all(map(_is_number, value)))
+        whole = isinstance(value, np.ndarray) or (isinstance(value, tuple) and all(map(is_number, value)))
         fits = whole and np.shape(value) == (SIZES[type(layer)],) and bool(np.isfinite(value).all())
-    elif name in ("_has_reset", "needs_reset"):
+    elif name == "_has_reset":
         fits = isinstance(value, bool)
-    elif isinstance(layer, Monitor) and name in LISTS:
-        fits = isinstance(value, list) and all(map(_is_number, value))
     else:
-        fits = _is_number(value) or (name == "episode_returns" and isinstance(value, np.ndarray) and value.size == 1)
+        fits = is_number(value) or (name == "episode_returns" and isinstance(value, np.ndarray) and value.size == 1)
     if not fits:
         raise ValueError(f"{name} of {type(layer).__name__} cannot be {str(value)[:40]!r}")
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Returns whether a value is a real number."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
@@ -182,6 +182,12 @@ def answers_for_itself(layer: gym.Env) -> bool:
     """Returns whether an environment or wrapper has ``get_state`` and ``set_state`` of its own."""
     has = callable(getattr(type(layer), "get_state", None)) and callable(getattr(type(layer), "set_state", None))
     return has and not is_mujoco(layer)  # whose set_state is of another form
+
+
+def saves_itself(layer: gym.Env) -> bool:
+    """Returns whether this is a wrapper with ``get_wrapper_state`` and ``set_wrapper_state``."""
+    methods = (getattr(type(layer), f"{verb}_wrapper_state", None) for verb in ("get", "set"))
+    return isinstance(layer, gym.Wrapper) and all(map(callable, methods))
 
 
 def is_mujoco(layer: gym.Env) -> bool:

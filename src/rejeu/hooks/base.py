@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from rejeu.envs.vec_env import VecEnv
 from rejeu.reporting.logging import Logger
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 
 if TYPE_CHECKING:
     from rejeu.agents import Agent

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from rejeu.envs.auto_reset import around, identities
 from rejeu.envs.masks import make_masked
-from rejeu.envs.vec_env import VecEnv
-from rejeu.envs.vec_normalize import sync_envs_normalization
 from rejeu.hooks.base import BaseCallback, EventCallback, hooked
 from rejeu.io import atomic
 from rejeu.io.checkpoint import SUFFIX
 from rejeu.reporting.evaluation import evaluate_policy
+from rejeu.sb3.common.vec_env.adapters import dummy_vec_env, identities
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
+from rejeu.sb3.common.vec_env.vec_normalize import sync_envs_normalization
 from rejeu.validation import whole
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class EvalCallback(EventCallback):
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.parent = self
         if isinstance(eval_env, gym.Env):
-            eval_env = around([eval_env])
+            eval_env = dummy_vec_env([eval_env])
         if not isinstance(eval_env, VecEnv):
             raise TypeError(f"eval_env must be a Gymnasium or a vector environment, got {type(eval_env).__name__}")
         self.eval_env = eval_env

@@ -25,7 +25,6 @@ import numpy as np
 from rejeu.envs.make import InProcess
 from rejeu.envs.masks import shown_to
 from rejeu.envs.registry import make_env, provider, register
-from rejeu.envs.vec_env import VecEnvWrapper
 from rejeu.errors import MissingExtra
 from rejeu.interrupt import Interrupt
 from rejeu.validation import number, whole
@@ -123,9 +122,9 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
     vector = agent.env
     if vector is None:
         raise ValueError("this agent has no environment; give one: record_video(agent, path, env='parking-v0')")
-    if isinstance(vector.venv, VecEnvWrapper):
+    if vector.wrapped_by is not None:
         raise ValueError(
-            f"the agent's own environments are wrapped in {type(vector.venv).__name__}, which a new one would lack; step "
+            f"the agent's own environments are wrapped in {vector.wrapped_by}, which a new one would lack; step "
             "them in a VecVideoRecorder, or give env="
         )
     spec = vector.envs[0].spec if isinstance(vector, InProcess) else None

@@ -64,7 +64,7 @@ class Worker:
 
     def ask(self, request: str, *arguments: Any) -> None:
         """Sends a request, whose answer is to be fetched."""
-        self.asked = request
+        self.asked = arguments[0].__name__.strip("_") if request == "call" else request
         process.send(self.pipe, (request, *arguments))
 
     def answer(self, deadline: float | None) -> Any:
@@ -130,6 +130,7 @@ class Workers:
         timeout: float | None = TIMEOUT,
         restarts: int = 0,
         shared: Callable[[Any], tuple[Any, ...]] = lambda context: (None,),
+        preload: str | None = None,
     ) -> None:
         """Starts all of them, and waits until their environments are made.
 
@@ -139,6 +140,7 @@ class Workers:
             timeout: seconds to wait for the answers to a request; None: for ever.
             restarts: how many lost workers are replaced.
             shared: given the context, returns what else each worker gets.
+            preload: name of a further module that the workers need.
 
         Raises:
             TypeError: if a function cannot be sent.
@@ -158,7 +160,7 @@ class Workers:
         self._context: Any = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
             # Imported once, in the server: a worker is then there in milliseconds. It starts no threads.
-            self._context.set_forkserver_preload([process.__name__])
+            self._context.set_forkserver_preload([process.__name__, *([] if preload is None else [preload])])
         self._shared = shared(self._context)
         self.timeout = timeout
         self.restarts_left = self._restarts = restarts

@@ -15,7 +15,6 @@ import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.envs import answers, conversions, faults, snapshot
-from rejeu.envs.vec_env import is_wrapped
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves
 
@@ -71,7 +70,7 @@ def serve(
         pipe: to the process that asks.
         make: makes the environment.
         number: of the environment.
-        buffers: shared memory for the observations of ``n_envs`` environments; None: they are sent through the pipe.
+        buffers: shared memory for the observations of ``n_envs`` environments; None if there is none.
         n_envs: how many there are in all.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the main process, which may want another step
@@ -98,8 +97,6 @@ def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None
     """Returns what the environment answers, or how it failed."""
     try:
         answer = _answer(env, *request)
-        if put is None and request[0] in ("step and reset", "reset"):
-            return answers.kept(env.observation_space, answer[0]), *answer[1:]
         if put is None or request[0] not in ("step", "reset"):
             return answer
         put(number, answer[0])
@@ -107,8 +104,7 @@ def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None
     except BadEnvironmentError as error:
         return Failure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # whatever the environment raises
-        asked = request[0] in ("get_attr", "set_attr", "env_method")
-        kind: Any = "no attribute" if asked and isinstance(error, AttributeError) else "raised"
+        kind: Literal["raised", "no attribute"] = "no attribute" if isinstance(error, AttributeError) else "raised"
         return Failure(kind, str(error), traceback.format_exc())
 
 
@@ -116,28 +112,16 @@ def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
     """Returns what an environment says to one request."""
     if name == "step":
         return checked_step(env, arguments[0])
-    if name == "step and reset":
-        return _step_and_reset(env, arguments[0])
     if name == "reset":
         return answers.reset(env, *arguments)
-    if name == "render":
-        from rejeu.reporting.video import rgb_frame  # which imports what imports this module
-
-        return env.render() if env.render_mode == "human" else rgb_frame(env)
     if name == "snapshot":
         return snapshot.state_of(env)
     if name == "restore":
         snapshot.restore(env, arguments[0])
         return snapshot.is_over(env)
-    if name == "get_attr":
-        return env.get_wrapper_attr(arguments[0])
-    if name == "set_attr":
-        return env.set_wrapper_attr(*arguments)
-    if name == "env_method":
-        method, args, kwargs = arguments
-        return env.get_wrapper_attr(method)(*args, **kwargs)
-    assert name == "is_wrapped", name
-    return is_wrapped(env, arguments[0])
+    assert name == "call", name
+    function, *rest = arguments
+    return function(env, *rest)
 
 
 def checked_step(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -151,14 +135,3 @@ def checked_step(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dic
     if fault is not None:
         raise BadEnvironmentError(fault)
     return conversions.numbers_of(answer)
-
-
-def _step_and_reset(env: gym.Env, action: Any) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
-    """Steps an environment, resets it if the episode has ended, and returns also what the reset said."""
-    obs, reward, terminated, truncated, info = checked_step(env, action)
-    info = {**info, "TimeLimit.truncated": truncated and not terminated}
-    reset_info: dict[str, Any] = {}
-    if terminated or truncated:
-        info["terminal_observation"] = answers.kept(env.observation_space, obs)
-        obs, reset_info = answers.reset(env)
-    return obs, reward, terminated or truncated, info, reset_info

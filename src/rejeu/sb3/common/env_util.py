@@ -1,6 +1,108 @@
-"""Making environments."""
+"""Functions that make and inspect environments."""
 
-from rejeu.envs.make_vec_env import make_vec_env
-from rejeu.envs.vec_env import is_wrapped, unwrap_wrapper
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from rejeu.envs.registry import make_env
+from rejeu.sb3.common.monitor import Monitor
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, is_wrapped, unwrap_wrapper
+from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
+from rejeu.validation import whole
 
 __all__ = ["is_wrapped", "make_vec_env", "unwrap_wrapper"]
+
+
+def make_vec_env(
+    env_id: str | Callable[..., gym.Env],
+    n_envs: int = 1,
+    seed: int | None = None,
+    start_index: int = 0,
+    monitor_dir: str | Path | None = None,
+    wrapper_class: Callable[..., gym.Env] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    vec_env_cls: Callable[..., VecEnv] | None = None,
+    vec_env_kwargs: Mapping[str, Any] | None = None,
+    monitor_kwargs: Mapping[str, Any] | None = None,
+    wrapper_kwargs: Mapping[str, Any] | None = None,
+) -> VecEnv:
+    """Returns a vector environment of ``n_envs`` environments, each wrapped in a ``Monitor``.
+
+    With EnvPool installed, :func:`rejeu.make_vector` is faster for environments that EnvPool has.
+
+    Args:
+        env_id: an id, whose environments are made with ``render_mode="rgb_array"`` where they accept it; or a function or
+            class that returns an environment.
+        n_envs: number of environments.
+        seed: environment i is first reset with ``seed + i``. An agent that trains in them uses its own seed instead.
+        start_index: number of the first environment, used for the names of the files in ``monitor_dir`` and the seeds of
+            the action spaces.
+        monitor_dir: folder in which each ``Monitor`` writes ``{number}.monitor.csv``; created if missing. None writes
+            no files.
+        wrapper_class: wrapper of each environment, outside of the ``Monitor``.
+        env_kwargs: arguments of the environment.
+        vec_env_cls: :class:`DummyVecEnv` (None), ``SubprocVecEnv`` or another class that takes a list of functions.
+        vec_env_kwargs: arguments of that class.
+        monitor_kwargs: arguments of the ``Monitor``.
+        wrapper_kwargs: arguments of the wrapper.
+
+    >>> env = make_vec_env("CartPole-v1", n_envs=4, seed=0)
+    >>> env.reset().shape
+    (4, 4)
+    """
+    n_envs = whole("n_envs", n_envs, least=1)
+    folder = None if monitor_dir is None else Path(monitor_dir)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    makers = [
+        _Maker(
+            env_id,
+            dict(env_kwargs or {}),
+            None if seed is None else seed + rank,
+            None if folder is None else folder / str(rank),
+            dict(monitor_kwargs or {}),
+            wrapper_class,
+            dict(wrapper_kwargs or {}),
+        )
+        for rank in range(start_index, start_index + n_envs)
+    ]
+    venv = (DummyVecEnv if vec_env_cls is None else vec_env_cls)(makers, **(vec_env_kwargs or {}))
+    venv.seed(seed)
+    return venv
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Makes one environment; can be pickled."""
+
+    env_id: str | Callable[..., gym.Env]
+    env_kwargs: dict[str, Any]
+    action_seed: int | None
+    monitor_path: Path | None
+    monitor_kwargs: dict[str, Any]
+    wrapper: Callable[..., gym.Env] | None
+    wrapper_kwargs: dict[str, Any]
+
+    def __call__(self) -> gym.Env:
+        env = self._make()
+        if self.action_seed is not None:
+            env.action_space.seed(self.action_seed)
+        env = Monitor(env, self.monitor_path, **self.monitor_kwargs)
+        return env if self.wrapper is None else self.wrapper(env, **self.wrapper_kwargs)
+
+    def _make(self) -> gym.Env:
+        if not isinstance(self.env_id, str):
+            return self.env_id(**self.env_kwargs)
+        if "render_mode" in self.env_kwargs:
+            return make_env(self.env_id, **self.env_kwargs)
+        try:
+            return make_env(self.env_id, render_mode="rgb_array", **self.env_kwargs)
+        except TypeError as error:
+            if "render_mode" not in str(error):
+                raise
+            return make_env(self.env_id, **self.env_kwargs)

@@ -1,6 +1,253 @@
-"""Watching episodes."""
+"""A wrapper that records return, length and time of every episode, and the reader of its files."""
 
-from rejeu.envs.monitor import Monitor
-from rejeu.results import LoadMonitorResultsError, get_monitor_files, load_results
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.envs.snapshot import is_number
+from rejeu.io import atomic
+from rejeu.io.failed_writes import FailedWrites
 
 __all__ = ["LoadMonitorResultsError", "Monitor", "get_monitor_files", "load_results"]
+
+SUFFIX = "monitor.csv"
+COUNTS = ("needs_reset", "total_steps")
+LISTS = ("rewards", "episode_returns", "episode_lengths", "episode_times")
+"""Attributes of a Monitor that hold one number for each step or episode."""
+
+
+class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """Adds ``info["episode"] = {"r": return, "l": length, "t": seconds since construction}`` to an episode's last step.
+
+    Agents do not need a Monitor; it is for scripts that read its attributes or its file. The file is CSV: one line
+    ``#{"t_start": ..., "env_id": ...}``, then the columns ``r,l,t`` and the keywords. It is opened for each row and closed
+    again. Rows that cannot be written are kept, with a warning, and written later.
+
+    Args:
+        env: the environment.
+        filename: path of the CSV file. ``.monitor.csv`` is added unless it ends in ``monitor.csv``; for a folder the file
+            is ``monitor.csv`` in it. None writes no file.
+        allow_early_resets: whether ``reset`` may be called before the episode has ended.
+        reset_keywords: arguments of ``reset`` to record with the episode; each call must then pass them.
+        info_keywords: keys of the last step's info to record with the episode.
+        override_existing: replace an existing file; False appends to it. (Stable-Baselines3 then never writes the first
+            two lines; here they are written if there is no file yet.)
+
+    >>> env = Monitor(gym.make("CartPole-v1"))
+    >>> _ = env.reset(seed=0)
+    >>> while not (step := env.step(0))[2]:
+    ...     pass
+    >>> step[4]["episode"]["l"] == env.get_total_steps()
+    True
+    """
+
+    EXT = SUFFIX
+
+    def __init__(
+        self,
+        env: gym.Env,
+        filename: str | Path | None = None,
+        allow_early_resets: bool = True,
+        reset_keywords: Sequence[str] = (),
+        info_keywords: Sequence[str] = (),
+        override_existing: bool = True,
+    ) -> None:
+        # A copy made from the spec must not write to the same file.
+        gym.utils.RecordConstructorArgs.__init__(self, filename=None, allow_early_resets=allow_early_resets)
+        gym.Wrapper.__init__(self, env)
+        self.t_start = time.time()
+        self.reset_keywords, self.info_keywords = tuple(reset_keywords), tuple(info_keywords)
+        self.allow_early_resets = allow_early_resets
+        self.rewards: list[float] = []
+        self.needs_reset = True
+        self.episode_returns: list[float] = []
+        self.episode_lengths: list[int] = []
+        self.episode_times: list[float] = []
+        self.total_steps = 0
+        self.current_reset_info: dict[str, Any] = {}
+        self.path = None if filename is None else monitor_path(filename)
+        self._failed_writes = FailedWrites()
+        if self.path is not None and (override_existing or not self.path.exists()):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            env_id = str(env.spec.id if env.spec is not None else None)
+            with self.path.open("w", newline="\n", encoding="utf-8") as file:
+                file.write(f"#{json.dumps({'t_start': self.t_start, 'env_id': env_id})}\n")
+                csv.writer(file).writerow(self._columns())
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Resets the environment with the arguments given.
+
+        Raises:
+            RuntimeError: if the episode has not ended and early resets are not allowed.
+            ValueError: if one of ``reset_keywords`` is missing.
+        """
+        if not self.allow_early_resets and not self.needs_reset:
+            raise RuntimeError(
+                "reset before the episode has ended; to allow it use Monitor(env, allow_early_resets=True)"
+            )
+        for key in self.reset_keywords:
+            if kwargs.get(key) is None:
+                raise ValueError(f"reset needs the argument {key!r}, one of reset_keywords={self.reset_keywords}")
+            self.current_reset_info[key] = kwargs[key]
+        self.rewards = []
+        self.needs_reset = False
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment.
+
+        Raises:
+            RuntimeError: if the episode has ended, or before the first reset.
+            ValueError: if one of ``info_keywords`` is missing from the info of an episode's last step.
+        """
+        if self.needs_reset:
+            raise RuntimeError("step after the episode has ended; call reset() first")
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.rewards.append(float(reward))
+        self.total_steps += 1
+        if terminated or truncated:
+            self.needs_reset = True
+            info["episode"] = self._end_episode(info)
+        return obs, reward, terminated, truncated, info
+
+    def _end_episode(self, info: dict[str, Any]) -> dict[str, Any]:
+        total, length, seconds = sum(self.rewards), len(self.rewards), time.time() - self.t_start
+        self.episode_returns.append(total)
+        self.episode_lengths.append(length)
+        self.episode_times.append(seconds)
+        for key in self.info_keywords:
+            if key not in info:
+                raise ValueError(f"info_keywords: the info of an episode's last step has no {key!r}, only {[*info]}")
+        row = {"r": round(total, 6), "l": length, "t": round(seconds, 6)}
+        row |= {key: info[key] for key in self.info_keywords} | self.current_reset_info
+        if self.path is not None:
+            line = csv_line(row, self._columns())
+            self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), line)
+        return row
+
+    def _columns(self) -> tuple[str, ...]:
+        return ("r", "l", "t", *self.reset_keywords, *self.info_keywords)
+
+    def get_wrapper_state(self) -> dict[str, Any]:
+        """Returns what the wrapper stores, for the checkpoint of a run."""
+        return {name: vars(self)[name] for name in (*COUNTS, *LISTS)}
+
+    def set_wrapper_state(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`get_wrapper_state` returned.
+
+        Raises:
+            ValueError: if it is damaged.
+        """
+        if {*state} != {*COUNTS, *LISTS}:
+            raise ValueError(
+                f"the state of {type(self).__name__} has {sorted(state)}, expected {sorted((*COUNTS, *LISTS))}"
+            )
+        valid = {name: isinstance(state[name], list) and all(map(is_number, state[name])) for name in LISTS}
+        valid |= {"needs_reset": isinstance(state["needs_reset"], bool), "total_steps": is_number(state["total_steps"])}
+        for name, value in state.items():
+            if not valid[name]:
+                raise ValueError(f"{name} of {type(self).__name__} cannot be {str(value)[:40]!r}")
+        vars(self).update(state)
+
+    def close(self) -> None:
+        """Writes rows that could not be written before, if possible, and closes the environment."""
+        self._failed_writes.retry()
+        self._failed_writes.warn()
+        super().close()
+
+    def get_total_steps(self) -> int:
+        """Returns the total number of steps."""
+        return self.total_steps
+
+    def get_episode_rewards(self) -> list[float]:
+        """Returns the return of each finished episode."""
+        return self.episode_returns
+
+    def get_episode_lengths(self) -> list[int]:
+        """Returns the length of each finished episode."""
+        return self.episode_lengths
+
+    def get_episode_times(self) -> list[float]:
+        """Returns the end of each finished episode, in seconds since construction."""
+        return self.episode_times
+
+
+def csv_line(row: Mapping[str, Any], columns: Sequence[str]) -> bytes:
+    """Returns a row as a line of a CSV file."""
+    text = io.StringIO()
+    csv.DictWriter(text, columns).writerow(row)
+    return text.getvalue().encode()
+
+
+def monitor_path(filename: str | Path) -> Path:
+    """Returns the file that ``Monitor(env, filename)`` writes to.
+
+    >>> monitor_path("/logs/run").name
+    'run.monitor.csv'
+    """
+    path = Path(filename).absolute()
+    if path.name.endswith(SUFFIX):
+        return path
+    return path / SUFFIX if path.is_dir() else path.with_name(f"{path.name}.{SUFFIX}")
+
+
+class LoadMonitorResultsError(Exception):
+    """Raised if there are no monitor files, or one cannot be read."""
+
+
+def get_monitor_files(path: str | Path) -> list[str]:
+    """Returns the monitor files of a folder, sorted."""
+    return sorted(str(file) for file in Path(path).glob(f"*{SUFFIX}"))
+
+
+def load_results(path: str | Path) -> np.recarray:
+    """Returns the episodes of all monitor files of a folder, in the order in which they ended.
+
+    A NumPy record array: ``table["r"]`` or ``table.r`` are returns, ``l`` lengths, ``t`` seconds since the first file was
+    created, followed by the other columns of the files. ``pandas.DataFrame(table)`` converts it to a data frame.
+
+    Raises:
+        LoadMonitorResultsError: if there are none, or their columns differ.
+    """
+    files = get_monitor_files(path)
+    if not files:
+        raise LoadMonitorResultsError(f"there are no files *{SUFFIX} in {path}; Monitor(env, folder) writes them")
+    starts, rows, columns = [], [], None
+    for name in files:
+        with open(name, newline="", encoding="utf-8") as file:
+            try:
+                start = float(json.loads(file.readline().removeprefix("#"))["t_start"])
+                reader = csv.DictReader(file)
+                found = [{**row, "t": float(row["t"]) + start} for row in reader]
+            except (ValueError, KeyError, TypeError) as error:
+                raise LoadMonitorResultsError(f"{name} was not written by Monitor: {error}") from None
+        if columns not in (None, reader.fieldnames):
+            raise LoadMonitorResultsError(f"{name} has the columns {reader.fieldnames}, other files have {columns}")
+        columns = reader.fieldnames
+        starts.append(start)
+        rows += found
+    assert columns is not None
+    rows.sort(key=lambda row: row["t"])
+    arrays = {key: _column([row[key] for row in rows]) for key in columns}
+    arrays["t"] = np.array([row["t"] for row in rows], np.float64) - min(starts)
+    return np.rec.fromarrays([*arrays.values()], names=list(arrays))  # type: ignore[call-overload]
+
+
+def _column(values: list[Any]) -> np.ndarray:
+    """Returns values as integers if possible, else as floats, else as strings."""
+    for kind in (np.int64, np.float64):
+        try:
+            return np.array(values, dtype=kind)
+        except ValueError:
+            continue
+    return np.array(values, dtype=str)

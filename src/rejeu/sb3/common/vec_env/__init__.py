@@ -1,10 +1,16 @@
-"""Vector environments that reset themselves."""
+"""Vector environments and their wrappers."""
 
-from rejeu.envs.auto_reset import DummyVecEnv, VecVideoRecorder
-from rejeu.envs.subproc import SubprocVecEnv
-from rejeu.envs.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped, unwrap_vec_wrapper
-from rejeu.envs.vec_normalize import VecNormalize, sync_envs_normalization, unwrap_vec_normalize
-from rejeu.envs.vec_wrappers import VecCheckNan, VecExtractDictObs, VecFrameStack, VecMonitor, VecTransposeImage
+from rejeu.sb3.common.vec_env import adapters
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped, unwrap_vec_wrapper
+from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
+from rejeu.sb3.common.vec_env.subproc_vec_env import SubprocVecEnv
+from rejeu.sb3.common.vec_env.vec_check_nan import VecCheckNan
+from rejeu.sb3.common.vec_env.vec_extract_dict_obs import VecExtractDictObs
+from rejeu.sb3.common.vec_env.vec_frame_stack import VecFrameStack
+from rejeu.sb3.common.vec_env.vec_monitor import VecMonitor
+from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize, sync_envs_normalization, unwrap_vec_normalize
+from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
+from rejeu.sb3.common.vec_env.vec_video_recorder import VecVideoRecorder
 
 __all__ = [
     "DummyVecEnv",
@@ -18,6 +24,7 @@ __all__ = [
     "VecNormalize",
     "VecTransposeImage",
     "VecVideoRecorder",
+    "adapters",
     "is_vecenv_wrapped",
     "sync_envs_normalization",
     "unwrap_vec_normalize",

@@ -1,5 +1,338 @@
-"""One of the vector environments."""
+"""Base classes of Stable-Baselines3's vector environments and of their wrappers.
 
-from rejeu.envs.vec_env import VecEnv, VecEnvWrapper
+``step`` returns observations, rewards, dones and infos. Where an episode ended, the environment is reset within the step:
+the observation is the first of the next episode, ``info["terminal_observation"]`` is the last of the ended one, and
+``info["TimeLimit.truncated"]`` says whether only a time limit ended it. Agents accept such an environment and read the
+true next observations from the infos.
+"""
 
-__all__ = ["VecEnv", "VecEnvWrapper"]
+from __future__ import annotations
+
+import copy
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.errors import MissingExtra
+from rejeu.reporting.text import counted
+
+__all__ = [
+    "VecEnv",
+    "VecEnvWrapper",
+    "is_vecenv_wrapped",
+    "is_wrapped",
+    "tile_images",
+    "unwrap_vec_wrapper",
+    "unwrap_wrapper",
+]
+
+TERMINAL_OBSERVATION = "terminal_observation"
+"""Key of the info that holds the last observation of an episode."""
+TIME_LIMIT_TRUNCATED = "TimeLimit.truncated"
+"""Key of the info that says whether only a time limit ended the episode."""
+Indices = int | Iterable[int] | None
+"""Which environments: one, several, or None for all."""
+StepResult = tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]
+"""Observations ``(num_envs, ...)``, rewards ``float32 (num_envs,)``, dones ``bool (num_envs,)`` and infos."""
+
+
+class VecEnv(ABC):
+    """``num_envs`` environments that are reset within the step that ends an episode. Abstract.
+
+    Subclass it to wrap a simulator that steps many environments at once; agents accept an instance as ``env``.
+
+    Args:
+        num_envs: number of environments.
+        observation_space: observation space of one environment.
+        action_space: action space of one environment.
+    """
+
+    metadata: dict[str, Any]
+    """Metadata of the environments."""
+    render_mode: str | None
+    """Render mode that the environments were made with."""
+
+    def __init__(self, num_envs: int, observation_space: gym.Space, action_space: gym.Space) -> None:
+        self.num_envs = num_envs
+        self.observation_space, self.action_space = observation_space, action_space
+        self.metadata, self.render_mode = {}, None
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+        """Info returned by the last ``reset`` of each environment."""
+        self._seeds: list[int | None] = [None] * num_envs
+        self._options: list[dict[str, Any] | None] = [None] * num_envs
+
+    @abstractmethod
+    def reset(self) -> Any:
+        """Resets every environment and returns the observations ``(num_envs, ...)``."""
+
+    @abstractmethod
+    def step_async(self, actions: Any) -> None:
+        """Starts a step with one action for each environment."""
+
+    @abstractmethod
+    def step_wait(self) -> StepResult:
+        """Waits for the step started by :meth:`step_async`; returns the same as :meth:`step`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Closes the environments."""
+
+    @abstractmethod
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Returns an attribute of each environment."""
+
+    @abstractmethod
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Sets an attribute of each environment."""
+
+    @abstractmethod
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of each environment and returns the results."""
+
+    @abstractmethod
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Returns for each environment whether it is wrapped in that class."""
+
+    def __repr__(self) -> str:
+        spaces = f"observations {self.observation_space}, actions {self.action_space}"
+        return f"<{type(self).__name__}: {counted(self.num_envs, 'environment')}, {spaces}>"
+
+    def step(self, actions: Any) -> StepResult:
+        """Steps every environment and returns observations, rewards, dones and infos.
+
+        Where an episode ended, the observation is the first of the next episode, and ``info["terminal_observation"]`` is
+        the last of the ended one. ``info["TimeLimit.truncated"]`` says whether only a time limit ended it.
+
+        Args:
+            actions: one for each environment, within the action space.
+        """
+        self.step_async(actions)
+        return self.step_wait()
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Returns whether the environments have the attribute."""
+        try:
+            self.get_attr(attr_name)
+        except AttributeError:
+            return False
+        return True
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seeds the next :meth:`reset`: environment i gets ``seed + i``. Returns the seeds."""
+        first = int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else int(seed)
+        self._seeds = [first + i for i in range(self.num_envs)]
+        return list(self._seeds)
+
+    def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
+        """Sets the options of the next :meth:`reset`: one dict for all environments, or one for each."""
+        one_for_all = options is None or isinstance(options, dict)
+        each: list[Any] = [options] * self.num_envs if one_for_all else list(options or ())
+        self._options = copy.deepcopy(each)
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Returns an image of each environment, ``uint8 (height, width, 3)``.
+
+        Raises:
+            NotImplementedError: if the class does not implement it.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not define get_images, so it cannot be rendered")
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """Returns the images of all environments as one, ``uint8 (height, width, 3)``, or shows it and returns None.
+
+        Args:
+            mode: ``"rgb_array"`` returns the image, ``"human"`` shows it in a window; None uses the mode that the
+                environments were made with.
+
+        Raises:
+            ValueError: if the render mode of the environments does not allow it.
+        """
+        mode = self.render_mode if mode is None else mode
+        if mode == "human" and self.render_mode == "human":
+            self.env_method("render")
+            return None
+        if self.render_mode != "rgb_array" or mode not in ("rgb_array", "human"):
+            raise ValueError(
+                f"render(mode={mode!r}): the environments were made with render_mode={self.render_mode!r}; "
+                "make them with render_mode='rgb_array'"
+            )
+        image = tile_images([one for one in self.get_images() if one is not None])
+        if mode == "rgb_array":
+            return image
+        show(image)
+        return None
+
+    @property
+    def unwrapped(self) -> VecEnv:
+        """The vector environment without its wrappers."""
+        return self.venv.unwrapped if isinstance(self, VecEnvWrapper) else self
+
+    def _reset_seeds(self) -> None:
+        self._seeds = [None] * self.num_envs
+
+    def _reset_options(self) -> None:
+        self._options = [None] * self.num_envs
+
+    def _get_indices(self, indices: Indices) -> list[int]:
+        chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
+        return list(chosen)
+
+
+class VecEnvWrapper(VecEnv):
+    """A wrapper of a vector environment. Abstract: subclasses implement :meth:`reset` and :meth:`step_wait`.
+
+    Everything else, including unknown attributes, is forwarded to ``venv``. A subclass that changes observations must
+    also change ``infos[i]["terminal_observation"]``, from which agents read the last observation of an episode.
+
+    Args:
+        venv: the vector environment.
+        observation_space: observation space of one environment; None uses that of ``venv``.
+        action_space: action space of one environment; None uses that of ``venv``.
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        observation_space: gym.Space | None = None,
+        action_space: gym.Space | None = None,
+    ) -> None:
+        if not isinstance(venv, VecEnv):
+            raise TypeError(
+                f"{type(self).__name__} wraps a vector environment, got {type(venv).__name__}; "
+                "try DummyVecEnv([lambda: env])"
+            )
+        self.venv = venv
+        super().__init__(
+            venv.num_envs,
+            venv.observation_space if observation_space is None else observation_space,
+            venv.action_space if action_space is None else action_space,
+        )
+        self.metadata, self.render_mode = venv.metadata, venv.render_mode
+        self.reset_infos = venv.reset_infos
+
+    def step_async(self, actions: Any) -> None:
+        """Starts a step with one action for each environment."""
+        self.venv.step_async(actions)
+
+    def close(self) -> None:
+        """Closes the environments."""
+        self.venv.close()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seeds the next reset of the environments and returns the seeds."""
+        return self.venv.seed(seed)
+
+    def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
+        """Sets the options of the next reset of the environments."""
+        self.venv.set_options(options)
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Returns an image of each environment."""
+        return self.venv.get_images()
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """Renders the environments; see :meth:`VecEnv.render`."""
+        return self.venv.render(mode)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Returns whether the environments have the attribute."""
+        return self.venv.has_attr(attr_name)
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Returns an attribute of each environment."""
+        return self.venv.get_attr(attr_name, indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Sets an attribute of each environment."""
+        self.venv.set_attr(attr_name, value, indices)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of each environment and returns the results."""
+        return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Returns for each environment whether it is wrapped in that class."""
+        return self.venv.env_is_wrapped(wrapper_class, indices)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "venv":
+            raise AttributeError(f"{type(self).__name__}.__init__ must call super().__init__(venv) first")
+        return getattr(self.venv, name)
+
+
+W = TypeVar("W", bound=VecEnvWrapper)
+G = TypeVar("G", bound=gym.Wrapper)
+
+
+def unwrap_vec_wrapper(env: VecEnv, vec_wrapper_class: type[W]) -> W | None:
+    """Returns the outermost wrapper of that class around a vector environment, or None."""
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, vec_wrapper_class):
+            return env
+        env = env.venv
+    return None
+
+
+def is_vecenv_wrapped(env: VecEnv, vec_wrapper_class: type[VecEnvWrapper]) -> bool:
+    """Returns whether a vector environment is wrapped in that class."""
+    return unwrap_vec_wrapper(env, vec_wrapper_class) is not None
+
+
+def unwrap_wrapper(env: gym.Env, wrapper_class: type[G]) -> G | None:
+    """Returns the outermost wrapper of that class around an environment, or None."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, wrapper_class):
+            return env
+        env = env.env
+    return None
+
+
+def is_wrapped(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> bool:
+    """Returns whether an environment is wrapped in that class."""
+    return unwrap_wrapper(env, wrapper_class) is not None
+
+
+def tile_images(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Returns images of one shape as one image, in a near-square grid whose unused cells are black."""
+    rows = math.ceil(math.sqrt(len(images)))
+    columns = math.ceil(len(images) / rows)
+    filled = [*images, *[np.zeros_like(images[0])] * (rows * columns - len(images))]
+    return np.concatenate([np.concatenate(filled[r * columns : (r + 1) * columns], axis=1) for r in range(rows)])
+
+
+def by_key(obs: Any) -> dict[str, Any]:
+    """Returns Dict observations as they are, others under the key ``""``."""
+    return obs if isinstance(obs, dict) else {"": obs}
+
+
+def is_image(space: gym.Space) -> bool:
+    """Returns whether observations are ``uint8`` images with three axes."""
+    return isinstance(space, gym.spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
+
+
+def show(image: np.ndarray) -> None:
+    """Shows an image, ``uint8 (height, width, 3)``, in a window that the first call opens.
+
+    Raises:
+        MissingExtra: if pygame is not installed.
+    """
+    try:
+        import pygame
+    except ImportError:
+        raise MissingExtra("render('human')", "pygame-ce", "play") from None
+    pygame.display.init()
+    size = image.shape[1], image.shape[0]
+    window = pygame.display.get_surface()
+    if window is None or window.get_size() != size:
+        window = pygame.display.set_mode(size)
+    pygame.event.pump()
+    window.blit(pygame.surfarray.make_surface(image.swapaxes(0, 1)), (0, 0))
+    pygame.display.flip()

@@ -1,5 +1,212 @@
-"""One of the vector environments."""
+"""Environments in worker processes, behind Stable-Baselines3's interface."""
 
-from rejeu.envs.subproc import SubprocVecEnv
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import concatenate, create_empty_array
+
+from rejeu.envs import answers
+from rejeu.envs.faults import blamed
+from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
+from rejeu.envs.workers.process import Failure, checked_step
+from rejeu.errors import BadEnvironmentError, WorkerError
+from rejeu.reporting.video import rgb_frame
+from rejeu.sb3.common.vec_env.base_vec_env import (
+    TERMINAL_OBSERVATION,
+    TIME_LIMIT_TRUNCATED,
+    Indices,
+    StepResult,
+    VecEnv,
+    is_wrapped,
+)
 
 __all__ = ["SubprocVecEnv"]
+
+
+class SubprocVecEnv(VecEnv):
+    """Environments stepped in parallel, one process each, and reset within the step that ends an episode.
+
+    Worth it where a step takes longer than a few tenths of a millisecond. The processes import the main script, so it must
+    create the environment under ``if __name__ == "__main__":``.
+
+    Args:
+        env_fns: functions that each return a new environment; lambdas are allowed.
+        start_method: start method of ``multiprocessing``; None: ``"forkserver"`` on Linux, else ``"spawn"``. ``"fork"`` is
+            unsafe once JAX has started.
+        worker_timeout: maximum time of a step or a reset in seconds; None for no limit.
+        restart_workers: how many times a process that crashed or hung is replaced. Its episode is truncated with the
+            reward 0, and its last observation is repeated as ``terminal_observation``.
+
+    Raises:
+        TypeError: if a function cannot be sent to another process.
+        BadEnvironmentError: if an environment returns invalid values.
+        WorkerError: if an environment raises, with its traceback; if a process crashes or hangs; if the main script
+            cannot be imported.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gym.Env]],
+        start_method: str | None = None,
+        worker_timeout: float | None = TIMEOUT,
+        restart_workers: int = 0,
+    ) -> None:
+        if not env_fns:
+            raise ValueError("env_fns is empty; give one function for each environment")
+        self.waiting = False
+        self._n_steps = 0
+        self._last: list[Any] = [None] * len(env_fns)
+        """The last observation of each environment."""
+        self.workers = Workers(env_fns, start_method, worker_timeout, restart_workers, preload=__name__)
+        first = self.workers.descriptions[0]
+        super().__init__(len(env_fns), first.observation_space, first.action_space)
+        self.metadata, self.render_mode = first.metadata, first.render_mode
+
+    @property
+    def closed(self) -> bool:
+        """Whether the processes have been ended."""
+        return self.workers.closed
+
+    @property
+    def processes(self) -> list[Any]:
+        """The processes, one for each environment."""
+        return [worker.process for worker in self.workers.workers]
+
+    def reset(self) -> Any:
+        """Resets every environment, with the seeds and options set before, and returns the observations."""
+        for i, (obs, info) in self._reset(range(self.num_envs)).items():
+            self._last[i], self.reset_infos[i] = obs, info
+        self._reset_seeds()
+        self._reset_options()
+        return self._stack(self._last)
+
+    def _reset(self, numbers: Sequence[int]) -> dict[int, tuple[Any, dict[str, Any]]]:
+        """Resets some environments, again where the process had to be replaced; returns observations and infos."""
+        done: dict[int, tuple[Any, dict[str, Any]]] = {}
+        while len(done) < len(numbers):
+            waiting = {i: ("call", _reset, self._seeds[i], self._options[i]) for i in numbers if i not in done}
+            self.workers.send(waiting)
+            replies = self._receive(waiting)
+            done |= {i: reply for i, reply in replies.items() if not isinstance(reply, Restarted)}
+        return done
+
+    def step_async(self, actions: Any) -> None:
+        """Starts a step with one action for each environment."""
+        if len(actions) != self.num_envs:
+            raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
+        self._n_steps += 1
+        self.workers.send({i: ("call", _step_and_reset, action) for i, action in enumerate(actions)})
+        self.waiting = True
+
+    def step_wait(self) -> StepResult:
+        """Waits for the step started by :meth:`step_async`; returns the same as :meth:`step`."""
+        self.waiting = False
+        replies = self._receive(range(self.num_envs))
+        lost = {i: reply.why for i, reply in replies.items() if isinstance(reply, Restarted)}
+        for i, (obs, reset_info) in self._reset([*lost]).items():
+            info = {TIME_LIMIT_TRUNCATED: True, TERMINAL_OBSERVATION: self._last[i], RESTARTED: lost[i]}
+            replies[i] = obs, 0.0, True, info, reset_info
+        obs, rewards, dones, infos, reset_infos = zip(*(replies[i] for i in range(self.num_envs)), strict=True)
+        for i in np.flatnonzero(dones).tolist():
+            self.reset_infos[i] = reset_infos[i]
+        self._last = list(obs)
+        return self._stack(self._last), np.array(rewards, np.float32), np.array(dones, bool), list(infos)
+
+    def close(self) -> None:
+        """Ends the processes; a second call does nothing."""
+        self.workers.close()
+
+    def get_images(self) -> list[np.ndarray]:
+        """Returns an image of each environment, ``uint8 (height, width, 3)``."""
+        return self._call(range(self.num_envs), _render)
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Returns an attribute of each environment, looked up through its wrappers."""
+        return self._call(self._get_indices(indices), _get_attr, attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Sets an attribute of each environment where it exists, also inside wrappers."""
+        self._call(self._get_indices(indices), _set_attr, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of each environment, looked up through its wrappers, and returns the results."""
+        return self._call(self._get_indices(indices), _call_method, method_name, method_args, method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Returns for each environment whether it is wrapped in that class."""
+        return self._call(self._get_indices(indices), is_wrapped, wrapper_class)
+
+    def _call(self, indices: Sequence[int] | range, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Calls ``function(env, *arguments)`` in some processes and returns the results.
+
+        Raises:
+            AttributeError: if the function does; the processes then keep running.
+        """
+        self.workers.send(dict.fromkeys(indices, ("call", function, *arguments)))
+        replies = self._receive(indices, attribute_errors=True)
+        for i, reply in replies.items():
+            if isinstance(reply, Restarted):
+                self.close()
+                raise WorkerError(f"the process of environment {i} was lost outside of a step: {reply.why}")
+        return [replies[i] for i in indices]
+
+    def _receive(self, indices: Any, attribute_errors: bool = False) -> dict[int, Any]:
+        """Returns the replies of some processes; ends all processes if one of the replies is a failure."""
+        replies = self.workers.answers(indices)
+        for i, answer in replies.items():
+            if isinstance(answer, Failure):
+                if attribute_errors and answer.kind == "no attribute":
+                    raise AttributeError(answer.message)
+                self.close()
+                if answer.kind == "bad answer":
+                    raise BadEnvironmentError(blamed(type(self).__name__, i, self._n_steps, answer.message))
+                raise WorkerError(f"environment {i} raised an error:\n{answer.trace}")
+        return replies
+
+    def _stack(self, parts: list[Any]) -> Any:
+        empty: Any = create_empty_array(self.observation_space, self.num_envs)
+        return concatenate(self.observation_space, parts, empty)
+
+
+def _reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
+    """Resets an environment; returns a copy of the observation and the info."""
+    obs, info = answers.reset(env, seed, options)
+    return answers.kept(env.observation_space, obs), info
+
+
+def _step_and_reset(env: gym.Env, action: Any) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
+    """Steps an environment, and resets it if the episode has ended.
+
+    Returns:
+        The observation to act on, the reward, whether the episode has ended, the info, and the info of the reset.
+    """
+    obs, reward, terminated, truncated, info = checked_step(env, action)
+    obs = answers.kept(env.observation_space, obs)
+    info = {**info, TIME_LIMIT_TRUNCATED: truncated and not terminated}
+    reset_info: dict[str, Any] = {}
+    if terminated or truncated:
+        info[TERMINAL_OBSERVATION] = obs
+        obs, reset_info = _reset(env, None, None)
+    return obs, reward, terminated or truncated, info, reset_info
+
+
+def _render(env: gym.Env) -> Any:
+    return env.render() if env.render_mode == "human" else rgb_frame(env)
+
+
+def _get_attr(env: gym.Env, name: str) -> Any:
+    return env.get_wrapper_attr(name)
+
+
+def _set_attr(env: gym.Env, name: str, value: Any) -> None:
+    env.set_wrapper_attr(name, value)
+
+
+def _call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
+    return env.get_wrapper_attr(name)(*arguments, **keywords)

@@ -1,5 +1,74 @@
-"""One of the vector environments."""
+"""A wrapper that reports NaN and infinity."""
 
-from rejeu.envs.vec_wrappers import VecCheckNan
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+
+from rejeu.errors import BadEnvironmentError
+from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper, by_key
 
 __all__ = ["VecCheckNan"]
+
+
+class VecCheckNan(VecEnvWrapper):
+    """Checks every action, observation and reward for NaN and infinity.
+
+    Args:
+        venv: the vector environment.
+        raise_exception: raise :class:`BadEnvironmentError`; False warns.
+        warn_once: warn only the first time.
+        check_inf: check for infinity too.
+    """
+
+    def __init__(
+        self, venv: VecEnv, raise_exception: bool = False, warn_once: bool = True, check_inf: bool = True
+    ) -> None:
+        super().__init__(venv)
+        self.raise_exception, self.warn_once, self.check_inf = raise_exception, warn_once, check_inf
+        self._warned = False
+        self._last_actions: Any = None
+        """Actions of the last step, None after a reset."""
+
+    def step_async(self, actions: Any) -> None:
+        """Begins a step with one action for each environment."""
+        self._check(actions, "the actions")
+        self._last_actions = actions
+        self.venv.step_async(actions)
+
+    def reset(self) -> Any:
+        """Resets the environments and returns the observations."""
+        obs = self.venv.reset()
+        self._last_actions = None
+        self._check(obs, "the observations of reset")
+        return obs
+
+    def step_wait(self) -> StepResult:
+        """Steps the environments and returns observations, rewards, dones and infos."""
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self._check(obs, "the observations")
+        self._check(rewards, "the rewards")
+        return obs, rewards, dones, infos
+
+    def _check(self, values: Any, name: str) -> None:
+        if self._warned and self.warn_once and not self.raise_exception:
+            return
+        for key, value in by_key(values).items():
+            array = np.asarray(value)
+            if array.dtype.kind != "f":
+                continue
+            bad = ~np.isfinite(array) if self.check_inf else np.isnan(array)
+            if bad.any():
+                where = tuple(int(i) for i in np.argwhere(bad)[0])
+                after = (
+                    ""
+                    if self._last_actions is None or name == "the actions"
+                    else f" after the actions {self._last_actions}"
+                )
+                message = f"{name}{f' under {key!r}' * bool(key)} contain {array[where]} at {where}{after}"
+                if self.raise_exception:
+                    raise BadEnvironmentError(message)
+                self._warned = True
+                warnings.warn(message, UserWarning, stacklevel=3)

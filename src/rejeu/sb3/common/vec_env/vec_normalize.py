@@ -1,5 +1,358 @@
-"""One of the vector environments."""
+"""A wrapper that normalizes observations and rewards by running statistics, as Stable-Baselines3's ``VecNormalize`` does.
 
-from rejeu.envs.vec_normalize import VecNormalize
+The statistics are part of the environment, so they must be saved and loaded along with the agent. New code should use the
+agents' option ``normalize=True`` (:mod:`rejeu.normalization`), which keeps the statistics in the agent and its model file.
+"""
 
-__all__ = ["VecNormalize"]
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
+from rejeu.sb3.common.running_mean_std import RunningMeanStd
+from rejeu.sb3.common.vec_env.base_vec_env import (
+    TERMINAL_OBSERVATION,
+    StepResult,
+    VecEnv,
+    VecEnvWrapper,
+    unwrap_vec_wrapper,
+)
+from rejeu.validation import number
+
+__all__ = ["VecNormalize", "sync_envs_normalization", "unwrap_vec_normalize"]
+
+KIND = "vec_normalize"
+"""Kind of its files."""
+NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
+MOST = dict.fromkeys(NUMBERS, math.inf) | {"gamma": 1.0}
+BOUNDS = ("clip_obs", "clip_reward")
+"""Those that may be infinite, for no clipping. A file then has null, since JSON has no infinity."""
+SWITCHES = ("training", "norm_obs", "norm_reward")
+
+
+class VecNormalize(VecEnvWrapper):
+    """Standardizes observations, and divides rewards by the standard deviation of their discounted sum.
+
+    ``clip((obs - mean) / sqrt(var + epsilon), -clip_obs, clip_obs)`` and ``clip(reward / sqrt(var + epsilon),
+    -clip_reward, clip_reward)``; the statistics are updated while ``training`` is True. Training and prediction need the same
+    statistics; set ``training = norm_reward = False`` for evaluation.
+
+    Args:
+        venv: a vector environment with Box observations, or a Dict of them.
+        training: whether to update the statistics.
+        norm_obs: whether to normalize observations.
+        norm_reward: whether to normalize rewards.
+        clip_obs: largest magnitude of a normalized observation; ``math.inf`` for no limit.
+        clip_reward: largest magnitude of a normalized reward; ``math.inf`` for no limit.
+        gamma: discount factor of the sum of rewards; use the agent's.
+        epsilon: added to variances.
+        norm_obs_keys: keys of Dict observations to normalize; None for all.
+
+    Raises:
+        ValueError: if an observation to be normalized is not in a Box space.
+
+    >>> from rejeu.sb3.common.env_util import make_vec_env
+    >>> env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=4))
+    >>> env.reset().shape, env.obs_rms.mean.shape
+    ((4, 3), (3,))
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        training: bool = True,
+        norm_obs: bool = True,
+        norm_reward: bool = True,
+        clip_obs: float = 10.0,
+        clip_reward: float = 10.0,
+        gamma: float = 0.99,
+        epsilon: float = 1e-8,
+        norm_obs_keys: Sequence[str] | None = None,
+    ) -> None:
+        super().__init__(venv)
+        self.training, self.norm_obs, self.norm_reward = training, norm_obs, norm_reward
+        self.clip_obs, self.clip_reward = clip_obs, clip_reward
+        self.gamma, self.epsilon = gamma, epsilon
+        self.norm_obs_keys = None if norm_obs_keys is None else list(norm_obs_keys)
+        self.obs_rms: Any = None
+        """Moments of the observations: a :class:`RunningMeanStd`, or a dict of them by key."""
+        self.ret_rms = RunningMeanStd()
+        """Moments of the discounted sum of rewards."""
+        if norm_obs:
+            self._init_observations(venv.observation_space)
+        self.returns = np.zeros(self.num_envs)
+        """Discounted sum of the rewards of each environment so far."""
+        self.old_obs: Any = None
+        self.old_reward = np.zeros(self.num_envs, np.float32)
+
+    def _init_observations(self, space: spaces.Space) -> None:
+        """Creates the moments of the observations and the space of the normalized observations."""
+        if isinstance(space, spaces.Dict):
+            keys = list(space.spaces) if self.norm_obs_keys is None else self.norm_obs_keys
+            self.norm_obs_keys = keys
+            for key in keys:
+                if key not in space.spaces:
+                    raise ValueError(
+                        f"norm_obs_keys contains {key!r}, but the observations have the keys {', '.join(space.spaces)}"
+                    )
+                _check_box(space[key], key)
+            self.obs_rms = {key: RunningMeanStd(shape=space[key].shape or ()) for key in keys}
+            parts = {key: self._box(part) if key in keys else part for key, part in space.spaces.items()}
+            self.observation_space = spaces.Dict(parts)
+            return
+        if self.norm_obs_keys is not None:
+            raise ValueError(f"norm_obs_keys={self.norm_obs_keys!r} needs Dict observations, got {space}")
+        _check_box(space, None)
+        self.obs_rms = RunningMeanStd(shape=space.shape or ())
+        self.observation_space = self._box(space)
+
+    def _box(self, space: spaces.Space) -> spaces.Box:
+        return spaces.Box(-self.clip_obs, self.clip_obs, space.shape, np.float32)
+
+    def set_venv(self, venv: VecEnv) -> None:
+        """Replaces the wrapped vector environment by another with the same spaces; keeps the statistics.
+
+        Raises:
+            ValueError: if the spaces differ.
+        """
+        other = VecNormalize(venv, norm_obs=self.norm_obs, clip_obs=self.clip_obs, norm_obs_keys=self.norm_obs_keys)
+        if other.observation_space != self.observation_space:
+            raise ValueError(
+                f"the environment has the observation space {venv.observation_space}, which does not fit these statistics"
+            )
+        VecEnvWrapper.__init__(self, venv, other.observation_space)
+        self.returns, self.old_reward = np.zeros(self.num_envs), np.zeros(self.num_envs, np.float32)
+
+    def reset(self) -> Any:
+        """Resets the environments and returns the normalized observations."""
+        obs = self.venv.reset()
+        self.old_obs, self.returns = obs, np.zeros(self.num_envs)
+        self._update(obs)
+        return self.normalize_obs(obs)
+
+    def step_wait(self) -> StepResult:
+        """Steps the environments and returns normalized observations and rewards, dones and infos.
+
+        ``terminal_observation`` is normalized too.
+        """
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.old_obs, self.old_reward = obs, rewards
+        self._update(obs)
+        if self.training:
+            self.returns = self.returns * self.gamma + rewards
+            self.ret_rms.update(self.returns)
+        for info in infos:
+            if TERMINAL_OBSERVATION in info:
+                info[TERMINAL_OBSERVATION] = self.normalize_obs(info[TERMINAL_OBSERVATION])
+        self.returns[dones] = 0.0
+        return self.normalize_obs(obs), self.normalize_reward(rewards), dones, infos
+
+    def _update(self, obs: Any) -> None:
+        if not (self.training and self.norm_obs):
+            return
+        if isinstance(self.obs_rms, dict):
+            for key, moments in self.obs_rms.items():
+                moments.update(obs[key])
+        else:
+            self.obs_rms.update(obs)
+
+    def normalize_obs(self, obs: Any) -> Any:
+        """Returns normalized observations; does not update the statistics."""
+        return self._map(obs, self._scale)
+
+    def unnormalize_obs(self, obs: Any) -> Any:
+        """Returns the original observations, except where they were clipped."""
+        return self._map(obs, self._unscale)
+
+    def normalize_reward(self, reward: np.ndarray) -> np.ndarray:
+        """Returns normalized rewards, ``float32``; does not update the statistics."""
+        if not self.norm_reward:
+            return reward
+        normalized = np.clip(reward / np.sqrt(self.ret_rms.var + self.epsilon), -self.clip_reward, self.clip_reward)
+        return normalized.astype(np.float32)
+
+    def unnormalize_reward(self, reward: np.ndarray) -> np.ndarray:
+        """Returns the original rewards, except where they were clipped."""
+        return reward * np.sqrt(self.ret_rms.var + self.epsilon) if self.norm_reward else reward
+
+    def get_original_obs(self) -> Any:
+        """Returns the original observations of the last step or reset."""
+        return _copy(self.old_obs)
+
+    def get_original_reward(self) -> np.ndarray:
+        """Returns the original rewards of the last step."""
+        return self.old_reward.copy()
+
+    def _map(self, obs: Any, function: Any) -> Any:
+        if not self.norm_obs:
+            return obs
+        if isinstance(self.obs_rms, dict):
+            return {**obs, **{key: function(np.asarray(obs[key]), m) for key, m in self.obs_rms.items()}}
+        return function(np.asarray(obs), self.obs_rms)
+
+    def _scale(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
+        z = (obs - moments.mean) / np.sqrt(moments.var + self.epsilon)
+        return np.clip(z, -self.clip_obs, self.clip_obs).astype(np.float32)
+
+    def _unscale(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
+        return obs * np.sqrt(moments.var + self.epsilon) + moments.mean
+
+    def statistics(self) -> dict[str, np.ndarray]:
+        """Returns the statistics as arrays by name."""
+        arrays = {f"returns.{name}": value for name, value in _arrays(self.ret_rms).items()}
+        if isinstance(self.obs_rms, dict):
+            arrays |= {f"obs.{i}.{n}": v for i, m in enumerate(self.obs_rms.values()) for n, v in _arrays(m).items()}
+        elif self.obs_rms is not None:
+            arrays |= {f"obs.{name}": value for name, value in _arrays(self.obs_rms).items()}
+        return arrays
+
+    def put_statistics(self, arrays: Mapping[str, np.ndarray], path: str | Path = "the statistics") -> None:
+        """Restores what :meth:`statistics` returned; ``path`` names the source in messages.
+
+        Raises:
+            CheckpointError: if the arrays are damaged or belong to other observations.
+        """
+        left = dict(arrays)
+        _restore(self.ret_rms, left, "returns", path)
+        if isinstance(self.obs_rms, dict):
+            for i, moments in enumerate(self.obs_rms.values()):
+                _restore(moments, left, f"obs.{i}", path)
+        elif self.obs_rms is not None:
+            _restore(self.obs_rms, left, "obs", path)
+        if left:
+            raise CheckpointError(
+                f"{path} has the unexpected array {checkpoint.shown(min(left))}; it was saved with other settings"
+            )
+
+    def save(self, save_path: str | Path) -> Path:
+        """Writes statistics and settings to a safetensors file, without the environments; returns its path.
+
+        ``.safetensors`` is added to a path without a suffix.
+        """
+        arrays = self.statistics()
+        header = {
+            "settings": {key: _written(key, float(getattr(self, key))) for key in NUMBERS}
+            | {key: bool(getattr(self, key)) for key in SWITCHES},
+            "keys": None if not isinstance(self.obs_rms, dict) else list(self.obs_rms),
+        }
+        return checkpoint.write(save_path, KIND, arrays, header)
+
+    @staticmethod
+    def load(load_path: str | Path, venv: VecEnv) -> VecNormalize:
+        """Returns ``venv`` wrapped with the statistics and settings of a file written by :meth:`save`.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            CheckpointError: if the file is damaged or belongs to other observations.
+        """
+        with checkpoint.opened(load_path, KIND) as file:
+            header = file.header
+            try:
+                settings = {key: _read(key, header["settings"][key]) for key in NUMBERS}
+                switches = {key: _check_switch(key, header["settings"][key]) for key in SWITCHES}
+                new = VecNormalize(venv, **switches, **settings, norm_obs_keys=_check_keys(header["keys"]))  # type: ignore[arg-type]
+            except (LookupError, TypeError, ValueError) as error:
+                raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
+            _check_specs(file.specs, new.statistics(), load_path)
+            new.put_statistics(file.read(), load_path)
+        return new
+
+
+def unwrap_vec_normalize(env: VecEnv) -> VecNormalize | None:
+    """Returns the outermost ``VecNormalize`` of a vector environment, or None."""
+    return unwrap_vec_wrapper(env, VecNormalize)
+
+
+def sync_envs_normalization(env: VecEnv, eval_env: VecEnv) -> None:
+    """Copies the statistics of each ``VecNormalize`` in ``env`` to its counterpart in ``eval_env``.
+
+    Raises:
+        ValueError: if ``eval_env`` is not wrapped in the same way.
+    """
+    while isinstance(env, VecEnvWrapper):
+        if not isinstance(eval_env, VecEnvWrapper) or isinstance(env, VecNormalize) != isinstance(
+            eval_env, VecNormalize
+        ):
+            raise ValueError(
+                f"the training environment is wrapped in {type(env).__name__} where the other is "
+                f"{type(eval_env).__name__}; wrap both in the same way, the other with training=False"
+            )
+        if isinstance(env, VecNormalize) and isinstance(eval_env, VecNormalize):
+            eval_env.obs_rms, eval_env.ret_rms = _copy(env.obs_rms), env.ret_rms.copy()
+        env, eval_env = env.venv, eval_env.venv
+
+
+def _arrays(moments: RunningMeanStd) -> dict[str, np.ndarray]:
+    return {"mean": moments.mean, "var": moments.var, "count": np.array(moments.count, np.float64)}
+
+
+def _check_specs(found: Mapping[str, Any], own: Mapping[str, Any], path: str | Path) -> None:
+    """Raises ``CheckpointError`` unless both have the same names, shapes and dtypes."""
+    forms = [{name: f"{one.dtype}{list(one.shape)}" for name, one in arrays.items()} for arrays in (found, own)]
+    if differing := sorted(name for name in {*found, *own} if forms[0].get(name) != forms[1].get(name)):
+        name = differing[0]
+        raise CheckpointError(
+            f"{path}: {checkpoint.shown(name)} is {checkpoint.shown(forms[0].get(name, 'missing'))}, expected "
+            f"{forms[1].get(name, 'no such array')}; it was saved with other observations or settings"
+        )
+
+
+def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, path: str | Path) -> None:
+    """Restores moments from a file's arrays, which are removed from ``arrays``.
+
+    Raises:
+        CheckpointError: if they are missing or invalid.
+    """
+    found = {}
+    for part, shape in (("mean", moments.mean.shape), ("var", moments.mean.shape), ("count", ())):
+        array = arrays.pop(f"{name}.{part}", None)
+        if array is None or array.shape != shape or array.dtype != np.float64 or not np.isfinite(array).all():
+            same = array is not None and array.shape == shape
+            got = "no value" if array is None else "other values" if same else f"the shape {array.shape}"
+            raise CheckpointError(f"{path}: {name}.{part} has {got}, expected finite float64 of the shape {shape}")
+        if part != "mean" and (array < 0).any():
+            raise CheckpointError(f"{path}: {name}.{part} has negative values")
+        found[part] = array
+    moments.mean, moments.var, moments.count = found["mean"], found["var"], float(found["count"])
+
+
+def _written(key: str, value: float) -> float | None:
+    return None if key in BOUNDS and value == math.inf else value
+
+
+def _read(key: str, value: Any) -> float:
+    return math.inf if key in BOUNDS and value is None else number(key, value, least=0, most=MOST[key])
+
+
+def _check_keys(keys: Any) -> list[str] | None:
+    if keys is not None and not (isinstance(keys, list) and all(isinstance(key, str) for key in keys)):
+        raise ValueError(f"the keys are {str(keys)[:40]}, expected a list of strings or null")
+    return keys
+
+
+def _check_switch(key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{key}={str(value)[:40]} must be true or false")
+    return value
+
+
+def _check_box(space: spaces.Space, key: str | None) -> None:
+    if not isinstance(space, spaces.Box):
+        where = "" if key is None else f" under {key!r}"
+        raise ValueError(
+            f"VecNormalize normalizes Box observations, got {space}{where}; select others with norm_obs_keys, or set "
+            "norm_obs=False"
+        )
+
+
+def _copy(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _copy(part) for key, part in tree.items()}
+    return None if tree is None else tree.copy()

@@ -1,0 +1,308 @@
+"""Conversion between Stable-Baselines3's vector environments and rejeu's.
+
+Agents step a :class:`rejeu.envs.base.VectorEnv`, which never resets by itself. Importing this module registers the
+conversion in both directions (:mod:`rejeu.envs.adapters`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import jax
+import numpy as np
+
+from rejeu.envs import adapters, answers, faults, goals as goals_module
+from rejeu.envs.base import Step, VectorEnv, success_of
+from rejeu.envs.goals import GoalFunctions
+from rejeu.envs.in_process import InProcess
+from rejeu.envs.seeds import Seed
+from rejeu.errors import BadEnvironmentError
+from rejeu.sb3.common.vec_env.base_vec_env import (
+    TERMINAL_OBSERVATION,
+    TIME_LIMIT_TRUNCATED,
+    Indices,
+    StepResult,
+    VecEnv,
+    VecEnvWrapper,
+)
+from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
+from rejeu.sb3.common.vec_env.vec_normalize import unwrap_vec_normalize
+from rejeu.spaces import leaves, plain
+
+
+def to_vector(venv: VecEnv, seed: Seed = None) -> VectorEnv:
+    """Returns a ``VecEnv`` as a vector environment without automatic resets.
+
+    The environments of a plain :class:`DummyVecEnv` are stepped directly, which is fastest. Wrappers, other classes and
+    subclasses are stepped as they are.
+    """
+    if isinstance(venv, AutoResetView):
+        return venv.vector
+    if type(venv) is DummyVecEnv:
+        return InProcess(venv.envs, seed, venv)
+    return VecEnvAdapter(venv, seed)
+
+
+def to_vec_env(vector: VectorEnv) -> VecEnv:
+    """Returns a ``VecEnv`` of the environments of a vector environment, to be stepped by hand."""
+    return dummy_vec_env(vector.envs) if isinstance(vector, InProcess) else AutoResetView(vector)
+
+
+def dummy_vec_env(envs: Sequence[gym.Env]) -> DummyVecEnv:
+    """Returns a ``DummyVecEnv`` of existing environments."""
+    remaining = iter(envs)
+    return DummyVecEnv([lambda: next(remaining)] * len(envs))
+
+
+def identities(venv: VecEnv) -> set[int]:
+    """Returns the ids of a vector environment and of the environments in it, as :meth:`VectorEnv.identities` does."""
+    if isinstance(venv, AutoResetView):
+        return {id(venv)} | venv.vector.identities()
+    inner = venv.unwrapped
+    return {id(inner)} | {id(env.unwrapped) for env in (inner.envs if isinstance(inner, DummyVecEnv) else ())}
+
+
+class VecEnvAdapter(VectorEnv):
+    """A ``VecEnv`` without its automatic resets: the true next observations are read from the infos.
+
+    Args:
+        venv: the vector environment, with its wrappers.
+        seed: seed of the first reset.
+    """
+
+    venv: VecEnv
+
+    def __init__(self, venv: VecEnv, seed: Seed = None) -> None:
+        self.venv = venv
+        self.n_envs = venv.num_envs
+        self.observation_space, self.action_space = venv.observation_space, venv.action_space
+        self.backend = "gymnasium"
+        self.env_id = type(venv.unwrapped).__name__
+        if (spec := _first_attr(venv, "spec")) is not None:
+            self.env_id, self.max_episode_steps = spec.id, spec.max_episode_steps
+            self.reward_threshold = spec.reward_threshold
+        self.wrapped_by = type(venv).__name__ if isinstance(venv, VecEnvWrapper) else None
+        self.vec_normalize = unwrap_vec_normalize(venv)
+        self.n_steps = 0
+        """Number of steps of the vector."""
+        self._seed = None if seed is None else self._single_seed(seed)
+        self._leaves = leaves(self.observation_space)
+        self._after_reset: Any = None
+        """Observations returned by the last step, including the first ones of new episodes."""
+        self._desynced = np.zeros(self.n_envs, bool)
+        """Environments that were stepped although they were not active, and have not been reset since."""
+
+    def reset(self, seed: Seed = None) -> Any:
+        seed = self._seed if seed is None else seed
+        self._seed = None
+        if seed is not None:
+            self.venv.seed(self._single_seed(seed))
+        self._desynced = np.zeros(self.n_envs, bool)
+        self._obs = self._after_reset = self._cast(self.venv.reset())
+        return self._obs
+
+    def _single_seed(self, seed: int | Sequence[int]) -> int:
+        """Returns a seed that is a single number.
+
+        Raises:
+            ValueError: if it is a sequence.
+        """
+        if isinstance(seed, int):
+            return seed
+        raise ValueError(
+            f"seed={seed}: {type(self.venv).__name__} takes a single seed and seeds its environments itself; give one "
+            "number, or make the environments with rejeu.make_vector, which takes one seed for each"
+        )
+
+    def _step_all(self, action: np.ndarray) -> Step:
+        self.n_steps += 1
+        answer = self.venv.step(action)
+        if not isinstance(answer, tuple) or len(answer) != 4:
+            raise self._bad(f"step returned {faults.described(answer)}, expected (obs, rewards, dones, infos)")
+        returned, reward, dones, infos = answer
+        try:
+            done = answers.for_each("dones", dones, self.n_envs, bool)
+            reward = answers.for_each("rewards", reward, self.n_envs, np.float32)
+        except BadEnvironmentError as error:
+            raise self._bad(f"step returned {error}") from error.__cause__
+        for i, info in enumerate(infos):
+            if not isinstance(info, dict):
+                raise self._bad(f"step returned infos[{i}]={info!r:.40}, expected a dict, for example {{}}")
+        truncated = np.array([bool(info.get(TIME_LIMIT_TRUNCATED, False)) for info in infos]) & done
+        obs = self._after_reset = self._cast(returned)
+        returns = None
+        if done.any():
+            obs = jax.tree.map(np.copy, obs)
+            returns = np.full(self.n_envs, np.nan)
+            for i in np.flatnonzero(done).tolist():
+                self._write_final(obs, i, infos[i])
+                returns[i] = np.asarray(infos[i].get("episode", {}).get("r", np.nan)).item()
+        self._obs = obs
+        return Step(obs, reward, done & ~truncated, truncated, infos, returns)
+
+    def _write_final(self, obs: Any, i: int, info: dict[str, Any]) -> None:
+        """Writes the final observation of environment ``i`` into a batch of observations."""
+        if TERMINAL_OBSERVATION not in info:
+            raise BadEnvironmentError(
+                f"an episode ended in environment {i} of {type(self.venv).__name__}, but infos[{i}] has no "
+                f"{TERMINAL_OBSERVATION!r}; step_wait must store the last observation there before it resets the environment"
+            )
+        last = jax.tree.leaves(plain(self.observation_space, info[TERMINAL_OBSERVATION]))
+        for store, part in zip(jax.tree.leaves(obs), last, strict=True):
+            if np.shape(part) != store.shape[1:]:
+                raise BadEnvironmentError(
+                    f"infos[{i}][{TERMINAL_OBSERVATION!r}] has the shape {np.shape(part)}, but observations have "
+                    f"{store.shape[1:]}; a wrapper that changes observations must also change it (outermost wrapper: "
+                    f"{type(self.venv).__name__})"
+                )
+            store[i] = part
+
+    def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
+        rest = ~active
+        before = jax.tree.map(lambda leaf: leaf[rest], self._obs)
+        action = np.array(action)
+        action[rest] = action[np.argmax(active)]  # inactive environments are stepped too, with a valid action
+        step = self._step_all(action)
+        self._desynced |= rest
+        self._obs = jax.tree.map(np.copy, step.obs)
+        jax.tree.map(lambda whole, old: whole.__setitem__(rest, old), self._obs, before)
+        return step._replace(
+            obs=self._obs,
+            reward=np.where(active, step.reward, np.float32(0.0)),
+            terminated=step.terminated & active,
+            truncated=step.truncated & active,
+        )
+
+    def reset_done(self, done: np.ndarray) -> Any:
+        done = np.asarray(done, bool)
+        if not (done & self._desynced).any():
+            self._obs = self._after_reset
+        elif done.all():
+            self._obs = self.reset()
+        else:
+            raise ValueError(
+                f"{type(self.venv).__name__} resets by itself and was stepped while some environments were inactive, so "
+                "single environments cannot be reset; use rejeu.make_vector, or leave out n_episodes"
+            )
+        self._desynced = self._desynced & ~done
+        return self._obs
+
+    def success(self, step: Step, env: int) -> float:
+        return success_of(step.info[env])
+
+    def goals(self) -> GoalFunctions | None:
+        if self.vec_normalize is not None:
+            raise ValueError(
+                "hindsight replay computes rewards from goals, which VecNormalize normalizes; remove it and use the "
+                "agent's option normalize=True"
+            )
+        if not self.venv.has_attr("compute_reward"):
+            return None
+        return GoalFunctions(goals_module.over_batches(self._remote("compute_reward"), np.float32), self._terminated())
+
+    def _terminated(self) -> Any:
+        if not self.venv.has_attr("compute_terminated"):
+            return None
+        return goals_module.over_batches(self._remote("compute_terminated"), np.bool_)
+
+    def _remote(self, name: str) -> Any:
+        """Returns a method of the first environment as a function."""
+        return lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]
+
+    def identities(self) -> set[int]:
+        return {id(self)} | identities(self.venv)
+
+    def close(self) -> None:
+        self.venv.close()
+
+    def _cast(self, obs: Any) -> Any:
+        try:
+            return answers.batch(self.observation_space, self._leaves, self.n_envs, obs)
+        except BadEnvironmentError as error:
+            raise self._bad(f"it returned {error}") from error.__cause__
+
+    def _bad(self, fault: str) -> BadEnvironmentError:
+        return BadEnvironmentError(faults.blamed(self.env_id, None, self.n_steps, fault))
+
+
+def _first_attr(venv: VecEnv, name: str) -> Any:
+    """Returns an attribute of the first environment, or None."""
+    try:
+        found = venv.get_attr(name, 0)
+    except (AttributeError, NotImplementedError):
+        return None
+    return found[0] if found else None
+
+
+class AutoResetView(VecEnv):
+    """A vector environment of rejeu as a ``VecEnv``, to be stepped by hand.
+
+    It is used where single environments are not Python objects in this process, as with EnvPool.
+    """
+
+    def __init__(self, vector: VectorEnv) -> None:
+        self.vector = vector
+        super().__init__(vector.n_envs, vector.observation_space, vector.action_space)
+        self._actions: Any = None
+
+    def reset(self) -> Any:
+        """Resets every environment and returns the observations ``(num_envs, ...)``."""
+        seed = self._seeds[0]
+        self._reset_seeds()
+        return jax.tree.map(np.copy, self.vector.reset(seed))
+
+    def step_async(self, actions: Any) -> None:
+        """Stores the actions for :meth:`step_wait`."""
+        self._actions = np.asarray(actions)
+
+    def step_wait(self) -> StepResult:
+        """Steps with the actions of :meth:`step_async`; returns the same as :meth:`step`."""
+        step = self.vector.step(self._actions)
+        dones = step.terminated | step.truncated
+        infos: list[dict[str, Any]] = []
+        for i in range(self.num_envs):
+            info = dict(step.info[i]) if isinstance(step.info, list) else {}
+            info[TIME_LIMIT_TRUNCATED] = bool(step.truncated[i] and not step.terminated[i])
+            success = self.vector.success(step, i)
+            if not math.isnan(success):
+                info["is_success"] = bool(success)
+            if dones[i]:
+                info[TERMINAL_OBSERVATION] = jax.tree.map(lambda leaf, i=i: np.copy(leaf[i]), step.obs)
+            infos.append(info)
+        obs = self.vector.reset_done(dones) if dones.any() else step.obs
+        return jax.tree.map(np.copy, obs), step.reward, dones, infos
+
+    def close(self) -> None:
+        """Closes the environments."""
+        self.vector.close()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Raises ``AttributeError``: single environments cannot be accessed."""
+        raise AttributeError(self._no_access(attr_name))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Raises ``AttributeError``, as :meth:`get_attr` does."""
+        raise AttributeError(self._no_access(attr_name))
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Raises ``AttributeError``, as :meth:`get_attr` does."""
+        raise AttributeError(self._no_access(method_name))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Returns False for each environment."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _no_access(self, name: str) -> str:
+        return (
+            f"{name!r}: single environments of {self.vector.env_id} on the backend {self.vector.backend} cannot be "
+            "accessed; give the agent gymnasium.make(id) or make_vec_env(id) instead of an id"
+        )
+
+
+adapters.register_adapter(VecEnv, to_vector)
+adapters.register_vec_env_view(to_vec_env)
