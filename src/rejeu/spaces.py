@@ -5,20 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
+import msgspec
 import numpy as np
 from gymnasium import spaces
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 LARGEST = 2**20
-"""Most numbers and choices, together, of a space that is read from a file, unless the file is itself large enough to hold
+"""Upper limit on the numbers and choices, together, of a space in a file, unless the file is itself large enough to hold
 networks for more: a damaged file must not exhaust the memory."""
-MOST_LEAVES = 1024
-"""Most arrays that an observation read from a file may consist of."""
-BOX_DTYPES = ("float16", "float32", "float64", "int8", "int16", "int32", "uint8", "uint16", "uint32")
-"""What :func:`describe` calls the dtypes of a Box."""
+MAX_LEAVES = 1024
+"""Upper limit on the arrays of an observation in a file."""
+MAX_DEPTH = 32
+"""Upper limit on the levels of nesting of a space in a file."""
 
 
 @dataclass(frozen=True)
@@ -360,65 +361,87 @@ def rebuild(description: Any, largest: int = LARGEST) -> spaces.Space:
 
     Args:
         description: JSON values.
-        largest: most numbers and choices that it may have, over all its parts.
+        largest: upper limit on the numbers and choices of all its parts together.
 
     Raises:
         ValueError: if the description is not one that :func:`describe` writes, or is of a larger space.
     """
+    sizes: list[int] = []
+
+    def check(size: int) -> None:
+        sizes.append(size)
+        if sum(sizes) > largest or len(sizes) > MAX_LEAVES:
+            raise ValueError(f"{sum(sizes)} numbers in {len(sizes)} arrays, expected {largest} in {MAX_LEAVES} at most")
+
     try:
-        sizes = _sizes(description)
-        if sum(sizes) > largest or len(sizes) > MOST_LEAVES:
-            raise ValueError(
-                f"{sum(sizes)} numbers in {len(sizes)} arrays, expected {largest} in {MOST_LEAVES} at most"
-            )
-        return _rebuild(description)
-    except (AttributeError, LookupError, TypeError, ValueError, AssertionError, ArithmeticError) as error:
+        return _rebuild(description, check)
+    except (
+        AttributeError, LookupError, TypeError, ValueError, AssertionError, ArithmeticError, msgspec.ValidationError
+    ) as error:  # fmt: skip
         raise ValueError(f"not the description of a space: {error}") from None
 
 
-def _rebuild(description: Any) -> spaces.Space:
+Size = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+class BoxRecord(msgspec.Struct):
+    """The description of a Box."""
+
+    low: Any
+    high: Any
+    shape: list[Size]
+    dtype: Literal["float16", "float32", "float64", "int8", "int16", "int32", "uint8", "uint16", "uint32"]
+
+
+class DiscreteRecord(msgspec.Struct):
+    """The description of a Discrete."""
+
+    n: Size
+    start: int
+
+
+class MultiDiscreteRecord(msgspec.Struct):
+    """The description of a MultiDiscrete; both lists may be nested."""
+
+    nvec: list[Any]
+    start: list[Any]
+
+
+class MultiBinaryRecord(msgspec.Struct):
+    """The description of a MultiBinary."""
+
+    shape: list[Size]
+
+
+def _rebuild(description: Any, check: Callable[[int], None], depth: int = 0) -> spaces.Space:
+    """Returns the space; ``check`` is called with the size of each array before it is made."""
     ((kind, body),) = description.items()
+    if depth > MAX_DEPTH:
+        raise ValueError(f"nested more than {MAX_DEPTH} deep")
     if kind == "Dict":
-        return spaces.Dict({key: _rebuild(part) for key, part in body.items()})
+        return spaces.Dict({key: _rebuild(part, check, depth + 1) for key, part in body.items()})
     if kind == "Tuple":
-        return spaces.Tuple([_rebuild(part) for part in body])
+        return spaces.Tuple([_rebuild(part, check, depth + 1) for part in body])
     if kind == "Box":
-        dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
-        low, high = (_bound(body[end], dtype) for end in ("low", "high"))
-        return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
+        box = msgspec.convert(body, BoxRecord)
+        check(math.prod(box.shape))
+        dtype, shape = np.dtype(box.dtype), tuple(box.shape)
+        low, high = (np.broadcast_to(_bound(bound, dtype), shape) for bound in (box.low, box.high))
+        return spaces.Box(low, high, shape, dtype.type)
     if kind == "Discrete":
-        return spaces.Discrete(body["n"], start=body["start"])
+        discrete = msgspec.convert(body, DiscreteRecord)
+        check(discrete.n)
+        return spaces.Discrete(discrete.n, start=discrete.start)
     if kind == "MultiDiscrete":
-        return spaces.MultiDiscrete(body["nvec"], start=body["start"])
-    return spaces.MultiBinary(body["shape"])
-
-
-def _sizes(description: Any) -> list[int]:
-    """Returns how many numbers or choices each array of a described space has; nothing of that size is made.
-
-    Raises:
-        ValueError: for what no description holds, or another of what :func:`rebuild` catches.
-    """
-    ((kind, body),) = description.items()
-    if kind in ("Dict", "Tuple"):
-        parts = body.values() if kind == "Dict" else body
-        return [size for part in parts for size in _sizes(part)]
-    if kind == "Box":
-        if body["dtype"] not in BOX_DTYPES:
-            raise ValueError(f"a Box of {str(body['dtype'])[:40]!r}")
-        return [math.prod(_integers(body["shape"]))]
-    if kind in ("Discrete", "MultiDiscrete"):
-        _integers(_flat(body["start"]), least=-(2**62))
-        return [sum(_integers(_flat(body["n" if kind == "Discrete" else "nvec"])))]
+        several = msgspec.convert(body, MultiDiscreteRecord)
+        check(sum(msgspec.convert(_flat(several.nvec), list[Size])))
+        msgspec.convert(_flat(several.start), list[int])
+        return spaces.MultiDiscrete(several.nvec, start=several.start)
     if kind == "MultiBinary":
-        return [math.prod(_integers(body["shape"]))]
+        binary = msgspec.convert(body, MultiBinaryRecord)
+        check(math.prod(binary.shape))
+        return spaces.MultiBinary(binary.shape)
     raise ValueError(f"{str(kind)[:40]!r}")
-
-
-def _integers(value: Any, least: int = 0) -> list[int]:
-    if not isinstance(value, list) or not all(type(n) is int and least <= n < 2**62 for n in value):
-        raise ValueError(f"{str(value)[:40]} in place of whole numbers")
-    return value
 
 
 def _flat(value: Any) -> list[Any]:
@@ -426,7 +449,7 @@ def _flat(value: Any) -> list[Any]:
 
 
 def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
-    """Returns a bound of a Box from JSON, of 64-bit integers that were halved clipped to what is left."""
+    """Returns a bound of a Box; 64-bit integers that became 32-bit ones are clipped."""
     for number in _flat(value):
         if type(number) not in (int, float) and number not in ("inf", "-inf"):
             raise ValueError(f"the bound {str(number)[:40]!r}")

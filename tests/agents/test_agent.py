@@ -470,7 +470,7 @@ def test_a_part_of_the_parameters_may_be_set():
             r"actor.head.bias is float64\[2\], expected float32\[2\]",
         ),
         (lambda p: p.pop("actor.head.bias"), "has no actor.head.bias"),
-        (lambda p: p.update(more=np.zeros(1)), "has more, which this agent has not"),
+        (lambda p: p.update(more=np.zeros(1)), "has more, which this agent does not have"),
     ],
 )
 def test_parameters_that_do_not_fit_leave_the_agent_unchanged(change, words):

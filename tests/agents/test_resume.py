@@ -24,7 +24,7 @@ from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.hooks import BaseCallback, EvalCallback
-from rejeu.io import checkpoint, plain
+from rejeu.io import checkpoint, json_arrays
 from rejeu.loops.learner import Learner
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
@@ -586,7 +586,7 @@ def test_a_checkpoint_full_of_nonsense_is_refused_by_our_own_error_alone(kind, t
                 elif len(place) == 1:
                     holder[place[-1]] = junk if isinstance(junk, int | str | list | None) else 0.5
                 else:
-                    holder[place[-1]] = plain.encode(junk, more, "run.junk")
+                    holder[place[-1]] = json_arrays.encode(junk, more, "run.junk")
                 checkpoint.write(path, "run", more, changed)
                 try:
                     rejeu.AGENTS[name].resume(tmp_path, env())

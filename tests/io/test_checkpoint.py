@@ -208,7 +208,7 @@ def test_arrays_in_another_order_of_bytes_and_memory_come_back_as_numbers(tmp_pa
         (lambda h, a: h["config"]["policy_kwargs"].update(net_arch=[9]), "it was saved with other networks"),
         (lambda h, a: a["actor.head.bias"].fill(np.nan), "actor.head.bias holds numbers that are not finite"),
         (lambda h, a: a.pop("actor.head.bias"), "has no actor.head.bias; it was saved with other networks"),
-        (lambda h, a: a.update(extra=np.zeros(2)), "has extra, which this agent has not"),
+        (lambda h, a: a.update(extra=np.zeros(2)), "has extra, which this agent does not have"),
         (lambda h, a: a.update(log_alpha=np.zeros(2, np.float32)), r"log_alpha is float32\[2\], expected float32\[\]"),
         (lambda h, a: a.update(log_alpha=np.zeros((), np.float64)), r"log_alpha is float64\[\], expected float32\[\]"),
         (lambda h, a: a.update(log_alpha=np.zeros((), np.float16)), r"log_alpha is float16\[\], expected float32\[\]"),
@@ -226,7 +226,7 @@ def test_a_file_that_does_not_fit_says_what_differs(trained, tmp_path, change, w
     ("change", "words"),
     [
         (lambda h, a: h["counters"].update(step=10**30), "step"),
-        (lambda h, a: h["rng"].update(state=2**128), "more than 128 bits"),
+        (lambda h, a: h["rng"].update(state=2**128), r"from 0 to 2\*\*128"),
         (lambda h, a: h["rng"].update(inc=-1), r"from 0 to 2\*\*128"),
         (lambda h, a: h["config"].update(buffer_size=10**18), "buffer_size"),
         (lambda h, a: h["config"]["policy_kwargs"].update(net_arch=[10**9, 10**9]), "other networks|memory"),
@@ -386,7 +386,7 @@ def test_a_disk_that_fills_up_is_an_error_that_says_so(tmp_path):
     script = """
 import resource, signal, sys
 import numpy as np
-from rejeu import atomic, checkpoint, tensors
+from rejeu.io import checkpoint
 path = sys.argv[1]
 checkpoint.write(path, "rows", {"a": np.arange(10)}, {})
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -458,7 +458,7 @@ def test_a_process_that_is_killed_while_it_writes_leaves_the_old_file(tmp_path):
     script = """
 import os, sys
 import numpy as np
-from rejeu import atomic, checkpoint
+from rejeu.io import atomic, checkpoint
 path = checkpoint.write(sys.argv[1], "rows", {"a": np.arange(10)}, {})
 atomic.os.fsync = lambda file: os._exit(9)
 checkpoint.write(path, "rows", {"a": np.zeros(1000)}, {})
@@ -485,9 +485,7 @@ def test_a_path_that_is_a_folder_is_refused(trained, tmp_path):
         ({}, {"x": object()}, TypeError, "JSON"),
         ({}, {"kind": "agent"}, ValueError, "may not have a 'kind' of its own"),
         ({}, {"checksums": {}}, ValueError, "may not have a 'checksums' of its own"),
-        ({}, {"x": "x" * 5 * 2**20}, ValueError, "keep many numbers in arrays"),
-        ({}, {"x": [{}] * 2**18}, ValueError, "brackets and quotes"),
-        ({}, {"x": 2**128}, ValueError, "more than 128 bits"),
+        ({}, {"x": "x" * 5 * 2**20}, ValueError, "use arrays for many numbers"),
         ({"a": np.zeros(2, np.complex64)}, {}, TypeError, "a has the dtype complex64; expected one of float32"),
         ({"a": np.array(["text"])}, {}, TypeError, "a has the dtype"),
         ({"a": np.array([object()])}, {}, TypeError, "a has the dtype object"),

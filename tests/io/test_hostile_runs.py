@@ -210,13 +210,10 @@ def test_a_hostile_file_of_a_run_is_refused_by_our_own_error_alone(run, tmp_path
 @pytest.mark.parametrize("run", ["replay", "rollout"], indirect=True)
 def test_no_array_is_read_that_the_run_does_not_have(run, tmp_path, monkeypatch):
     """Six GiB in a hole of a few KiB are refused at once, by names, shapes and sizes."""
-    sizes, read_array = [], tensors.read_array
-
-    def read(file, entry):
-        sizes.append(entry.end - entry.begin)
-        return read_array(file, entry)
-
-    monkeypatch.setattr(tensors, "read_array", read)
+    sizes, read = [], tensors.TensorFile.read
+    monkeypatch.setattr(
+        tensors.TensorFile, "read", lambda file, name: sizes.append(file.specs[name].nbytes) or read(file, name)
+    )
     monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**40)
     for path in files_of(run[1]):
         for one in hostile_files.sparse(path.read_bytes()):

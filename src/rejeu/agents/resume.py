@@ -24,7 +24,7 @@ from rejeu.core import PyTree
 from rejeu.envs.base import DivergedError
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint, plain
+from rejeu.io import checkpoint, json_arrays
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Run, is_finite
 from rejeu.validation import number, whole
@@ -127,7 +127,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     agent = model_files.load(cls, file, make_env, changes, threads(path, header), "state.")
     try:
         check_specs(agent, file)
-        saved = plain.decode(header["run"], file.read("run."))
+        saved = json_arrays.decode(header["run"], file.read("run."))
         best = checkpoint.within(file.read("best."), "best.")
         parts = [read_rows(path.parent / name, agent) for name in rows]
         reason = restore(agent, saved, parts, best, path)

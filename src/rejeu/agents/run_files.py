@@ -35,7 +35,7 @@ from rejeu.buffers.ring import Ring
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
-from rejeu.io import atomic, checkpoint, plain
+from rejeu.io import atomic, checkpoint, json_arrays
 from rejeu.io.failed_writes import RETRY_SECONDS
 from rejeu.loops import finite
 from rejeu.loops.run import Progress, Run
@@ -320,7 +320,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "backend": run.env.backend,
         "own_env": agent._own_env,
         "threads": xla.threads(),
-        "run": plain.encode(everything, arrays, "run"),
+        "run": json_arrays.encode(everything, arrays, "run"),
     }
     return header, arrays
 

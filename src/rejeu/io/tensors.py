@@ -1,156 +1,90 @@
-"""The safetensors format: 8 bytes of length, a JSON table of names, dtypes, shapes and places, then the arrays.
+"""Arrays by name in the safetensors format: 8 bytes of length, a JSON table of dtypes, shapes and offsets, the arrays.
 
-Everything that a table says is checked against the size of the file before anything is allocated, and arrays are read
-and written one at a time. The safetensors library reads what is written here, and the reverse; it is not used, because it
-maps files into memory (where one that shrinks meanwhile ends the process), reports a full disk without saying so in a way
-that a program can tell, and takes a table at its word until an array is asked for.
+The safetensors library reads it, without mapping the file into memory: a mapped file that shrinks ends the process. It
+cannot write an array at a time to an open file, which saves copying a replay buffer and reports a full disk as
+``OSError``; so files are written here.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping
-from typing import Any, BinaryIO, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from safetensors import safe_open
+
+from rejeu.io.records import Malformed, parse_json, shown
 
 DTYPES = {"F32": "float32", "F64": "float64", "I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8"}
 DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BOOL": "bool", "F16": "float16"}
 """The dtypes that are read and written, by their names in the format."""
 MAX_TABLE = 4 * 2**20
-"""Most bytes of a table."""
-MAX_DEPTH = 100
-"""Most brackets within each other in any JSON."""
-MAX_TOKENS = 2**18
-"""Most brackets and quotes in any JSON, those of some ten thousand arrays: what is built from them takes time and room."""
-LARGEST_INTEGER = 2**128
-"""What whole numbers in any JSON stay below; the states of NumPy's generators have 128 bits."""
-MAX_AXES = 32
+"""Upper limit on the bytes of a table."""
 METADATA = "__metadata__"
 
 
-class Malformed(ValueError):
-    """Bytes are not what the format asks for; the message says where."""
-
-
-class Entry(NamedTuple):
-    """One array of a file, before it is read."""
-
-    name: str
-    dtype: str
-    """As in the format, such as ``"F32"``; of other programs' files perhaps none of ``DTYPES``."""
-    shape: tuple[int, ...]
-    begin: int
-    """Where its bytes begin, counted from the end of the table."""
-    end: int
-
-
 class Spec(NamedTuple):
-    """Shape and dtype of an array that was not read yet."""
+    """Shape and dtype of an array in a file."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
 
     @property
     def size(self) -> int:
-        """Its number of elements."""
+        """The number of elements."""
         return math.prod(self.shape)
 
     @property
     def nbytes(self) -> int:
-        """Its size in bytes."""
+        """The size in bytes."""
         return self.size * self.dtype.itemsize
 
 
-class Table(NamedTuple):
-    """What stands before the arrays of a file."""
+class TensorFile:
+    """An open file: metadata and specs are read at once, arrays when they are asked for. A context manager."""
 
-    metadata: dict[str, str]
-    entries: list[Entry]
-    """In the order of their places."""
-    start: int
-    """Where the arrays begin in the file."""
+    def __init__(self, path: Path) -> None:
+        """Opens the file.
 
+        Raises:
+            Malformed: if the table is too large, or holds what the library accepts but no program writes.
+            SafetensorError: if it is not a valid safetensors file.
+            OSError: if it cannot be read.
+        """
+        _check_table(path)
+        self._file = safe_open(path, framework="numpy", backend="pread")
+        self.metadata: dict[str, str] = self._file.metadata() or {}
+        self.specs: dict[str, Spec] = {}
+        """By name, in the order of the offsets."""
+        for name in self._file.offset_keys():
+            array = self._file.get_slice(name)
+            if (dtype := array.get_dtype()) not in DTYPES:
+                raise Malformed(f"{shown(name)} has the dtype {shown(dtype)}, which rejeu does not write")
+            self.specs[name] = Spec(tuple(array.get_shape()), np.dtype(DTYPES[dtype]))
 
-def parse_json(text: str) -> Any:
-    """Returns the value of a JSON text, of bounded depth, without names given twice or numbers that are none.
+    def read(self, name: str) -> np.ndarray:
+        """Returns an array.
 
-    Raises:
-        Malformed: if it is no such text.
-    """
-    _check_depth(text)
-    try:
-        return json.loads(
-            text,
-            parse_constant=_refuse_constant,
-            parse_float=_finite,
-            parse_int=_whole,
-            object_pairs_hook=_without_duplicates,
-        )
-    except Malformed:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise Malformed(f"no JSON: {str(error)[:80]}") from None
+        Raises:
+            SafetensorError: if the file ends before the array does.
+        """
+        return self._file.get_tensor(name)
 
+    def __enter__(self) -> TensorFile:
+        return self
 
-def read_table(file: BinaryIO, size: int) -> Table:
-    """Reads and checks the table of a file of ``size`` bytes; the arrays lie side by side in what follows it.
-
-    Raises:
-        Malformed: unless every entry says what it should, and all of them fill the file exactly.
-    """
-    prefix = file.read(8)
-    length = int.from_bytes(prefix, "little")
-    if len(prefix) < 8 or length > size - 8:
-        raise Malformed("it ends before its table does")
-    if length > MAX_TABLE:
-        raise Malformed(f"its table of {length} bytes is longer than {MAX_TABLE}")
-    content = file.read(length)
-    if len(content) < length:
-        raise Malformed("it ends before its table does")
-    try:
-        table = parse_json(content.decode("utf-8"))
-    except UnicodeDecodeError:
-        raise Malformed("its table is no text") from None
-    if not isinstance(table, dict):
-        raise Malformed("its table is no JSON object")
-    metadata = table.pop(METADATA, {})
-    if not isinstance(metadata, dict) or not all(isinstance(value, str) for value in metadata.values()):
-        raise Malformed("its metadata are not texts by name")
-    entries = sorted((_entry(name, value) for name, value in table.items()), key=lambda e: (e.begin, e.end))
-    place = 0
-    for entry in entries:
-        if entry.begin != place:
-            raise Malformed(f"{shown(entry.name)} begins at {entry.begin} where {place} is expected")
-        place = entry.end
-    if place != size - 8 - length:
-        raise Malformed(f"its arrays have {place} bytes and {size - 8 - length} follow the table")
-    return Table(metadata, entries, 8 + length)
+    def __exit__(self, *_: object) -> None:
+        self._file.__exit__(None, None, None)
 
 
-def read_array(file: BinaryIO, entry: Entry) -> np.ndarray:
-    """Reads the array that begins where ``file`` stands; its dtype is one of ``DTYPES``.
+def contiguous(name: str, value: Any) -> np.ndarray:
+    """Returns an array as it is written: contiguous and little-endian.
 
     Raises:
-        Malformed: if the file ends before it, or truth values are neither 0 nor 1.
-        MemoryError: if there is no room for it.
-    """
-    dtype = np.dtype(DTYPES[entry.dtype]).newbyteorder("<")
-    array = np.empty(entry.shape, dtype)
-    if file.readinto(as_bytes(array)) != array.nbytes:  # type: ignore[attr-defined]
-        raise Malformed(f"it ends within {shown(entry.name)}")
-    if entry.dtype == "BOOL" and array.view(np.uint8).max(initial=0) > 1:
-        raise Malformed(f"{shown(entry.name)} holds truth values other than 0 and 1")
-    return array.astype(dtype.newbyteorder("="), copy=False)
-
-
-def plain(name: str, value: Any) -> np.ndarray:
-    """Returns an array as its bytes are written: contiguous, little-endian.
-
-    Raises:
-        TypeError: for a dtype that the format has not, or that is not read again.
+        TypeError: for other dtypes than those in ``DTYPES``.
     """
     array = np.asarray(value)
     if array.dtype.name not in DTYPES.values():
@@ -159,113 +93,48 @@ def plain(name: str, value: Any) -> np.ndarray:
 
 
 def as_bytes(array: np.ndarray) -> memoryview:
-    """Returns the bytes of a contiguous array, not copied."""
+    """Returns the bytes of a contiguous array without copying them."""
     return array.reshape(-1).view(np.uint8).data
 
 
-def layout(arrays: Mapping[str, Any]) -> list[Entry]:
-    """Returns where each array is to lie: the widest numbers first, so that all are aligned, then by name."""
-    kinds = {dtype: name for name, dtype in DTYPES.items()}
-    sized = [(np.asarray(value).dtype, name, np.shape(value)) for name, value in arrays.items()]
-    entries, place = [], 0
-    for dtype, name, shape in sorted(sized, key=lambda part: (-part[0].itemsize, part[1])):
-        end = place + math.prod(shape) * dtype.itemsize
-        entries.append(Entry(name, kinds[dtype.name], shape, place, end))
-        place = end
-    return entries
+def table(arrays: Mapping[str, Any], metadata: Mapping[str, str]) -> tuple[bytes, list[str]]:
+    """Returns everything that precedes the arrays in a file, and their names in the order in which they follow.
 
-
-def table_bytes(entries: list[Entry], metadata: Mapping[str, str]) -> bytes:
-    """Returns what stands before the arrays of a file.
+    The widest dtypes come first, so that all arrays are aligned.
 
     Raises:
-        ValueError: if it would be too long to be read again, or a name is no text.
+        ValueError: if the table is too large, or a name is not valid.
     """
-    table: dict[str, Any] = {METADATA: dict(metadata)}
-    for entry in entries:
-        if entry.name == METADATA:
-            raise ValueError(f"no array may be called {METADATA}")
-        table[entry.name] = {
-            "dtype": entry.dtype,
-            "shape": list(entry.shape),
-            "data_offsets": [entry.begin, entry.end],
-        }
-    text = json.dumps(table, separators=(",", ":"), ensure_ascii=False)
-    parse_json(text)
-    content = text.encode("utf-8")
+    if METADATA in arrays:
+        raise ValueError(f"no array may be called {METADATA}")
+    codes = {dtype: code for code, dtype in DTYPES.items()}
+    dtypes = {name: np.asarray(value).dtype for name, value in arrays.items()}
+    names = sorted(arrays, key=lambda name: (-dtypes[name].itemsize, name))
+    entries: dict[str, Any] = {METADATA: dict(metadata)}
+    begin = 0
+    for name in names:
+        shape = np.shape(arrays[name])
+        end = begin + math.prod(shape) * dtypes[name].itemsize
+        entries[name] = {"dtype": codes[dtypes[name].name], "shape": shape, "data_offsets": [begin, end]}
+        begin = end
+    content = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
     content += b" " * (-len(content) % 8)
     if len(content) > MAX_TABLE:
-        raise ValueError(f"the header has {len(content)} bytes and may have {MAX_TABLE}; keep many numbers in arrays")
-    return len(content).to_bytes(8, "little") + content
+        raise ValueError(
+            f"the header has {len(content)} bytes, expected at most {MAX_TABLE}; use arrays for many numbers"
+        )
+    return len(content).to_bytes(8, "little") + content, names
 
 
-def shown(name: Any) -> str:
-    """Returns a name from a file as an error may show it: on one line, and not endless."""
-    text = str(name)
-    text = text if text.isprintable() else ascii(text)[1:-1]
-    return text if len(text) <= 100 else text[:97] + "..."
-
-
-def _entry(name: str, value: Any) -> Entry:
-    if not isinstance(value, dict) or set(value) != {"dtype", "shape", "data_offsets"}:
-        raise Malformed(f"the entry of {shown(name)} is not dtype, shape and data_offsets")
-    dtype, shape, offsets = value["dtype"], value["shape"], value["data_offsets"]
-    if not isinstance(dtype, str) or not _whole_numbers(shape) or not _whole_numbers(offsets) or len(offsets) != 2:
-        raise Malformed(f"the entry of {shown(name)} is not a dtype, whole numbers and two places")
-    if len(shape) > MAX_AXES or math.prod(max(n, 1) for n in shape) >= 2**60:
-        raise Malformed(f"the shape of {shown(name)} is beyond reason")
-    begin, end = offsets
-    if begin > end:
-        raise Malformed(f"{shown(name)} ends before it begins")
-    if dtype in DTYPES and math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize != end - begin:
-        raise Malformed(f"{shown(name)} has {end - begin} bytes, which is not {DTYPES[dtype]}{shape}")
-    return Entry(name, dtype, tuple(shape), begin, end)
-
-
-def _whole_numbers(value: Any) -> bool:
-    return isinstance(value, list) and all(type(n) is int and n >= 0 for n in value)
-
-
-def _check_depth(text: str) -> None:
-    """Raises ``Malformed`` where brackets go too deep or there are too many; in time proportional to the text."""
-    depth, in_string = 0, False
-    for count, match in enumerate(re.finditer(r'\\.?|["\[\]{}]', text, re.DOTALL)):
-        token = match[0]
-        if count > MAX_TOKENS:
-            raise Malformed(f"JSON of more than {MAX_TOKENS} brackets and quotes")
-        if token == '"':
-            in_string = not in_string
-        elif not in_string and token in "[{":
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise Malformed(f"JSON more than {MAX_DEPTH} brackets deep")
-        elif not in_string and token in "]}":
-            depth -= 1
-
-
-def _refuse_constant(name: str) -> None:
-    raise Malformed(f"{name} is no JSON number")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise Malformed(f"{text[:20]} is no finite number")
-    return value
-
-
-def _whole(text: str) -> int:
-    if len(text) > 40 or not -LARGEST_INTEGER < (value := int(text)) < LARGEST_INTEGER:
-        raise Malformed("a whole number of more than 128 bits")
-    return value
-
-
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        seen: set[str] = set()
-        for name, _ in pairs:
-            if name in seen:
-                raise Malformed(f"the name {shown(name)} is given twice")
-            seen.add(name)
-    return found
+def _check_table(path: Path) -> None:
+    """Raises ``Malformed`` for what the library accepts although no program writes it; invalid files are left to it."""
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+        if size > MAX_TABLE:  # else the objects built from it could take gigabytes
+            raise Malformed(f"its table has {size} bytes, expected at most {MAX_TABLE}")
+        entries = parse_json(file.read(size))  # refuses names that occur twice: readers differ in which one they use
+    if not isinstance(entries, dict):
+        raise Malformed("its table is not a JSON object")
+    for name, entry in entries.items():
+        if name != METADATA and (not isinstance(entry, dict) or len(entry) != 3):  # a field that other readers may use
+            raise Malformed(f"the entry of {shown(name)} is not dtype, shape and data_offsets")

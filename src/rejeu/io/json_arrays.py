@@ -1,7 +1,7 @@
-"""Nested plain data as JSON and arrays by name, and back, each value of the type that it was.
+"""Nested data as JSON and named arrays, and back, with the type of every value preserved.
 
-What environments and callbacks remember is made of numbers, texts, lists, tuples, dicts and arrays. JSON alone would
-turn tuples into lists and knows no arrays; with the two apart, both fit in a file that is safe to open.
+The states of environments and callbacks consist of numbers, strings, lists, tuples, dicts and arrays. JSON alone would turn
+tuples into lists and has no arrays.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 
 from rejeu.errors import CheckpointError
 
-DEEPEST = 32
-"""Most levels of nesting."""
+MAX_DEPTH = 32
+"""Upper limit on the levels of nesting."""
 
 
 def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
     """Returns ``value`` as JSON; its arrays are added to ``arrays`` under names that begin with ``name``.
 
     Raises:
-        TypeError: if something in it is no plain data, with its place.
+        TypeError: for a value of another type; it names its place.
 
     >>> arrays = {}
     >>> encode({"state": (1, np.float32(2.5))}, arrays, "env")
@@ -42,19 +42,17 @@ def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
         return parts if isinstance(value, list) else {"tuple": parts}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {"dict": {key: encode(part, arrays, f"{name}.{key}") for key, part in value.items()}}
-    raise TypeError(
-        f"{name} is a {type(value).__name__}; only numbers, texts, lists, tuples, dicts and arrays are kept"
-    )
+    raise TypeError(f"{name} is a {type(value).__name__}; expected numbers, strings, lists, tuples, dicts and arrays")
 
 
 def decode(value: Any, arrays: Mapping[str, np.ndarray], depth: int = 0) -> Any:
-    """Returns what :func:`encode` was given.
+    """Returns the value that :func:`encode` encoded.
 
     Raises:
-        CheckpointError: if it is nothing that :func:`encode` returns.
+        CheckpointError: if ``value`` cannot come from :func:`encode`.
     """
-    if depth > DEEPEST:
-        raise CheckpointError(f"plain data is nested more than {DEEPEST} deep; the file is damaged")
+    if depth > MAX_DEPTH:
+        raise CheckpointError(f"the data are nested more than {MAX_DEPTH} deep; the file is damaged")
     if isinstance(value, list):
         return [decode(part, arrays, depth + 1) for part in value]
     if not isinstance(value, dict):
@@ -68,4 +66,4 @@ def decode(value: Any, arrays: Mapping[str, np.ndarray], depth: int = 0) -> Any:
         return float(content)
     if kind in ("array", "scalar") and isinstance(content, str) and content in arrays:
         return arrays[content] if kind == "array" else arrays[content][()]
-    raise CheckpointError("plain data has an unknown form; the file is damaged")
+    raise CheckpointError("the data have an unknown form; the file is damaged")

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rejeu.errors import CheckpointError
-from rejeu.io import plain
+from rejeu.io import json_arrays
 
 NUMBERS = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 ARRAYS = hnp.arrays(
@@ -39,21 +39,21 @@ def same(one, two):
 @given(DATA)
 def test_everything_comes_back_as_what_it_was(value):
     arrays = {}
-    text = json.dumps(plain.encode(value, arrays, "x"), allow_nan=False)
-    assert same(plain.decode(json.loads(text), arrays), value)
+    text = json.dumps(json_arrays.encode(value, arrays, "x"), allow_nan=False)
+    assert same(json_arrays.decode(json.loads(text), arrays), value)
 
 
 def test_arrays_are_copies():
     array, arrays = np.zeros(3), {}
-    plain.encode([array], arrays, "x")
+    json_arrays.encode([array], arrays, "x")
     array[0] = 1
     assert arrays["x.0"].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("value", [object(), {1: 2}, {"a": {3}}, np.array(["text"]), np.array([None]), 1j, b"bytes"])
 def test_other_things_are_refused_with_their_place(value):
-    with pytest.raises(TypeError, match=r"^x\.1.* only numbers, texts"):
-        plain.encode([0, value], {}, "x")
+    with pytest.raises(TypeError, match=r"^x\.1.* expected numbers, strings"):
+        json_arrays.encode([0, value], {}, "x")
 
 
 def nested(depth):
@@ -79,4 +79,4 @@ def nested(depth):
 )
 def test_what_encode_never_returns_is_refused(value):
     with pytest.raises(CheckpointError):
-        plain.decode(value, {})
+        json_arrays.decode(value, {})

@@ -1,0 +1,110 @@
+"""JSON from files: parsed strictly, and converted to typed records with ``msgspec``, which checks types and bounds."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from rejeu.errors import CheckpointError
+
+T = TypeVar("T")
+
+Count = Annotated[int, Meta(ge=0, le=2**62)]
+"""An integer from 0."""
+Positive = Annotated[int, Meta(ge=1, le=2**62)]
+"""An integer from 1."""
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+"""The seed of a NumPy generator."""
+EnvCount = Annotated[int, Meta(ge=1, le=4096)]
+"""A number of environments that a file may ask for."""
+Seconds = Annotated[float, Meta(ge=0, le=1e300)]
+"""A finite duration."""
+
+
+class Malformed(ValueError):
+    """A file does not follow its format; the message says where."""
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Returns the value of a JSON document; unlike ``json.loads``, refuses repeated names, NaN and infinities.
+
+    Raises:
+        Malformed: if the document is not valid.
+
+    >>> parse_json('{"a": NaN}')
+    Traceback (most recent call last):
+        ...
+    rejeu.io.records.Malformed: NaN is not valid JSON
+    """
+    try:
+        return json.loads(
+            text, parse_constant=_refuse_constant, parse_float=_finite, object_pairs_hook=_without_duplicates
+        )
+    except Malformed:
+        raise
+    except UnicodeDecodeError:
+        raise Malformed("it is not valid UTF-8") from None
+    except RecursionError:
+        raise Malformed("it is nested too deeply") from None
+    except ValueError as error:
+        raise Malformed(f"it is not valid JSON: {str(error)[:80]}") from None
+
+
+def convert(value: Any, kind: type[T]) -> T:
+    """Returns a JSON value, or one with arrays, as a record of type ``kind``.
+
+    Raises:
+        CheckpointError: if types or bounds differ; it names the field, what was received and what was expected.
+
+    >>> convert([-1], list[Count])
+    Traceback (most recent call last):
+        ...
+    rejeu.errors.CheckpointError: [0]=-1: expected `int` >= 0
+    """
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at ")
+        raise CheckpointError(f"{_received(value, place)}{problem[:1].lower()}{problem[1:]}") from None
+
+
+def shown(value: Any, length: int = 100) -> str:
+    """Returns a value from a file as an error message may contain it: on one line, and shortened."""
+    text = str(value)
+    text = text if text.isprintable() else ascii(text)[1:-1]
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def _received(value: Any, place: str) -> str:
+    """Returns ``field=value: `` for a place such as ``$.counters.step``, or the place alone where it has no index."""
+    name = place.replace("`", "").removeprefix("$").lstrip(".")
+    if not name or "..." in name or " " in name:
+        return f"{name}: " if name else ""
+    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", name):
+        value = value[key] if key else value[int(index)]
+    return f"{name}={shown(repr(value), 40)}: "
+
+
+def _refuse_constant(name: str) -> None:
+    raise Malformed(f"{name} is not valid JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise Malformed(f"{text[:20]} is out of range")
+    return value
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise Malformed(f"the name {shown(twice)} occurs twice")
+    return found
