@@ -31,17 +31,6 @@ def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     return int(value)
 
 
-def whole_exact(value: Any) -> int:
-    """Returns ``value`` if it is an int in [0, 2^128), as the state of a NumPy generator is.
-
-    Raises:
-        ValueError: if it is not.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**128:
-        raise ValueError(f"{value!r} must be a whole number from 0 to 2**128 - 1")
-    return value
-
-
 def number(key: str, value: Any, least: float = -math.inf, above: float = -math.inf, most: float = math.inf) -> float:
     """Returns ``value`` as a finite float within ``[least, most]`` and greater than ``above``.
 

@@ -51,8 +51,7 @@ ALLOWED = {
     # The names of the fields of our own dataclasses, and settings that a class lists in its own source.
     "agents/base.py": {"getattr"},
     "agents/description.py": {"getattr"},
-    "agents/checkpoints.py": {"getattr"},
-    "agents/resuming.py": {"getattr"},
+    "agents/resume.py": {"getattr"},
     "callbacks/evaluate.py": {"getattr"},
     "cli/run_folder.py": {"getattr"},
     "envs/snapshot.py": {"getattr"},

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import gymnasium as gym
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from rejeu import spaces, validation, xla
 from rejeu.agents.policy import check_policy
@@ -16,6 +18,7 @@ from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
+from rejeu.io.records import Positive, Seed, convert
 from rejeu.networks import settled
 
 if TYPE_CHECKING:
@@ -24,77 +27,97 @@ if TYPE_CHECKING:
 
 BEST_WINDOW = 20
 """Training episodes over whose mean return the best weights are judged by default."""
-COUNTERS = ("step", "steps_before", "episode", "n_updates")
-"""What a model file counts; all below 2^32."""
-GIVEN = ("policy", "seed", "success_threshold", "stats_window_size", "best_window")
-"""Constructor arguments that a model file keeps, and that may be given otherwise when it is loaded."""
 SIZES = ("n_critics", "n_quantiles")
-"""Hyper-parameters outside ``policy_kwargs`` that networks grow with."""
-MOST_LAYERS = 256
-"""Most layers of any kind that the networks of a file may have: each costs time to build, even if it is empty."""
-SMALL = 2**16
-"""Widths up to here cost nothing to look at, whatever arrays a file has."""
+"""Hyper-parameters outside ``policy_kwargs`` that set the size of networks."""
+MAX_LAYERS = 256
+"""Upper limit on the layers of any kind in the networks of a file: each takes time to build, even if it is empty."""
+SMALL_WIDTH = 2**16
+"""Widths up to this one are accepted whatever the size of the file."""
 WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
-"""What Python raises where values of a file are not what they should be."""
+"""Exceptions that invalid values of a file can cause."""
+
+Count32 = Annotated[int, Meta(ge=0, lt=2**32)]
+
+
+class Counters(msgspec.Struct):
+    """The counters of a model file."""
+
+    step: Count32
+    steps_before: Count32
+    episode: Count32
+    n_updates: Count32
+    episodes_before: Count32 = 0  # missing in older files
+
+    def __post_init__(self) -> None:
+        if self.steps_before > self.step or self.episodes_before > self.episode:
+            raise ValueError(f"steps_before={self.steps_before} or episodes_before={self.episodes_before} is too large")
+
+
+class GeneratorState(msgspec.Struct):
+    """The state of NumPy's PCG64."""
+
+    state: int
+    inc: int
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.state < 2**128 and 0 <= self.inc < 2**128):
+            raise ValueError("expected state and inc from 0 to 2**128 - 1")
+
+
+class AgentHeader(msgspec.Struct, kw_only=True):
+    """The header of a model file, which :func:`header` returns; unknown fields are ignored."""
+
+    config: dict[str, Any]
+    policy: str
+    observation_space: Any
+    action_space: Any
+    seed: Seed
+    stats_window_size: Positive
+    counters: Counters
+    rng: GeneratorState
+    success_threshold: float | None = None
+    best_window: Positive = BEST_WINDOW
 
 
 class Saved(NamedTuple):
-    """What a model file says beside its arrays."""
+    """The interpreted header of a model file."""
 
+    header: AgentHeader
     config: Any
     """The algorithm's configuration."""
     observation_space: gym.Space
     action_space: gym.Space
-    counters: dict[str, int]
-    rng: dict[str, int]
-    """State of the NumPy generator."""
-    policy: str
-    seed: int
-    success_threshold: float | None
-    stats_window_size: int
-    best_window: int
 
 
-def interpret(
-    header: Mapping[str, Any],
-    room: int,
-    kind: type,
-    given: Mapping[str, Any],
-    changes: Mapping[str, Any],
-) -> Saved:
-    """Returns what a header says, with some of it changed; builds nothing larger than the file.
+def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[str, Any]) -> Saved:
+    """Returns what a header says; builds nothing larger than the file.
 
     Args:
         header: JSON values of schema ``checkpoint.SCHEMA``.
         room: bytes that the file holds.
         kind: class of the algorithm's configuration.
-        given: some of ``GIVEN`` as the user has them.
-        changes: hyper-parameters as the user has them.
+        changes: hyper-parameters that the user sets otherwise than they were saved.
 
     Raises:
-        CheckpointError: where the file is at fault.
-        TypeError, ValueError: where ``given`` or ``changes`` are.
+        CheckpointError: if the header is damaged.
+        TypeError, ValueError: if ``changes`` are invalid.
     """
     try:
-        return _interpret({**header, **given}, room, kind, changes)
+        saved = convert(header, AgentHeader)
+        said = _with_widths(saved.config, kind)
+        config = configs.rebuild(kind, said, _torso(changes))
+        largest = max(spaces.LARGEST, room)
+        observation_space = spaces.rebuild(saved.observation_space, largest)
+        check_policy(saved.policy, observation_space)
+        action_space = spaces.rebuild(saved.action_space, largest)
     except WRONG as error:
-        own = _torso(changes)
-        others = given or changes.keys() - own.keys()
-        if isinstance(error, CheckpointError) or (others and _is_sound(header, room, kind, own)):
-            raise
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
-
-
-def _is_sound(*arguments: Any) -> bool:
-    try:
-        _interpret(*arguments)
-    except WRONG:
-        return False
-    return True
+    check_sizes(config, room)
+    return Saved(saved, configs.rebuild(kind, said, changes) if changes else config, observation_space, action_space)
 
 
 def brief(error: BaseException) -> str:
-    """Returns what an error says on one line, cut where it repeats values of a file at length."""
+    """Returns the message of an error on one line, shortened."""
     text = " ".join((str(error) or type(error).__name__).split())
     return text if len(text) <= 400 else text[:397] + "..."
 
@@ -110,50 +133,8 @@ def whole_seed(seed: Any) -> int:
     return int(seed)
 
 
-def _interpret(
-    header: Mapping[str, Any],
-    room: int,
-    kind: type,
-    changes: Mapping[str, Any],
-) -> Saved:
-    try:
-        config: Any = configs.rebuild(kind, _with_widths(header["config"], kind), changes)
-        check_sizes(config, room)
-        largest = max(spaces.LARGEST, room)
-        observation_space = spaces.rebuild(header["observation_space"], largest)
-        threshold = header.get("success_threshold")
-        policy = header["policy"]
-        check_policy(policy, observation_space)
-        return Saved(
-            config,
-            observation_space,
-            spaces.rebuild(header["action_space"], largest),
-            check_counters(header["counters"]),
-            {key: validation.whole_exact(header["rng"][key]) for key in ("state", "inc")},
-            policy,
-            whole_seed(header["seed"]),
-            None if threshold is None else validation.number("success_threshold", threshold),
-            validation.whole("stats_window_size", header["stats_window_size"], 1),
-            validation.whole("best_window", header.get("best_window", BEST_WINDOW), 1),
-        )
-    except KeyError as error:
-        raise CheckpointError(f"the header is damaged or of another version: {brief(error)} is missing") from None
-
-
-def check_counters(saved: Mapping[str, Any]) -> dict[str, int]:
-    """Returns the counters of a model file; what was counted before is no more than what was counted in all.
-
-    Raises:
-        KeyError, TypeError, ValueError: if they are damaged.
-    """
-    counters = {key: validation.whole(key, saved[key], 0, 2**32 - 1) for key in COUNTERS}
-    validation.whole("steps_before", counters["steps_before"], 0, counters["step"])
-    before = saved.get("episodes_before", 0)  # older files do not have it
-    return counters | {"episodes_before": validation.whole("episodes_before", before, 0, counters["episode"])}
-
-
 def check_space(description: Any, own: gym.Space, kind: str) -> None:
-    """Raises ``ValueError`` unless a space of a file is an agent's own: of observations in structure, of actions in bounds.
+    """Raises ``ValueError`` unless a space of a file is the agent's, apart from the bounds of observations.
 
     Args:
         description: JSON values.
@@ -170,7 +151,7 @@ def check_space(description: Any, own: gym.Space, kind: str) -> None:
 def _with_widths(config: Any, kind: Any) -> dict[str, Any]:
     """Returns the configuration of a file with the widths of hidden layers that it leaves to the default.
 
-    Files say them since the default depends on the observation. In those written before, it did not.
+    Only older files leave them out, from when the default did not depend on the observation.
     """
     shape = config.get("policy_kwargs")
     shape = {} if shape is None else shape
@@ -178,26 +159,26 @@ def _with_widths(config: Any, kind: Any) -> dict[str, Any]:
 
 
 def check_sizes(config: Any, room: int) -> None:
-    """Raises ``CheckpointError`` where a configuration asks for networks larger than all arrays together.
+    """Raises ``CheckpointError`` if the networks of a configuration are larger than all arrays of the file together.
 
-    Every layer of that width, or ensemble of that number, would have at least as many numbers. So what is built to
-    compare shapes is no larger than what was read.
+    A layer of that width, or an ensemble of that size, has at least as many numbers. What is built to compare shapes is
+    then no larger than the file.
     """
-    largest = max(SMALL, room)
+    largest = max(SMALL_WIDTH, room)
     policy = config.policy_kwargs
     widths = {key: value for key, value in vars(policy).items() if isinstance(value, tuple)}
     numbers = {key: value for key, value in vars(policy).items() if type(value) is int}
     numbers |= {key: value for key, value in vars(config).items() if key in SIZES}
     for key, layers in {**widths, "n_blocks": range(policy.n_blocks)}.items():
-        if len(layers) > MOST_LAYERS:
-            raise CheckpointError(f"{key} has {len(layers)} layers, expected {MOST_LAYERS} at most")
+        if len(layers) > MAX_LAYERS:
+            raise CheckpointError(f"{key} has {len(layers)} layers, expected {MAX_LAYERS} at most")
     for key, value in [*numbers.items(), *((key, max(layers, default=0)) for key, layers in widths.items())]:
         if value > largest:
             raise CheckpointError(f"{key}={value} is larger than all that the file holds; it has other networks")
 
 
 def _torso(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns of the changes only a torso, without which a file that has one cannot be judged."""
+    """Returns only the torso among the changes; a file with a custom torso cannot be checked without it."""
     policy = changes.get("policy_kwargs")
     if isinstance(policy, Mapping) and "torso" in policy:
         return {"policy_kwargs": {"torso": policy["torso"]}}
@@ -220,11 +201,11 @@ AGENT_ARGUMENTS = {
     "episode. Raising it is surer to find a policy that is good again, as a single return may be luck.",
     "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
 }
-"""What every agent takes beside its hyper-parameters, with its meaning."""
+"""Arguments of every agent in addition to its hyper-parameters, with their meanings."""
 
 
 def header(agent: Agent) -> dict[str, Any]:
-    """Returns all of an agent that a model file holds beside its arrays, as JSON values."""
+    """Returns the header of an agent's model file: everything except arrays, as JSON values."""
     run = agent.run
     return {
         "algorithm": agent.name,
@@ -250,7 +231,7 @@ def header(agent: Agent) -> dict[str, Any]:
 
 
 def made_from(agent: Agent) -> dict[str, Any] | None:
-    """Returns id and keyword arguments of an agent's environments for a header, None where a file may not hold them."""
+    """Returns id and keyword arguments of an agent's environments for a header; None if a file may not hold them."""
     source = agent._trained_on if agent.run.env is None else agent.run.env.made_from
     if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
         return None
@@ -258,7 +239,7 @@ def made_from(agent: Agent) -> dict[str, Any] | None:
 
 
 def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
-    """Returns what :func:`made_from` wrote, None where there is none or where it is more than a file may say."""
+    """Returns what :func:`made_from` wrote; None if it is missing or not what a file may hold."""
     said = header.get("made_from")
     if not isinstance(said, dict) or not is_plain_id(said.get("env_id")) or not are_plain(said.get("env_kwargs")):
         return None
@@ -266,7 +247,7 @@ def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
 
 
 def find(path: str | Path) -> str | Path:
-    """Returns the model of a run folder, the best one if there is one, or the path itself if it is no folder.
+    """Returns the model of a run folder, the best one if it exists, or the path itself if it is not a folder.
 
     Raises:
         FileNotFoundError: if a folder holds no model.
@@ -290,15 +271,15 @@ def load(
     threads: int | None = None,
     prefix: str = "",
 ) -> A:
-    """Returns the agent that a file describes; its buffer is empty. No array is read that the agent does not have.
+    """Returns the agent of a file, with an empty buffer. Only arrays that the agent has are read.
 
     Args:
         cls: the class of the agent.
         file: its header holds what :func:`header` returned.
-        make_env: returns where it goes on learning, None for an agent that only predicts.
-        changes: constructor arguments or hyper-parameters to set otherwise.
-        threads: that JAX's device is to have; None for the number that suits the agent.
-        prefix: of the names of everything learnt, in the file.
+        make_env: returns the environment to continue training in; None for an agent that only predicts.
+        changes: constructor arguments or hyper-parameters that replace the saved ones.
+        threads: of JAX's device; None for the number that suits the agent.
+        prefix: of the names of the agent's arrays in the file.
 
     Raises:
         CheckpointError: if something is damaged or of another algorithm or environment.
@@ -308,16 +289,12 @@ def load(
         other = str(header.get("algorithm"))[:40]
         raise CheckpointError(f"{path} holds a {other} agent, not {name}; use rejeu.load(path) or rejeu.{other}.load")
     own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
-    given = {key: own.pop(key) for key in GIVEN if key in own}
     try:
-        saved = interpret(header, file.room, cls.algorithm.Config, given, changes)
+        saved = interpret(header, file.room, cls.algorithm.Config, changes)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
     agent = cls.__new__(cls)
-    agent._set_up(
-        saved.policy, saved.config, saved.seed, own.pop("verbose", 0), own.pop("tensorboard_log", None),
-        saved.stats_window_size, saved.success_threshold, saved.best_window,
-    )  # fmt: skip
+    _set_up(agent, saved, own)
     try:
         agent._build(saved.observation_space, saved.action_space)
     except WRONG as error:
@@ -333,7 +310,8 @@ def load(
     n_envs = 1 if vector is None else vector.n_envs
     xla.start_device(agent._threads(n_envs) if threads is None else threads)
     try:
-        stand(agent, vector, state, saved)
+        agent._start(vector, agent.learner.pack(state))
+        _restore_counters(agent, saved.header)
     except (ArithmeticError, MemoryError, ValueError) as error:
         if changes.keys() & {"buffer_size", "n_steps", "n_episodes"}:
             raise
@@ -341,12 +319,34 @@ def load(
     return agent
 
 
-def stand(agent: Agent, vector: VectorEnv | None, state: Any, saved: Saved) -> None:
-    """Puts a loaded agent where the saved one stood; the replay buffer is empty until one is loaded."""
-    agent._start(vector, agent.learner.pack(state))
+def _set_up(agent: Agent, saved: Saved, given: Mapping[str, Any]) -> None:
+    """Sets what a model file says of an agent, and what the user sets otherwise.
+
+    Raises:
+        ValueError: if ``given`` is invalid.
+    """
+    policy, seed, stats_window_size, success_threshold, best_window = (
+        given.get(key, getattr(saved.header, key))
+        for key in ("policy", "seed", "stats_window_size", "success_threshold", "best_window")
+    )
+    check_policy(policy, saved.observation_space)
+    agent._set_up(
+        policy,
+        saved.config,
+        whole_seed(seed),
+        given.get("verbose", 0),
+        given.get("tensorboard_log"),
+        validation.whole("stats_window_size", stats_window_size, 1),
+        None if success_threshold is None else validation.number("success_threshold", success_threshold),
+        validation.whole("best_window", best_window, 1),
+    )
+
+
+def _restore_counters(agent: Agent, saved: AgentHeader) -> None:
+    """Sets the counters and random numbers of a loaded agent; its replay buffer is empty until one is loaded."""
     run, counters = agent.run, saved.counters
-    run.step, run.episode, run.n_updates = counters["step"], counters["episode"], counters["n_updates"]
-    run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": saved.rng}
+    run.step, run.episode, run.n_updates = counters.step, counters.episode, counters.n_updates
+    run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": msgspec.structs.asdict(saved.rng)}
     run.learn_from = agent._learn_from(run.step)
     run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
-    agent._steps_before, agent._episodes_before = counters["steps_before"], counters["episodes_before"]
+    agent._steps_before, agent._episodes_before = counters.steps_before, counters.episodes_before
