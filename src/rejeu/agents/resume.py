@@ -16,7 +16,7 @@ from jax import Array
 
 from rejeu import spaces, xla
 from rejeu.agents import model_files
-from rejeu.agents.run_files import PER_ENV, ROWS_FILE, SCALARS, RowFiles, run_files
+from rejeu.agents.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_files
 from rejeu.agents.training import Call
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.rollout import RolloutBuffer
@@ -25,26 +25,23 @@ from rejeu.envs.base import DivergedError
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, json_arrays
+from rejeu.io.records import MAX_ENVS, convert
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Run, is_finite
-from rejeu.validation import number, whole
+from rejeu.validation import number
 
 if TYPE_CHECKING:
     from rejeu.agents.base import Agent
 
 A = TypeVar("A", bound="Agent")
 
-MOST_BESIDE = 2**26
-"""Bytes that a checkpoint may hold beside weights and experience, for history, environments and callbacks; more, which nothing
-else bounds, must not be a hole in the file."""
-MOST_ZEROS = 64
-"""How many times as large as the file without its holes they may then be."""
+MAX_OTHER_BYTES = 2**26
+"""Upper limit on the bytes of history, environments and callbacks in a checkpoint; beyond it they must not be a hole in the
+file."""
+MAX_ZEROS = 64
+"""Upper limit on their size relative to that of the file without its holes."""
 PER_BUFFER = ("heads", "started")
 """Arrays of a replay buffer and of a rollout with one entry for each environment; a run has one of them."""
-MOST_ENVS = 4096
-"""More environments than so many are not made because a file says so."""
-MOST_THREADS = 1024
-"""More threads than so many are not started because a file says so."""
 
 
 class Resumed(NamedTuple):
@@ -96,25 +93,25 @@ def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
 
 def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
     """Returns the agent; environments that are made for it are closed with ``made``, should it be refused."""
-    path, header = file.path, file.header
+    path = file.path
     try:
-        rows = [_rows_name(name) for name in header["rows"]]
+        header = convert(file.header, RunHeader)
         buffer = checkpoint.within(file.specs, "run.buffer.")
         counted = " or ".join(str(buffer[name].size) for name in PER_BUFFER if name in buffer)
-        if counted != str(header["n_envs"]):
-            raise ValueError(f"it is of {header['n_envs']} environments, and its replay buffer of {counted or 'none'}")
+        if counted != str(header.n_envs):
+            raise ValueError(f"it is of {header.n_envs} environments, and its replay buffer of {counted or 'none'}")
     except model_files.WRONG as error:
         raise refusal(path, error) from error
 
     def make_env(agent: Agent) -> VectorEnv:
         if env is not None:
             vector = agent._vector(env, seed=agent.seed)
-            if vector.n_envs != header["n_envs"]:
-                raise CheckpointError(f"the run had {header['n_envs']} environments, and {vector.n_envs} are given")
+            if vector.n_envs != header.n_envs:
+                raise CheckpointError(f"the run had {header.n_envs} environments, and {vector.n_envs} are given")
             return vector
-        env_id, n_envs, backend = environment(path, header)
+        env_id, backend = environment(path, header)
         try:
-            vector = agent._vector(env_id, n_envs, backend, agent.seed)
+            vector = agent._vector(env_id, header.n_envs, backend, agent.seed)
             made.callback(vector.close)
             agent._check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:
@@ -124,17 +121,17 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
             ) from error
         return vector
 
-    agent = model_files.load(cls, file, make_env, changes, threads(path, header), "state.")
+    agent = model_files.load(cls, file, make_env, changes, header.threads, "state.")
     try:
         check_specs(agent, file)
-        saved = json_arrays.decode(header["run"], file.read("run."))
+        saved = convert(json_arrays.decode(header.run, file.read("run.")), SavedRun)
         best = checkpoint.within(file.read("best."), "best.")
-        parts = [read_rows(path.parent / name, agent) for name in rows]
+        parts = [read_rows(path.parent / name, agent) for name in header.rows]
         reason = restore(agent, saved, parts, best, path)
         agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
         if "train_freq" not in changes:
             check_owed(agent)
-        agent._run_id, agent._own_env = text(header["run_id"]), env is None
+        agent._run_id, agent._own_env = header.run_id, env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
     except model_files.WRONG as error:
@@ -142,7 +139,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     if parts:
         ring = agent.run.replay.ring
         heads = [part["head"] for part in parts]
-        agent._rows[path.parent.resolve()] = RowFiles(list(zip(rows, heads, strict=True)), ring, ring.version)
+        agent._rows[path.parent.resolve()] = RowFiles(list(zip(header.rows, heads, strict=True)), ring, ring.version)
     return agent
 
 
@@ -164,7 +161,7 @@ def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
     else:
         experience = 0 if buffer.priorities is None else 8 * buffer.ring.rows * buffer.ring.n_envs
     found = sum(spec.nbytes for spec in checkpoint.within(file.specs, "run.").values())
-    if found > experience + MOST_BESIDE and found > MOST_ZEROS * file.room:
+    if found > experience + MAX_OTHER_BYTES and found > MAX_ZEROS * file.room:
         raise ValueError(f"it says that it holds {found:,} bytes of the run, nearly all of them a hole in the file")
 
 
@@ -179,9 +176,10 @@ def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
         return file.read()
 
 
-def compared(agent: Agent, header: dict[str, Any]) -> Resumed:
-    """Returns how a run resumes whose environments stand where they stood."""
-    before, here = header.get("threads", xla.threads()), xla.threads()
+def compared(agent: Agent, header: RunHeader) -> Resumed:
+    """Returns how a run resumes whose environments are where they were."""
+    here = xla.threads()
+    before = here if header.threads is None else header.threads
     if before == here:
         return Resumed(agent.run.step, True, "")
     return Resumed(
@@ -192,16 +190,10 @@ def compared(agent: Agent, header: dict[str, Any]) -> Resumed:
 
 
 def refusal(path: Path, error: BaseException) -> CheckpointError:
-    """Returns what a checkpoint is refused with, from what was raised while its values were put in place."""
-    if isinstance(error, CheckpointError):
+    """Returns the error for a checkpoint whose values raised ``error``."""
+    if isinstance(error, CheckpointError) and str(path.parent) in str(error):
         return error
     return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {model_files.brief(error)}")
-
-
-def _rows_name(name: Any) -> str:
-    if not isinstance(name, str) or not ROWS_FILE.fullmatch(name):
-        raise CheckpointError(f"{str(name)[:40]!r} is no file of rows")
-    return name
 
 
 def check_owed(agent: Agent) -> None:
@@ -215,96 +207,99 @@ def check_owed(agent: Agent) -> None:
         raise ValueError(f"owed={agent.run.owed} is not below train_freq={frequency!r}")
 
 
-def threads(path: Path, header: dict[str, Any]) -> int | None:
-    """Returns the number of threads that a run computed with; None for a checkpoint that does not say.
-
-    Raises:
-        CheckpointError: if it cannot be that.
-    """
-    try:
-        return None if "threads" not in header else whole("threads", header["threads"], least=1, most=MOST_THREADS)
-    except ValueError as error:
-        raise refusal(path, error) from None
-
-
-def environment(path: Path, header: dict[str, Any]) -> tuple[str, int, Backend]:
-    """Returns id, number and backend of the environments that a run had.
+def environment(path: Path, header: RunHeader) -> tuple[str, Backend]:
+    """Returns id and backend of the environments of a run.
 
     Raises:
         CheckpointError: if the checkpoint does not say, or they were not made from an id.
     """
-    env_id, n_envs, backend = header.get("env_id"), header.get("n_envs"), header.get("backend")
-    if not isinstance(env_id, str) or backend not in BACKENDS or type(n_envs) is not int or not 0 < n_envs <= MOST_ENVS:
+    env_id, backend = header.env_id, header.backend
+    if not isinstance(env_id, str) or backend not in BACKENDS or header.n_envs > MAX_ENVS:
         raise CheckpointError(f"{path} does not say which environments the run had; give them: resume(folder, env=...)")
-    if not header.get("own_env") or ":" in env_id:  # a colon would let Gymnasium import what stands before it
+    if not header.own_env or ":" in env_id:  # Gymnasium imports what precedes a colon
         raise CheckpointError(
             f"the run was given an environment, {env_id[:60]!r}, that no file can hold; give it again: "
             "resume(folder, env=...)"
         )
-    return env_id, n_envs, backend
+    return env_id, backend
 
 
 def restore(
-    agent: Agent, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
+    agent: Agent, saved: SavedRun, rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
 ) -> str:
-    """Puts an agent that was loaded from the same checkpoint where its run stood.
+    """Restores the run of an agent that was loaded from the same checkpoint.
 
     Returns where else its environments begin and why, empty where they continue.
 
     Raises:
         LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
     """
-    run, learner = agent.run, agent.learner
-    for key in SCALARS:
-        setattr(run, key, whole(key, saved[key], least=0))
-    whole("steps_since_update", run.steps_since_update, least=0, most=run.step)
-    n_envs = run.env.n_envs
-    run.rng.bit_generator.state = saved["rng"]
-    run.carry = like(learner.initial_carry(n_envs), saved["carry"], "carry")
-    if saved["metrics"] is not None:
-        metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved["metrics"].items()}
+    run, n_envs = agent.run, agent.run.env.n_envs
+    carry = agent.learner.initial_carry(n_envs)
+    restore_counters(agent, saved)
+    run.carry = like(carry, saved.carry, "carry")
+    if saved.metrics is not None:
+        metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved.metrics.items()}
         run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
-    run.watch.n_skipped = whole("n_skipped", saved["n_skipped"], least=0)
-    td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved["td_errors"]]
-    run.seconds = {key: number(key, saved["seconds"][key], least=0) for key in run.seconds}
-    agent._seconds_before = number("before", saved["seconds"].get("before", 0.0), least=0, most=run.seconds["total"])
-    for key in PER_ENV:
-        setattr(run, key, exactly(saved[key], (len(saved[key]),), getattr(run, key).dtype, key))
+    td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved.td_errors]
     for part in rows:
         spaces.check_actions(agent.action_space, part["action"], "a file of rows")
-    restore_buffer(run, saved["buffer"], rows, learner.initial_carry(n_envs), begun=saved["envs"] is not None)
-    if saved["buffer"].get("priorities") is not None:
-        run.td_errors = with_draws(run.replay.priorities, saved["buffer"]["priorities"]["drawn"], td_errors)
+    restore_buffer(run, saved.buffer, rows, carry, begun=saved.envs is not None)
+    if saved.buffer.get("priorities") is not None:
+        run.td_errors = with_draws(run.replay.priorities, saved.buffer["priorities"]["drawn"], td_errors)
     if isinstance(run.replay, RolloutBuffer):
-        spaces.check_actions(agent.action_space, saved["buffer"]["rollout"]["action"], "the rollout")
-    reason = text(saved["reason"])
-    if saved["envs"] is not None:
+        spaces.check_actions(agent.action_space, saved.buffer["rollout"]["action"], "the rollout")
+    reason = saved.reason
+    if saved.envs is not None:
         reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
-    elif saved["seed"] is not None:
-        run.seed = model_files.whole_seed(saved["seed"])
-    agent.history.replace(saved["history"])
+    elif saved.seed is not None:
+        run.seed = model_files.whole_seed(saved.seed)
+    agent.history.replace(saved.history)
     agent._fill_windows()
-    if saved["best"] is not None:
-        packed = learner.pack(checkpoint.arrays_to_tree(learner.shapes, best, path))
-        checkpoint.require_finite(best, path)
-        score, step = saved["best"]["score"], whole("step", saved["best"]["step"], least=0)
-        scores = score if isinstance(score, tuple) else (score,)
-        if not all(isinstance(part, int | float) for part in scores):
-            raise TypeError(f"the best score is {score!r}, expected a number, or several")
-        agent._put_best(score, text(saved["best"]["by"]), step, packed)
-    values, counts = saved["logger"]
-    agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
-    agent.logger._counts = {key: whole(key, value, least=0) for key, value in counts.items()}
-    agent._n_predictions = whole("n_predictions", saved["n_predictions"], least=0)
-    agent._call = None if saved["call"] is None else Call.from_json(saved["call"])
-    agent._saved_callbacks = [(text(name), state) for name, state in saved["callbacks"]]
+    if saved.best is not None:
+        restore_best(agent, saved.best, best, path)
+    agent._call = None if saved.call is None else Call.from_json(saved.call)
+    agent._saved_callbacks = list(saved.callbacks)
     statistics = agent.get_vec_normalize_env()
-    if statistics is not None and saved["vec_normalize"] is not None:
-        statistics.put_statistics(saved["vec_normalize"])
+    if statistics is not None and saved.vec_normalize is not None:
+        statistics.put_statistics(saved.vec_normalize)
     return f"at the start of new episodes: {reason}" if reason else ""
 
 
-def put_envs_back(run: Run, saved: dict[str, Any], n_episodes: int | None) -> str:
+def restore_counters(agent: Agent, saved: SavedRun) -> None:
+    """Restores counters, durations, random numbers and the logger of a run."""
+    run = agent.run
+    if saved.steps_since_update > run.step:
+        raise ValueError(f"steps_since_update={saved.steps_since_update}, expected at most {run.step}")
+    for key in SCALARS:
+        setattr(run, key, getattr(saved, key))
+    for key in PER_ENV:
+        value = getattr(saved, key)
+        setattr(run, key, exactly(value, (len(value),), getattr(run, key).dtype, key))
+    run.rng.bit_generator.state = saved.rng
+    run.watch.n_skipped = saved.n_skipped
+    run.seconds = {key: saved.seconds[key] for key in run.seconds}
+    agent._seconds_before = number("before", saved.seconds.get("before", 0.0), least=0, most=run.seconds["total"])
+    values, agent.logger._counts = saved.logger
+    agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
+    agent._n_predictions = saved.n_predictions
+
+
+def restore_best(agent: Agent, saved: SavedBest, arrays: dict[str, np.ndarray], path: Path) -> None:
+    """Restores the best weights.
+
+    Raises:
+        CheckpointError, TypeError: if they are of other networks, or not finite, or the score is not numbers.
+    """
+    packed = agent.learner.pack(checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path))
+    checkpoint.require_finite(arrays, path)
+    scores = saved.score if isinstance(saved.score, tuple) else (saved.score,)
+    if not all(isinstance(part, int | float) for part in scores):
+        raise TypeError(f"the best score is {saved.score!r}, expected numbers")
+    agent._put_best(saved.score, saved.by, saved.step, packed)
+
+
+def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
     """Lets the environments stand where they stood, with the observations and the actions that were chosen there.
 
     Where rollouts are ``n_episodes`` whole episodes, those that have played theirs may stand at the end of one. Returns why
@@ -322,22 +317,22 @@ def put_envs_back(run: Run, saved: dict[str, Any], n_episodes: int | None) -> st
         if waiting.all() or not ((run.playing >= 0) & (run.playing <= n_episodes)).all():
             raise ValueError(f"playing={run.playing} is not between 0 and n_episodes={n_episodes}, or all 0")
     held = run.replay if isinstance(run.replay, RolloutBuffer) else run.replay.ring
-    parts = zip(saved["obs"], held.obs_leaves, strict=True)
+    parts = zip(saved.obs or (), held.obs_leaves, strict=True)
     obs = jax.tree.unflatten(
         held.obs_structure, [exactly(part, (n_envs, *leaf.shape), leaf.dtype, "obs") for part, leaf in parts]
     )
     if not all(is_finite(leaf) for leaf in jax.tree.leaves(obs)):
         raise ValueError("the observations are not finite")
     try:
-        must_reset = run.env.restore(saved["envs"], obs)
+        must_reset = run.env.restore(saved.envs, obs)
     except DivergedError as error:
         return str(error)
     if over := [i for i in must_reset if waiting is None or not waiting[i]]:
         raise ValueError(f"the episode of environment {over[0]} is over, and it was not reset")
     run.obs, run.seed = obs, None
-    if saved["action"] is not None:
+    if saved.action is not None:
         expected = np.asarray(spaces.random_action(run.env.action_space, n_envs, np.random.default_rng(0)))
-        run.action = exactly(saved["action"], expected.shape, expected.dtype, "action")
+        run.action = exactly(saved.action, expected.shape, expected.dtype, "action")
         spaces.check_actions(run.env.action_space, run.action, "the checkpoint")
     return ""
 
@@ -383,17 +378,6 @@ def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Arr
     if any(len(draw.position) not in (0, td_error.size) for draw, td_error in pairs):
         raise ValueError("the TD errors under way are not those of the steps that were drawn")
     return [(draw, td_error) for draw, td_error in pairs if len(draw.position)]
-
-
-def text(value: Any) -> str:
-    """Returns a text of a file.
-
-    Raises:
-        TypeError: if it is none.
-    """
-    if not isinstance(value, str):
-        raise TypeError(f"expected a text, got {type(value).__name__}")
-    return value
 
 
 def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:

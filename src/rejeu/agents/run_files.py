@@ -23,11 +23,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
+import msgspec
 import numpy as np
 from filelock import FileLock, Timeout
+from msgspec import Meta
 
 from rejeu import xla
 from rejeu.agents import model_files
@@ -37,6 +39,7 @@ from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.io import atomic, checkpoint, json_arrays
 from rejeu.io.failed_writes import RETRY_SECONDS
+from rejeu.io.records import Count, Positive, Seconds
 from rejeu.loops import finite
 from rejeu.loops.run import Progress, Run
 from rejeu.validation import number, whole
@@ -274,6 +277,63 @@ def step_of(path: Path) -> int:
     found = RUN_FILE.fullmatch(path.name)
     assert found is not None
     return int(found[1])
+
+
+class RunHeader(msgspec.Struct):
+    """What the header of a run's checkpoint holds in addition to that of a model file; unknown fields are ignored."""
+
+    rows: list[Annotated[str, Meta(pattern=rf"^{ROWS_FILE.pattern}\Z")]]
+    """Names of the files with the rows of the replay buffer, oldest first."""
+    n_envs: Positive
+    run_id: str
+    run: Any
+    """A :class:`SavedRun`, encoded by :mod:`rejeu.io.json_arrays`."""
+    env_id: Any = None
+    backend: Any = None
+    own_env: Any = False
+    threads: Annotated[int, Meta(ge=1, le=1024)] | None = None
+    """Of JAX's device; missing in older checkpoints."""
+
+
+class SavedBest(msgspec.Struct):
+    """The best weights, which are arrays of their own."""
+
+    score: Any
+    by: str
+    step: Count
+
+
+class SavedRun(msgspec.Struct, kw_only=True):
+    """The state of a run that is in no model file; what depends on the agent is compared with it when it is resumed."""
+
+    learn_from: Count
+    owed: Count
+    steps_since_update: Count
+    playing: np.ndarray
+    ended: np.ndarray
+    episode_return: np.ndarray
+    episode_length: np.ndarray
+    running_return: np.ndarray
+    rng: dict[str, Any]
+    carry: list[np.ndarray]
+    obs: list[np.ndarray] | None
+    action: np.ndarray | None
+    envs: Any
+    seed: Any
+    """Used only where new episodes begin."""
+    reason: str
+    metrics: dict[str, np.ndarray] | None
+    n_skipped: Count
+    td_errors: list[np.ndarray]
+    seconds: dict[str, Seconds]
+    buffer: dict[str, Any]
+    history: np.ndarray
+    best: SavedBest | None
+    logger: tuple[dict[str, Any], dict[str, Count]]
+    n_predictions: Count
+    call: dict[str, Any] | None
+    callbacks: list[tuple[str, Any]]
+    vec_normalize: Any
 
 
 def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -21,6 +21,7 @@ from rejeu.errors import CheckpointError, NonFiniteError
 from rejeu.hooks import Hooks, told_apart
 from rejeu.interrupt import Interrupt
 from rejeu.io.failed_writes import RetryingSink
+from rejeu.io.records import Count, Positive, PositiveSeconds, Seconds, convert
 from rejeu.loops import finite
 from rejeu.loops.learner import PackedState
 from rejeu.loops.run import Episode, time_shares
@@ -36,27 +37,27 @@ if TYPE_CHECKING:
 class Call:
     """One call of ``learn``. Mutable: ``logged`` moves on."""
 
-    n_steps: int | None
+    n_steps: Positive | None
     """Environment steps to take, None where something else ends it."""
-    n_episodes: int | None
+    n_episodes: Positive | None
     """Episodes to finish, likewise."""
-    seconds: float | None
+    seconds: PositiveSeconds | None
     """Wall time to take, likewise."""
-    first_step: int
+    first_step: Count
     """Environment steps taken in all when it began."""
-    first_episode: int
+    first_episode: Count
     """Episodes finished in all when it began."""
-    log_interval: int
+    log_interval: Count
     """Episodes between two rows of statistics."""
-    logged: int
+    logged: Count
     """Episodes in the history when the last row was written."""
-    steps_before: int = 0
+    steps_before: Count = 0
     """Environment steps that schedules count as taken before it: those since the last ``learn`` that began to count."""
-    episodes_before: int = 0
+    episodes_before: Count = 0
     """Episodes likewise."""
-    seconds_before: float = 0.0
+    seconds_before: Seconds = 0.0
     """Training time likewise."""
-    spent: float = 0.0
+    spent: Seconds = 0.0
     """Wall time that it had taken when it was last taken up, in seconds."""
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """When it was begun or last taken up, by ``time.perf_counter``."""
@@ -94,25 +95,14 @@ class Call:
 
     @classmethod
     def from_json(cls, saved: Mapping[str, Any]) -> Call:
-        """Returns what :meth:`to_json` did, taken up now.
+        """Returns the call that :meth:`to_json` described, continued now.
 
         Raises:
-            KeyError, ValueError: if it is damaged.
+            CheckpointError: if it is damaged.
         """
-        steps, episodes, seconds = (saved[key] for key in ("n_steps", "n_episodes", "seconds"))
-        return cls(
-            n_steps=None if steps is None else whole("n_steps", steps, least=1),
-            n_episodes=None if episodes is None else whole("n_episodes", episodes, least=1),
-            seconds=None if seconds is None else number("seconds", seconds, above=0),
-            first_step=whole("first_step", saved["first_step"], least=0),
-            first_episode=whole("first_episode", saved["first_episode"], least=0),
-            log_interval=whole("log_interval", saved["log_interval"], least=0),
-            logged=whole("logged", saved["logged"], least=0),
-            steps_before=whole("steps_before", saved.get("steps_before", 0), least=0),
-            episodes_before=whole("episodes_before", saved.get("episodes_before", 0), least=0),
-            seconds_before=number("seconds_before", saved.get("seconds_before", 0.0), least=0),
-            spent=number("spent", saved["spent"], least=0),
-        )
+        call = convert(saved, cls)
+        call.began = time.perf_counter()
+        return call
 
 
 def share(before: float, taken: float, limit: float | None) -> float:

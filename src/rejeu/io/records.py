@@ -21,10 +21,12 @@ Positive = Annotated[int, Meta(ge=1, le=2**62)]
 """An integer from 1."""
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 """The seed of a NumPy generator."""
-EnvCount = Annotated[int, Meta(ge=1, le=4096)]
-"""A number of environments that a file may ask for."""
+MAX_ENVS = 4096
+"""Upper limit on the environments that a file may ask for."""
+EnvCount = Annotated[int, Meta(ge=1, le=MAX_ENVS)]
 Seconds = Annotated[float, Meta(ge=0, le=1e300)]
 """A finite duration."""
+PositiveSeconds = Annotated[float, Meta(gt=0, le=1e300)]
 
 
 class Malformed(ValueError):
