@@ -21,7 +21,7 @@ from rejeu.errors import CheckpointError, NonFiniteError
 from rejeu.hooks import Hooks, told_apart
 from rejeu.interrupt import Interrupt
 from rejeu.io.failed_writes import RetryingSink
-from rejeu.io.records import Count, Positive, PositiveSeconds, Seconds, convert
+from rejeu.io.records import Count, Duration, Positive, Seconds, convert
 from rejeu.loops import finite
 from rejeu.loops.learner import PackedState
 from rejeu.loops.run import Episode, time_shares
@@ -41,7 +41,7 @@ class Call:
     """Environment steps to take, None where something else ends it."""
     n_episodes: Positive | None
     """Episodes to finish, likewise."""
-    seconds: PositiveSeconds | None
+    seconds: Duration | None
     """Wall time to take, likewise."""
     first_step: Count
     """Environment steps taken in all when it began."""

@@ -6,33 +6,24 @@ import json
 import platform
 import re
 import time
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from rejeu.cli import environment
 from rejeu.cli.environment import Environment, RunOptions
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
+from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json
 
 Which = Literal["best", "last"]
-MOST_ENVS = 4096
-"""Most environments that a run steps at once."""
-MOST_EPISODES = 10_000
-"""Most episodes of an evaluation while training."""
-LONGEST_CONFIG = 2**20
-"""Most bytes of a ``config.json``."""
-KINDS: dict[str, Any] = {
-    "str": str,
-    "bool": bool,
-    "int": int,
-    "int | None": int | None,
-    "float | None": float | int | None,
-    "dict[str, Any]": dict,
-    "tuple[str, ...]": tuple,
-}
-"""What the annotations of :class:`RunConfig` allow."""
+MAX_EPISODES = 10_000
+"""Upper limit on the episodes of an evaluation while training."""
+MAX_CONFIG_BYTES = 2**20
+"""Upper limit on the size of a ``config.json``."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +97,21 @@ class RunConfig:
     hyperparameters: dict[str, Any]
     """All of them, defaults included."""
     policy: str
-    seed: int
-    n_envs: int
+    seed: Seed
+    n_envs: EnvCount
     backend: str
     """The backend that stepped the environments; never ``auto``."""
-    steps: int | None
+    steps: Positive | None
     """Environment steps to take, None where ``minutes`` ended the run."""
-    minutes: float | None
+    minutes: Duration | None
     """Minutes of training, None where ``steps`` ended the run."""
     success_threshold: float | None
     """Return from which on an episode counts as a success where the environment does not say; None for its own."""
-    film_every: int | None
+    film_every: Positive | None
     """Environment steps between two films of the policy, None for none."""
-    evaluate_every: int
-    evaluate_episodes: int
-    checkpoint_minutes: float | None
+    evaluate_every: Positive
+    evaluate_episodes: Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
+    checkpoint_minutes: Duration | None
     """Minutes between two checkpoints, None for none."""
     env_argument: str = ""
     """How the environment was named on the command line; for information, and for hints. No command imports it."""
@@ -176,45 +167,11 @@ def read_config(folder: RunFolder) -> RunConfig:
             f"{folder.path} is no run folder: it holds no {folder.config.name}{newest_inside(folder.path)}"
         )
     try:
-        if folder.config.stat().st_size > LONGEST_CONFIG:
-            raise ValueError(f"larger than {LONGEST_CONFIG:,} bytes")
-        content = json.loads(folder.config.read_text(encoding="utf-8"))
-        content["wrappers"] = tuple(content.get("wrappers", ()))
-        known = [one.name for one in fields(RunConfig) if one.name in content or one.name not in LATER]
-        config = RunConfig(**{name: content[name] for name in known})
-        for one in fields(RunConfig):
-            value = getattr(config, one.name)
-            if not isinstance(value, KINDS[str(one.type)]):
-                raise ValueError(f"{one.name} is {str(value)[:40]!r}, not {one.type}")
-        check_ranges(config)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CheckpointError(f"{folder.config} is damaged: {type(error).__name__} {error}") from None
-    return config
-
-
-LATER = ("env_argument", "env_kwargs", "wrappers")
-"""Fields that folders of earlier versions lack."""
-
-
-def check_ranges(config: RunConfig) -> None:
-    """Raises ``ValueError`` for numbers that no run can have, and for those that would take all of memory or time."""
-    from rejeu.agents import whole_seed
-    from rejeu.validation import number, whole
-
-    whole_seed(config.seed)
-    whole("n_envs", config.n_envs, least=1, most=MOST_ENVS)
-    whole("evaluate_every", config.evaluate_every, least=1)
-    whole("evaluate_episodes", config.evaluate_episodes, least=1, most=MOST_EPISODES)
-    for name in ("steps", "film_every"):
-        if getattr(config, name) is not None:
-            whole(name, getattr(config, name), least=1)
-    for name in ("minutes", "checkpoint_minutes"):
-        if getattr(config, name) is not None:
-            number(name, getattr(config, name), above=0)
-    if config.success_threshold is not None:
-        number("success_threshold", config.success_threshold)
-    if not all(isinstance(name, str) for name in config.wrappers):
-        raise ValueError("wrappers are not names")
+        if folder.config.stat().st_size > MAX_CONFIG_BYTES:
+            raise Malformed(f"it has more than {MAX_CONFIG_BYTES:,} bytes")
+        return convert(parse_json(folder.config.read_bytes()), RunConfig)
+    except (Malformed, CheckpointError) as error:
+        raise CheckpointError(f"{folder.config} is damaged: {error}") from None
 
 
 def versions() -> dict[str, str | None]:

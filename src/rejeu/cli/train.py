@@ -94,11 +94,12 @@ def make_env(arguments: Train, environment: Environment, preset: Preset | None, 
 def check(arguments: Train) -> None:
     """Raises ValueError or OSError for what is wrong before anything is made."""
     from rejeu.agents import whole_seed
+    from rejeu.io.records import MAX_ENVS
     from rejeu.validation import number, whole
 
     if arguments.steps is not None and arguments.minutes is not None:
         raise ValueError("--steps and --minutes exclude each other; give one of them")
-    most = {"envs": run_folder.MOST_ENVS, "evaluate_episodes": run_folder.MOST_EPISODES}
+    most = {"envs": MAX_ENVS, "evaluate_episodes": run_folder.MAX_EPISODES}
     for name in ("steps", "envs", "film_every", "evaluate_every", "evaluate_episodes"):
         if getattr(arguments, name) is not None:
             whole(f"--{name.replace('_', '-')}", getattr(arguments, name), least=1, most=most.get(name, 2**63 - 1))

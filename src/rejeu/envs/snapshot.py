@@ -1,24 +1,26 @@
-"""The whole state of a running environment, taken out and put back, so that a run resumes in the middle of an episode.
+"""Snapshots of running environments, so that a run resumes in the middle of an episode.
 
-It can be saved where it is known what an environment remembers: Gymnasium's classic control and MuJoCo environments, the
-ball, and any environment or wrapper with the two methods ::
+Supported are Gymnasium's classic control and MuJoCo environments, the ball, the wrappers of Gymnasium and rejeu listed
+here, and any environment or wrapper with the two methods ::
 
-    get_state() -> a dict of numbers, texts, lists, tuples, dicts and arrays
+    get_state() -> a dict of numbers, strings, lists, tuples, dicts and arrays
     set_state(state)
 
-which then answer for themselves and everything inside, random numbers included; around them, the wrappers of Gymnasium and
-rejeu that are listed here, and wrappers with the two methods ``get_wrapper_state`` and ``set_wrapper_state``, which answer
-for the wrapper alone. It cannot be saved of Box2D and highway-env, whose worlds are not plain data.
+which then cover everything inside, including random numbers. A wrapper with the methods ``get_wrapper_state`` and
+``set_wrapper_state`` covers itself only. Box2D and highway-env are not supported: their worlds are not plain data.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs import classic_control
+from msgspec import Meta
 
 from rejeu.envs.ball.ball import Ball
 from rejeu.envs.mask_wrapper import MaskInObservation
@@ -39,36 +41,40 @@ STATELESS = (
     wrappers.TransformReward,
     MaskInObservation,
 )
-"""Wrappers that remember nothing from step to step."""
-REMEMBERED: dict[type, tuple[str, ...]] = {
-    wrappers.TimeLimit: ("_elapsed_steps",),
-    wrappers.OrderEnforcing: ("_has_reset",),
-    wrappers.PassiveEnvChecker: (),
-    wrappers.RecordEpisodeStatistics: ("episode_count", "episode_returns", "episode_lengths"),
-    classic_control.CartPoleEnv: ("state", "steps_beyond_terminated"),
-    classic_control.MountainCarEnv: ("state",),
-    classic_control.Continuous_MountainCarEnv: ("state",),
-    classic_control.PendulumEnv: ("state", "last_u"),
-    classic_control.AcrobotEnv: ("state",),
-}
-"""Attributes that hold all that wrappers and environments remember, beside the random numbers of the latter."""
-SIZES: dict[type, int] = {
-    classic_control.CartPoleEnv: 4,
-    classic_control.MountainCarEnv: 2,
-    classic_control.Continuous_MountainCarEnv: 2,
-    classic_control.PendulumEnv: 2,
-    classic_control.AcrobotEnv: 4,
-}
-"""How many numbers the ``state`` of an environment is."""
-MUJOCO = "gymnasium.envs.mujoco."
-OPTIONAL = ("state", "steps_beyond_terminated", "last_u", "_elapsed_steps")
-"""Attributes that may be None, or not be there yet."""
+"""Wrappers without state."""
 ABSENT = "absent"
-"""Stands for an attribute that is not there yet, as ``last_u`` before the first step."""
+"""Value of an attribute that does not exist yet, as ``last_u`` before the first step."""
+Integer = int | None | Literal["absent"]
+Number = float | None | Literal["absent"]
+
+
+def numbers(n: int) -> Any:
+    """Returns the type of an attribute that holds ``n`` finite numbers, or none yet."""
+    finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
+    return Annotated[list[finite], Meta(min_length=n, max_length=n)] | None | Literal["absent"]  # type: ignore[return-value]
+
+
+REMEMBERED: dict[type, dict[str, Any]] = {
+    wrappers.TimeLimit: {"_elapsed_steps": Integer},
+    wrappers.OrderEnforcing: {"_has_reset": bool},
+    wrappers.PassiveEnvChecker: {},
+    wrappers.RecordEpisodeStatistics: {
+        "episode_count": int,
+        "episode_returns": float | Annotated[list[float], Meta(min_length=1, max_length=1)],
+        "episode_lengths": int,
+    },
+    classic_control.CartPoleEnv: {"state": numbers(4), "steps_beyond_terminated": Integer},
+    classic_control.MountainCarEnv: {"state": numbers(2)},
+    classic_control.Continuous_MountainCarEnv: {"state": numbers(2)},
+    classic_control.PendulumEnv: {"state": numbers(2), "last_u": Number},
+    classic_control.AcrobotEnv: {"state": numbers(4)},
+}
+"""Attributes of wrappers and environments that hold their whole state except random numbers, and their types in a file."""
+MUJOCO = "gymnasium.envs.mujoco."
 
 
 def state_of(env: gym.Env) -> list[Any] | None:
-    """Returns what each layer remembers, outermost first, None if one of them cannot be carried.
+    """Returns the state of each layer, outermost first; None if one of them is not supported.
 
     >>> env = gym.make("MountainCar-v0")
     >>> first, _ = env.reset(seed=0)
@@ -99,10 +105,10 @@ def state_of(env: gym.Env) -> list[Any] | None:
 
 
 def restore(env: gym.Env, layers: list[Any]) -> None:
-    """Puts back what :func:`state_of` returned.
+    """Restores the state that :func:`state_of` returned.
 
     Raises:
-        ValueError: if the environment has other layers.
+        ValueError: if the environment has other layers, or the state is invalid.
     """
     layer, left = env, list(layers)
     while True:
@@ -114,21 +120,17 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
         elif saves_itself(layer):
             layer.set_wrapper_state(state)  # type: ignore[attr-defined]
         elif type(layer) in STATELESS or type(layer) in REMEMBERED:
-            expected = {*REMEMBERED.get(type(layer), ())} | ({"rng"} if not isinstance(layer, gym.Wrapper) else set())
-            if {*state} != expected:
-                raise ValueError(
-                    f"the state of {type(layer).__name__} has {sorted(state)}, expected {sorted(expected)}"
-                )
-            for name in REMEMBERED.get(type(layer), ()):
-                _check_form(layer, name, state[name])
+            types = REMEMBERED.get(type(layer), {})
+            check_types(layer, state, types if isinstance(layer, gym.Wrapper) else {**types, "rng": Any})
+            for name in types:
                 if not (isinstance(state[name], str) and state[name] == ABSENT):
                     setattr(layer, name, state[name])
-            if isinstance(layer, wrappers.PassiveEnvChecker):  # which checked it where the run began
+            if isinstance(layer, wrappers.PassiveEnvChecker):  # it was checked when the run began
                 vars(layer).update({name: True for name in vars(layer) if name.startswith("checked_")})
         elif is_mujoco(layer):
             _put_mujoco(layer, state)
         else:
-            raise ValueError(f"{type(layer).__name__} has no state that can be put back")
+            raise ValueError(f"{type(layer).__name__} does not support snapshots")
         if answers_for_itself(layer) or not isinstance(layer, gym.Wrapper):
             break
         layer = layer.env
@@ -155,27 +157,32 @@ def is_over(env: gym.Env) -> bool:
         if isinstance(layer, wrappers.TimeLimit) and layer._elapsed_steps is None:
             return True
         layer = layer.env
-    return layer.over if isinstance(layer, Ball) else type(layer) in SIZES and getattr(layer, "state", None) is None
+    if isinstance(layer, Ball):
+        return layer.over
+    return "state" in REMEMBERED.get(type(layer), {}) and getattr(layer, "state", None) is None
 
 
-def _check_form(layer: gym.Env, name: str, value: Any) -> None:
-    """Raises ``ValueError`` unless an attribute of a layer may have this value, which comes from a file."""
-    if name in OPTIONAL and (value is None or (isinstance(value, str) and value == ABSENT)):
-        return
-    if name == "state":  # an array, or after some steps a tuple of numbers
-        whole = isinstance(value, np.ndarray) or (isinstance(value, tuple) and all(map(is_number, value)))
-        fits = whole and np.shape(value) == (SIZES[type(layer)],) and bool(np.isfinite(value).all())
-    elif name == "_has_reset":
-        fits = isinstance(value, bool)
-    else:
-        fits = is_number(value) or (name == "episode_returns" and isinstance(value, np.ndarray) and value.size == 1)
-    if not fits:
-        raise ValueError(f"{name} of {type(layer).__name__} cannot be {str(value)[:40]!r}")
+def check_types(layer: gym.Env, state: Mapping[str, Any], types: Mapping[str, Any]) -> None:
+    """Checks attributes of an environment or wrapper, which come from a file.
+
+    Raises:
+        ValueError: if names differ, or a value is not of its type.
+    """
+    if {*state} != {*types}:
+        raise ValueError(f"the state of {type(layer).__name__} has {sorted(state)}, expected {sorted(types)}")
+    for name, kind in types.items():
+        try:
+            msgspec.convert(_builtin(state[name]), kind)
+        except msgspec.ValidationError as error:
+            value = str(state[name])[:40]
+            raise ValueError(f"{name} of {type(layer).__name__} cannot be {value!r}: {error}") from None
 
 
-def is_number(value: Any) -> bool:
-    """Returns whether a value is a real number."""
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+def _builtin(value: Any) -> Any:
+    """Returns arrays and NumPy's numbers as lists and numbers of Python."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return [_builtin(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def answers_for_itself(layer: gym.Env) -> bool:

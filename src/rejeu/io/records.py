@@ -25,8 +25,8 @@ MAX_ENVS = 4096
 """Upper limit on the environments that a file may ask for."""
 EnvCount = Annotated[int, Meta(ge=1, le=MAX_ENVS)]
 Seconds = Annotated[float, Meta(ge=0, le=1e300)]
-"""A finite duration."""
-PositiveSeconds = Annotated[float, Meta(gt=0, le=1e300)]
+Duration = Annotated[float, Meta(gt=0, le=1e300)]
+"""Seconds or minutes, more than none."""
 
 
 class Malformed(ValueError):

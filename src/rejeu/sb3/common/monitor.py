@@ -14,16 +14,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rejeu.envs.snapshot import is_number
+from rejeu.envs.snapshot import check_types
 from rejeu.io import atomic
 from rejeu.io.failed_writes import FailedWrites
 
 __all__ = ["LoadMonitorResultsError", "Monitor", "get_monitor_files", "load_results"]
 
 SUFFIX = "monitor.csv"
-COUNTS = ("needs_reset", "total_steps")
-LISTS = ("rewards", "episode_returns", "episode_lengths", "episode_times")
-"""Attributes of a Monitor that hold one number for each step or episode."""
+STATE = {"needs_reset": bool, "total_steps": int, "rewards": list[float], "episode_returns": list[float]}
+STATE |= {"episode_lengths": list[int], "episode_times": list[float]}
+"""Attributes that hold the whole state of a Monitor, and their types."""
 
 
 class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -140,7 +140,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     def get_wrapper_state(self) -> dict[str, Any]:
         """Returns what the wrapper stores, for the checkpoint of a run."""
-        return {name: vars(self)[name] for name in (*COUNTS, *LISTS)}
+        return {name: vars(self)[name] for name in STATE}
 
     def set_wrapper_state(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`get_wrapper_state` returned.
@@ -148,15 +148,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         Raises:
             ValueError: if it is damaged.
         """
-        if {*state} != {*COUNTS, *LISTS}:
-            raise ValueError(
-                f"the state of {type(self).__name__} has {sorted(state)}, expected {sorted((*COUNTS, *LISTS))}"
-            )
-        valid = {name: isinstance(state[name], list) and all(map(is_number, state[name])) for name in LISTS}
-        valid |= {"needs_reset": isinstance(state["needs_reset"], bool), "total_steps": is_number(state["total_steps"])}
-        for name, value in state.items():
-            if not valid[name]:
-                raise ValueError(f"{name} of {type(self).__name__} cannot be {str(value)[:40]!r}")
+        check_types(self, state, STATE)
         vars(self).update(state)
 
     def close(self) -> None:
