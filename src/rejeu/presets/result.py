@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+
+import msgspec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +66,8 @@ def _percent(share: float) -> str:
 @cache
 def results() -> tuple[Result, ...]:
     """Returns every result; of several for one preset the first is of the preset as it is."""
-    text = resources.files("rejeu.presets").joinpath("results.json").read_text(encoding="utf-8")
-    return tuple(Result(**{**entry, "seconds": tuple(entry["seconds"])}) for entry in json.loads(text))
+    content = resources.files("rejeu.presets").joinpath("results.json").read_bytes()
+    return msgspec.json.decode(content, type=tuple[Result, ...])
 
 
 def find_result(env_id: str, algorithm: str) -> Result | None:
