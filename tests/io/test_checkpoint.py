@@ -472,7 +472,7 @@ checkpoint.write(path, "rows", {"a": np.zeros(1000)}, {})
 def test_a_path_that_is_a_folder_is_refused(trained, tmp_path):
     (tmp_path / "model.safetensors").mkdir()
     with pytest.raises(
-        IsADirectoryError, match=r"model.safetensors could not be written: there is a folder.* no folder"
+        IsADirectoryError, match=r"model.safetensors could not be written: there is a folder.* not a folder"
     ):
         trained[0].save(tmp_path / "model")
     assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]

@@ -248,7 +248,7 @@ def test_a_monitor_writes_its_rows_when_it_can(tmp_path, disk):
 
 
 def test_of_too_many_rows_the_newest_are_kept_and_the_loss_is_reported(monkeypatch):
-    monkeypatch.setattr(failed_writes, "MOST_ROWS", 3)
+    monkeypatch.setattr(failed_writes, "MAX_ROWS", 3)
     failed, written, full = FailedWrites(), [], [True]
 
     def write(row):

@@ -1,4 +1,4 @@
-"""The agent of a run's newest checkpoint, standing where it stood; whatever the files hold, nothing else comes of them."""
+"""Resumes a run from its newest checkpoint; damaged or hostile files are refused."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ file."""
 MAX_ZEROS = 64
 """Upper limit on their size relative to that of the file without its holes."""
 PER_BUFFER = ("heads", "started")
-"""Arrays of a replay buffer and of a rollout with one entry for each environment; a run has one of them."""
+"""Arrays of a replay buffer and of a rollout with one entry per environment; a run has one of them."""
 
 
 class Resumed(NamedTuple):
@@ -54,14 +54,14 @@ class Resumed(NamedTuple):
     reason: str
     """What differs otherwise; empty where it is exact."""
     skipped: tuple[str, ...] = ()
-    """What was wrong with each newer checkpoint, which could not be read; newest first."""
+    """The errors of newer checkpoints, which could not be read; newest first."""
 
     def __str__(self) -> str:
         return f"resumed at step {self.step:,}, {'exactly where it stood' if self.exact else self.reason}"
 
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
-    """Returns the agent of the newest checkpoint that is whole; see :meth:`Agent.resume`."""
+    """Returns the agent of the newest complete checkpoint; see :meth:`Agent.resume`."""
     found = run_files(folder)
     if not found:
         raise FileNotFoundError(f"there is no checkpoint in {folder}")
@@ -92,7 +92,7 @@ def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
 
 
 def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
-    """Returns the agent; environments that are made for it are closed with ``made``, should it be refused."""
+    """Returns the agent; ``made`` closes the environments made for it if the checkpoint is refused."""
     path = file.path
     try:
         header = convert(file.header, RunHeader)
@@ -144,11 +144,11 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
 
 
 def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
-    """Checks what a run's file holds beside the state, before any of it is read.
+    """Checks the arrays of a run's file before they are read; those of the agent's state were checked before.
 
     Raises:
-        CheckpointError: if the best weights are of other networks, or something is there that no run has.
-        ValueError: if the rest is larger than a run needs, and nearly all of it a hole in the file.
+        CheckpointError: if the best weights are of other networks, or there are arrays that no run has.
+        ValueError: if the other arrays are larger than a run needs, and nearly all of them are a hole in the file.
     """
     if best := checkpoint.within(file.specs, "best."):
         checkpoint.match(agent.learner.shapes, best, file.path)
@@ -166,7 +166,7 @@ def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
 
 
 def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
-    """Returns a file of rows, once its arrays are known to be rows of the agent's buffer.
+    """Returns the arrays of a file of rows, after checking that they fit the agent's buffer.
 
     Raises:
         CheckpointError, ValueError: if they are not.
@@ -177,7 +177,7 @@ def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
 
 
 def compared(agent: Agent, header: RunHeader) -> Resumed:
-    """Returns how a run resumes whose environments are where they were."""
+    """Returns how a run resumes whose environments were restored."""
     here = xla.threads()
     before = here if header.threads is None else header.threads
     if before == here:
@@ -197,10 +197,10 @@ def refusal(path: Path, error: BaseException) -> CheckpointError:
 
 
 def check_owed(agent: Agent) -> None:
-    """Checks that no more gradient steps are due than a run of this configuration can owe between two steps.
+    """Checks that no more gradient steps are due than are possible with this configuration.
 
     Raises:
-        ValueError: if more are, which nothing but a damaged file can ask for.
+        ValueError: if more are due, as only a damaged file can say.
     """
     frequency = getattr(agent.config, "train_freq", 1)
     if agent.run.owed >= (frequency if isinstance(frequency, int) else frequency[0]):
@@ -229,7 +229,7 @@ def restore(
 ) -> str:
     """Restores the run of an agent that was loaded from the same checkpoint.
 
-    Returns where else its environments begin and why, empty where they continue.
+    Returns why its environments begin new episodes, empty if they continue.
 
     Raises:
         LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
@@ -300,10 +300,10 @@ def restore_best(agent: Agent, saved: SavedBest, arrays: dict[str, np.ndarray], 
 
 
 def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
-    """Lets the environments stand where they stood, with the observations and the actions that were chosen there.
+    """Restores the environments, their observations and the actions chosen for them.
 
-    Where rollouts are ``n_episodes`` whole episodes, those that have played theirs may stand at the end of one. Returns why
-    new episodes must begin instead, empty where they need not.
+    If rollouts consist of ``n_episodes`` whole episodes, environments that have finished theirs may be at the end of one.
+    Returns why new episodes must begin instead, empty if they need not.
     """
     n_envs = run.env.n_envs
     for key in PER_ENV:
@@ -340,14 +340,14 @@ def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
 def restore_buffer(
     run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], carry: PyTree, begun: bool
 ) -> None:
-    """Puts the experience of a run back.
+    """Restores the experience of a run.
 
     Args:
         run: mutated.
         saved: what :func:`rejeu.agents.run_files.buffer_content` returned.
         rows: of a ring.
-        carry: what exploration remembers, for its form.
-        begun: whether a rollout is under way; before the first there is nothing that was remembered at its beginning.
+        carry: the state of exploration, for its structure.
+        begun: whether a rollout has begun; before the first there is no carry of its beginning.
     """
     buffer = run.replay
     if isinstance(buffer, RolloutBuffer):
@@ -363,13 +363,13 @@ def restore_buffer(
 
 
 def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Array]) -> list[tuple[Draw, Array]]:
-    """Returns TD errors beside the draws that they belong to.
+    """Returns TD errors with the draws that they belong to.
 
-    Older versions could save more draws than TD errors, or draws of no steps, after an error or after
-    ``load_replay_buffer``: the first draws have then lost their TD errors, and draws of no steps their meaning.
+    Older versions could save more draws than TD errors, or empty draws, after an error or after ``load_replay_buffer``. The
+    first draws then have no TD errors, and empty draws are dropped.
 
     Raises:
-        ValueError: if they do not belong together, or are of another replay buffer.
+        ValueError: if they do not belong together, or to another replay buffer.
     """
     draws = [priorities.draw_of(index, time) for index, time in drawn]
     if len(draws) < len(td_errors):
@@ -381,7 +381,7 @@ def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Arr
 
 
 def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
-    """Returns a tree of the form of ``expected`` with the given leaves.
+    """Returns a tree with the structure of ``expected`` and the given leaves.
 
     Raises:
         ValueError: if shapes or dtypes differ, or a number is not finite.
@@ -396,10 +396,10 @@ def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
 
 
 def exactly(array: Any, shape: tuple[int, ...], dtype: Any, name: str) -> np.ndarray:
-    """Returns an array of a file.
+    """Returns a copy of an array of a file.
 
     Raises:
-        ValueError: if its shape or dtype is another than expected.
+        ValueError: if its shape or dtype differs from what is expected.
     """
     if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != dtype:
         found = f"{array.dtype}{list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__

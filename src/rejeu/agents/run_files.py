@@ -1,16 +1,16 @@
-"""Checkpoints of whole runs: everything that a run depends on, so that it goes on as if nothing had happened.
+"""Checkpoints of whole runs, from which a run resumes exactly.
 
 A folder of checkpoints holds ::
 
-    run_000000020000.safetensors           the newest and the one before: all but the replay buffer's rows
-    run_000000010000.safetensors
-    rows_000000010000_5f0c.safetensors     the rows that were new at a checkpoint; those that are still needed
+    run_000000020000.safetensors           the newest checkpoint, without the rows of the replay buffer
+    run_000000010000.safetensors           the one before
+    rows_000000010000_5f0c.safetensors     rows that were new at a checkpoint, as long as they are needed
     rows_000000020000_91aa.safetensors
     lock                                   held by the process that trains
 
-Rows are written once, so a checkpoint costs what is new, whatever the size of the buffer. Every file is written beside its
-place, synced and renamed, rows before the run that names them, and nothing is deleted before what replaces it is there:
-whenever the process dies, the newest complete checkpoint is at most one interval old.
+Rows are written once, so the cost of a checkpoint does not depend on the size of the buffer. Every file is written
+atomically, rows before the run that refers to them, and files are deleted only after their replacements exist. Whenever the
+process dies, the newest complete checkpoint is at most one interval old.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ if TYPE_CHECKING:
     from rejeu.agents.base import Agent
 
 MINUTES = 5.0
-"""Between two checkpoints where nothing else is asked for."""
+"""Default interval between two checkpoints."""
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 ROWS_FILE = re.compile(r"rows_\d{12}_[0-9a-f]+\.safetensors")
 SCALARS = ("learn_from", "owed", "steps_since_update")
-"""Counters of a run that are in no model file; whole numbers from 0."""
+"""Counters of a run that model files do not hold."""
 PER_ENV = ("playing", "ended", "episode_return", "episode_length", "running_return")
-"""Fields of a run that are arrays with one entry for each environment."""
+"""Fields of a run that are arrays with one entry per environment."""
 
 
 @dataclass
 class RowFiles:
-    """Which files hold the rows of a replay buffer. Mutable."""
+    """The files that hold the rows of a replay buffer. Mutable."""
 
     files: list[tuple[str, np.ndarray]] = field(default_factory=list)
     """Names, oldest first, and the times of the newest rows in each, by environment."""
@@ -68,24 +68,24 @@ class RowFiles:
     version: int = -1
 
     def heads(self, ring: Ring) -> np.ndarray:
-        """Returns up to which times the rows of ``ring`` are on disk, -1 for nothing."""
+        """Returns the times of the newest rows of ``ring`` on disk, -1 for none."""
         if self.ring is not ring or self.version != ring.version or not self.files:
             self.files, self.ring, self.version = [], ring, ring.version
             return np.full(ring.n_envs, -1, np.int64)
         return self.files[-1][1]
 
     def add(self, name: str, ring: Ring) -> None:
-        """Notes a file that holds the rows up to the newest, and forgets those of which no row is kept any more."""
+        """Adds a file with the rows up to the newest, and drops files of which the ring keeps no row."""
         self.files.append((name, ring.head.copy()))
         oldest = ring.oldest()
         self.files = [one for one in self.files if (one[1] >= oldest).any()]
 
 
 class Checkpoint:
-    """Saves the whole run every so many environment steps or minutes, and whenever ``learn`` ends, so that it can go on.
+    """Saves the whole run at an interval of environment steps or minutes, and when ``learn`` ends.
 
-    Ctrl-C, SIGTERM and errors of the environment end ``learn`` with a checkpoint as well. ``Agent.resume(folder)`` takes the
-    run up again. The folder belongs to one run; the last ``keep`` checkpoints are kept.
+    Ctrl-C, SIGTERM and errors of the environment also end ``learn`` with a checkpoint. ``Agent.resume(folder)`` resumes the
+    run. The folder belongs to one run; the last ``keep`` checkpoints are kept.
 
     >>> import rejeu, tempfile
     >>> folder = tempfile.mkdtemp()
@@ -99,13 +99,13 @@ class Checkpoint:
     def __init__(
         self, folder: str | Path, every: int | None = None, *, minutes: float | None = None, keep: int = 2
     ) -> None:
-        """Saves nothing yet.
+        """Sets the interval; nothing is saved yet.
 
         Args:
-            folder: of the checkpoints, made with the first; new, or of the same run.
+            folder: of the checkpoints; new, or of the same run. It is created with the first checkpoint.
             every: environment steps between two checkpoints.
-            minutes: of wall time between two checkpoints; with neither, every five.
-            keep: how many checkpoints are kept, at least 1.
+            minutes: wall time between two checkpoints; 5 if neither is given.
+            keep: number of checkpoints that are kept, at least 1.
         """
         if isinstance(folder, int):
             raise TypeError(f"folder={folder!r} must be a path: Checkpoint(folder, every={folder})")
@@ -124,7 +124,7 @@ class Checkpoint:
 
     @contextmanager
     def held(self, agent: Agent) -> Iterator[None]:
-        """While entered, the folder is this process's alone.
+        """Locks the folder for this process.
 
         Raises:
             RunInUseError: if another process holds it.
@@ -168,7 +168,7 @@ class Checkpoint:
             return
 
     def __call__(self, agent: Agent, progress: Progress) -> None:
-        """Saves if a checkpoint has fallen due in this step."""
+        """Saves if a checkpoint is due in this step."""
         before, self._last_step = self._last_step, progress.step
         by_steps = self.every is not None and before // self.every < progress.step // self.every
         now = time.monotonic()
@@ -177,7 +177,7 @@ class Checkpoint:
             self.attempt(agent)
 
     def attempt(self, agent: Agent) -> None:
-        """Saves as :meth:`save` does; where that is impossible, warns and tries again after a minute."""
+        """Saves as :meth:`save` does; if that fails, warns and retries after a minute."""
         written = agent.failed_writes.attempt(f"checkpoints in {self.folder}", lambda: self.save(agent), retry=False)
         self._retry_at = math.inf
         if not written:
@@ -185,14 +185,14 @@ class Checkpoint:
             self._retry_at = self._last_time + RETRY_SECONDS
 
     def save(self, agent: Agent, reason: str = "") -> Path | None:
-        """Saves now, unless nothing has happened since the last time; returns the path, or None.
+        """Saves now and returns the path; returns None if nothing has changed since the last checkpoint.
 
         Args:
             agent: the agent.
-            reason: why the environments' state is not to be trusted, in words; empty where it is.
+            reason: why the state of the environments is not valid; empty if it is.
 
         Raises:
-            OSError: if that is impossible; what was saved before stays as it is.
+            OSError: if the checkpoint cannot be written; earlier checkpoints are not changed.
             NonFiniteError: if the last update left numbers that are not finite; nothing is saved then.
         """
         began = time.monotonic()
@@ -221,7 +221,7 @@ class Checkpoint:
         return path
 
     def save_after(self, error: Exception, agent: Agent) -> None:
-        """Saves what is whole after an error in the course of a step: the run goes on at the start of new episodes."""
+        """Saves after an error within a step; the run resumes at the start of new episodes."""
         if any(array.is_deleted() for array in agent.run.state):
             return  # the error came between two states
         reason = f"the run ended with {type(error).__name__}"
@@ -232,14 +232,14 @@ class Checkpoint:
 
     def _write_rows(self, ring: Ring, row_files: RowFiles, step: int) -> None:
         if not all((self.folder / name).exists() for name, _ in row_files.files):
-            row_files.files = []  # somebody has cleared the folder: everything is written anew
+            row_files.files = []  # the folder was cleared: all rows are written again
         rows = ring.rows_since(row_files.heads(ring))
         name = f"rows_{step:012d}_{secrets.token_hex(4)}.safetensors"
         checkpoint.write(self.folder / name, "rows", rows, {})
         row_files.add(name, ring)
 
     def _tidy(self) -> None:
-        """Deletes the checkpoints that are too many, and the rows that no other names."""
+        """Deletes checkpoints beyond ``keep``, and the rows that no other checkpoint needs."""
         found = run_files(self.folder)
         for path in found[self.keep :]:
             _remove(path)
@@ -250,7 +250,7 @@ class Checkpoint:
                 _remove(path)
 
     def _rows_of(self, path: Path) -> list[str]:
-        """Returns the files of rows that a checkpoint names; none, if it is damaged."""
+        """Returns the files of rows that a checkpoint needs; none if it is damaged."""
         if path not in self._named:
             try:
                 self._named[path] = [str(name) for name in checkpoint.read_header(path, "run")["rows"]]
@@ -260,7 +260,7 @@ class Checkpoint:
 
 
 def _remove(path: Path) -> None:
-    """Removes a file that is not needed any more; one that cannot be is left for the next checkpoint to remove."""
+    """Removes a file; if that fails, the next checkpoint tries again."""
     with suppress(OSError):
         path.unlink()
 
@@ -273,7 +273,7 @@ def run_files(folder: Path) -> list[Path]:
 
 
 def step_of(path: Path) -> int:
-    """Returns the environment steps that had been taken at a checkpoint."""
+    """Returns the environment step of a checkpoint."""
     found = RUN_FILE.fullmatch(path.name)
     assert found is not None
     return int(found[1])
@@ -337,7 +337,7 @@ class SavedRun(msgspec.Struct, kw_only=True):
 
 
 def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Returns header and arrays of a run, the rows of its replay buffer left out."""
+    """Returns header and arrays of a run, without the rows of its replay buffer."""
     run = agent.run
     states = None if reason or run.obs is None else run.env.snapshot()
     if states is None and not reason:
@@ -386,7 +386,7 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
 
 
 def buffer_content(run: Run) -> dict[str, Any]:
-    """Returns what a buffer holds beside the rows of a ring."""
+    """Returns the state of a buffer, without the rows of a ring."""
     buffer = run.replay
     if isinstance(buffer, RolloutBuffer):
         return {"rollout": buffer.arrays(), "started": buffer.started, "carry": leaves(buffer.carry)}

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, whatever ends the process or the power in between."""
+"""Atomic writes: after a crash or power cut a file is either complete or unchanged."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 STALE = 3600.0
-"""Seconds after its last change from which on a temporary file counts as left behind by a process that is no more."""
+"""Age in seconds from which a temporary file is taken for one that a killed process left behind."""
 
 ADVICE = {
     errno.ENOSPC: "free some space, or give a path on another disk",
@@ -25,26 +25,26 @@ ADVICE = {
     errno.ENOENT: "its folder was removed while the file was written; write it again",
     errno.ENOTDIR: "a part of the path is a file; give a path through folders only",
     errno.EEXIST: "a part of the path is a file; give a path through folders only",
-    errno.EISDIR: "give a path that is no folder",
+    errno.EISDIR: "give a path that is not a folder",
     errno.ENAMETOOLONG: "give a shorter name",
 }
-"""What to do about each kind of failure."""
+"""What to do about each error."""
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Gives a new file to write to, which takes the place of ``path`` once it is complete and on disk.
+    """Opens a new file for writing, which replaces ``path`` once it is complete and on disk.
 
-    Missing folders are made. If anything is raised, in here or by the caller, ``path`` is left as it was. Temporary files
-    that processes which were killed left behind for ``path`` are removed.
+    Missing folders are created. If an exception is raised, ``path`` is unchanged. Temporary files that killed processes left
+    behind for ``path`` are removed.
 
     Raises:
-        OSError: if it cannot be written, of the class that fits, with the path, the reason and what to do.
+        OSError: if it cannot be written, of the matching class, with the path, the reason and what to do.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         if path.exists() and not path.is_file():
-            raise OSError(errno.EISDIR, "there is a folder, or something else that is no file, of that name")
+            raise OSError(errno.EISDIR, "there is a folder, or something else that is not a file, of that name")
         make_folder(path.parent)
         remove_stale(path)
         try:
@@ -63,7 +63,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def make_folder(path: Path) -> None:
-    """Makes a folder, and those above it that are missing, and brings their names to disk; one that is there is left alone.
+    """Creates a folder with its missing parents and syncs their names to disk; an existing folder is not changed.
 
     Raises:
         OSError: if that is impossible.
@@ -80,7 +80,7 @@ def make_folder(path: Path) -> None:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Adds bytes at the end of a file, all of them or none; they are not brought to disk at once.
+    """Appends bytes to a file, all of them or none; they are not synced to disk.
 
     Raises:
         OSError: if that is impossible, as for :func:`replacing`; the file is then as long as before.
@@ -100,7 +100,7 @@ def append(path: Path, content: bytes) -> None:
 
 
 def remove_stale(path: Path, age: float = STALE) -> None:
-    """Removes temporary files of :func:`replacing` for ``path`` that nothing has written to for ``age`` seconds."""
+    """Removes temporary files of :func:`replacing` for ``path`` that were last written ``age`` seconds ago or earlier."""
     ours = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.tmp")
     with contextlib.suppress(OSError):
         for other in path.parent.iterdir():
@@ -111,13 +111,13 @@ def remove_stale(path: Path, age: float = STALE) -> None:
 
 
 def shortened(path: str | Path) -> str:
-    """Returns a path for a message: whole, unless it is longer than a line or two."""
+    """Returns a path for a message, shortened if it is very long."""
     text = str(path)
     return text if len(text) <= 300 else f"{text[:150]}...{text[-50:]}"
 
 
 def _sync_folder(folder: Path) -> None:
-    """Brings the new name to disk where folders can be opened for that; elsewhere the system does so in its own time."""
+    """Syncs the names in a folder to disk, on systems where folders can be opened."""
     if os.name != "posix":
         return
     with contextlib.suppress(OSError):
@@ -129,7 +129,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _explained(error: OSError, path: Path) -> OSError:
-    """Returns an error of the same class whose message holds path, reason and remedy."""
+    """Returns an error of the same class whose message contains the path, the reason and what to do."""
     reason = error.strerror or str(error)
     advice = ADVICE.get(error.errno or 0, "give a path on another disk")
     return OSError(

@@ -1,4 +1,4 @@
-"""Writes that may fail without ending training: warned of at once, tried again, and reported at the end."""
+"""Writes that may fail without ending training: reported with a warning, retried, and listed at the end."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from rejeu.reporting.logging import Sink
 
 RETRY_SECONDS = 60.0
 """Seconds between two attempts at a write that failed."""
-MOST_ROWS = 10_000
-"""Most rows of one table that wait to be written; beyond it the oldest are dropped."""
+MAX_ROWS = 10_000
+"""Upper limit on the rows of one table that wait to be written; beyond it the oldest are dropped."""
 
 
 class Failure(NamedTuple):
     """A write that failed."""
 
     reason: str
-    """Why, in words."""
+    """The reason as text."""
     written: bool
-    """Whether it succeeded later."""
+    """Whether a later attempt succeeded."""
 
 
 class FailedWrites:
@@ -48,7 +48,7 @@ class FailedWrites:
 
     def __init__(self) -> None:
         self.failures: dict[str, Failure] = {}
-        """What failed in the last ``learn``, by name."""
+        """Failures of the last ``learn``, by name."""
         self._retries: dict[str, Callable[[], object]] = {}
         self._waiting: dict[str, deque[tuple[Any, ...]]] = {}
         self._dropped: dict[str, int] = {}
@@ -56,16 +56,16 @@ class FailedWrites:
 
     @property
     def complete(self) -> bool:
-        """Whether everything is written, be it late."""
+        """Whether everything has been written, possibly late."""
         return all(failure.written for failure in self.failures.values())
 
     def attempt(self, what: str, write: Callable[[], object], retry: bool = True) -> bool:
-        """Calls ``write`` and returns whether it succeeded; if not, warns unless that is known already.
+        """Calls ``write`` and returns whether it succeeded; if not, warns unless it failed before.
 
         Args:
-            what: what is written, in words; a later attempt of the same name replaces an earlier one.
-            write: raises ``OSError`` where it fails, and may then be called again.
-            retry: whether :meth:`retry` calls it again; False where the caller does.
+            what: name of what is written; a later attempt with the same name replaces an earlier one.
+            write: raises ``OSError`` if it fails, and may then be called again.
+            retry: whether :meth:`retry` calls it again; False if the caller does.
         """
         try:
             write()
@@ -75,7 +75,7 @@ class FailedWrites:
                 what,
                 write if retry else None,
                 os.strerror(error.errno) if error.errno else text,
-                f"{what}: {text}; training continues, and the write is tried again",
+                f"{what}: {text}; training continues and the write is retried",
             )
             return False
         self._retries.pop(what, None)
@@ -84,29 +84,29 @@ class FailedWrites:
         return True
 
     def put(self, what: str, write: Callable[..., object], *row: Any) -> None:
-        """Writes a row, after those of the same name that still wait, or lets it wait with them.
+        """Writes a row after those of the same name that still wait, or queues it.
 
         Args:
-            what: the rows of which table, in words.
-            write: takes ``row``; raises ``OSError`` if it could not write it, and must then have written no part of it.
-            row: what is written.
+            what: name of the table.
+            write: takes ``row``; if it raises ``OSError``, it must not have written any part of it.
+            row: the values.
         """
         rows = self._waiting.setdefault(what, deque())
-        if len(rows) == MOST_ROWS:
+        if len(rows) == MAX_ROWS:
             rows.popleft()
             self._dropped[what] = self._dropped.get(what, 0) + 1
         rows.append(row)
         self.attempt(what, partial(self._flush, what, write))
 
     def retry(self) -> bool:
-        """Tries again what failed, and returns whether everything is written."""
+        """Retries failed writes and returns whether everything has been written."""
         self._retry_at = math.inf
         for what, write in list(self._retries.items()):
             self.attempt(what, write)
         return self.complete
 
     def retry_if_due(self) -> None:
-        """Does the same where the last failure is ``RETRY_SECONDS`` old."""
+        """Calls :meth:`retry` if the last failure is ``RETRY_SECONDS`` old."""
         if time.monotonic() >= self._retry_at:
             self.retry()
 
@@ -115,7 +115,7 @@ class FailedWrites:
         self.failures = {what: failure for what, failure in self.failures.items() if not failure.written}
 
     def summary(self) -> str:
-        """Returns what failed, in words; empty if nothing did."""
+        """Returns the failures as text, empty if there were none."""
         parts = []
         for title, written in (("not written", False), ("written late", True)):
             by_reason: dict[str, list[str]] = {}
@@ -126,7 +126,7 @@ class FailedWrites:
         return "; ".join(parts)
 
     def warn(self) -> None:
-        """Warns of everything that failed, if anything did."""
+        """Warns of all failures, if there were any."""
         if text := self.summary():
             warnings.warn(text, UserWarning, stacklevel=2)
 
@@ -137,7 +137,7 @@ class FailedWrites:
             rows.popleft()
         if n := self._dropped.pop(what, 0):
             lost = f"the first {n:,} {what} that failed"
-            self._note(lost, None, f"only {MOST_ROWS:,} wait", f"{lost} are not written, for only {MOST_ROWS:,} wait")
+            self._note(lost, None, f"only {MAX_ROWS:,} wait", f"{lost} are not written: at most {MAX_ROWS:,} can wait")
 
     def _note(self, what: str, write: Callable[[], object] | None, reason: str, text: str) -> None:
         is_new = what not in self.failures or self.failures[what].written
@@ -150,7 +150,7 @@ class FailedWrites:
 
 
 class RetryingSink:
-    """A sink whose rows wait, in their order, while they cannot be written."""
+    """A sink whose rows are queued while they cannot be written."""
 
     def __init__(self, sink: Sink, failed: FailedWrites) -> None:
         self.sink = sink
@@ -158,7 +158,7 @@ class RetryingSink:
         self._failed = failed
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Takes the metrics of environment step ``step``."""
+        """Writes the metrics of environment step ``step``."""
         self._failed.put(self._what, self.sink.write, step, dict(metrics))
 
     def close(self) -> None:
