@@ -9,13 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from gymnasium import spaces
+from msgspec import Meta
 
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
+from rejeu.io.records import convert
 from rejeu.sb3.common.running_mean_std import RunningMeanStd
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
@@ -24,17 +27,34 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     VecEnvWrapper,
     unwrap_vec_wrapper,
 )
-from rejeu.validation import number
 
 __all__ = ["VecNormalize", "sync_envs_normalization", "unwrap_vec_normalize"]
 
 KIND = "vec_normalize"
 """Kind of its files."""
-NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
-MOST = dict.fromkeys(NUMBERS, math.inf) | {"gamma": 1.0}
 BOUNDS = ("clip_obs", "clip_reward")
-"""Those that may be infinite, for no clipping. A file then has null, since JSON has no infinity."""
-SWITCHES = ("training", "norm_obs", "norm_reward")
+"""Settings that may be infinite, for no clipping. A file then has null, since JSON has no infinity."""
+NonNegative = Annotated[float, Meta(ge=0, le=1e300)]
+
+
+class Settings(msgspec.Struct):
+    """The settings of a wrapper in the header of its file."""
+
+    clip_obs: NonNegative | None
+    clip_reward: NonNegative | None
+    gamma: Annotated[float, Meta(ge=0, le=1)]
+    epsilon: NonNegative
+    training: bool
+    norm_obs: bool
+    norm_reward: bool
+
+
+class Header(msgspec.Struct):
+    """The header of a wrapper's file."""
+
+    settings: Settings
+    keys: list[str] | None
+    """Keys of a Dict observation that are normalized."""
 
 
 class VecNormalize(VecEnvWrapper):
@@ -238,8 +258,7 @@ class VecNormalize(VecEnvWrapper):
         """
         arrays = self.statistics()
         header = {
-            "settings": {key: _written(key, float(getattr(self, key))) for key in NUMBERS}
-            | {key: bool(getattr(self, key)) for key in SWITCHES},
+            "settings": {key: _written(key, getattr(self, key)) for key in Settings.__struct_fields__},
             "keys": None if not isinstance(self.obs_rms, dict) else list(self.obs_rms),
         }
         return checkpoint.write(save_path, KIND, arrays, header)
@@ -253,11 +272,12 @@ class VecNormalize(VecEnvWrapper):
             CheckpointError: if the file is damaged or belongs to other observations.
         """
         with checkpoint.opened(load_path, KIND) as file:
-            header = file.header
             try:
-                settings = {key: _read(key, header["settings"][key]) for key in NUMBERS}
-                switches = {key: _check_switch(key, header["settings"][key]) for key in SWITCHES}
-                new = VecNormalize(venv, **switches, **settings, norm_obs_keys=_check_keys(header["keys"]))  # type: ignore[arg-type]
+                header = convert(file.header, Header)
+                settings = msgspec.structs.asdict(header.settings)
+                for key in BOUNDS:
+                    settings[key] = math.inf if settings[key] is None else settings[key]
+                new = VecNormalize(venv, **settings, norm_obs_keys=header.keys)
             except (LookupError, TypeError, ValueError) as error:
                 raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
             _check_specs(file.specs, new.statistics(), load_path)
@@ -323,24 +343,10 @@ def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, 
     moments.mean, moments.var, moments.count = found["mean"], found["var"], float(found["count"])
 
 
-def _written(key: str, value: float) -> float | None:
-    return None if key in BOUNDS and value == math.inf else value
-
-
-def _read(key: str, value: Any) -> float:
-    return math.inf if key in BOUNDS and value is None else number(key, value, least=0, most=MOST[key])
-
-
-def _check_keys(keys: Any) -> list[str] | None:
-    if keys is not None and not (isinstance(keys, list) and all(isinstance(key, str) for key in keys)):
-        raise ValueError(f"the keys are {str(keys)[:40]}, expected a list of strings or null")
-    return keys
-
-
-def _check_switch(key: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"{key}={str(value)[:40]} must be true or false")
-    return value
+def _written(key: str, value: float) -> float | bool | None:
+    if key in ("training", "norm_obs", "norm_reward"):
+        return bool(value)
+    return None if value == math.inf else float(value)
 
 
 def _check_box(space: spaces.Space, key: str | None) -> None:
