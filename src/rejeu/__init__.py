@@ -17,9 +17,24 @@ if not interrupt.is_command():  # which imports it when it makes an environment
     importlib.import_module("rejeu.envs")  # registers rejeu's environments
 
 if TYPE_CHECKING:
-    from rejeu.agents import A2C, AGENTS, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO, load
-    from rejeu.agents.off_policy import OffPolicyAgent
-    from rejeu.agents.on_policy import OnPolicyAgent
+    from rejeu.agents import (
+        A2C,
+        AGENTS,
+        DDPG,
+        DQN,
+        PPO,
+        QRDQN,
+        SAC,
+        TD3,
+        TQC,
+        CrossQ,
+        MaskablePPO,
+        OffPolicyAgent,
+        OnPolicyAgent,
+        RecurrentPPO,
+        load,
+        register,
+    )
     from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
     from rejeu.buffers.replay_memory import ReplayMemory
     from rejeu.buffers.uniform import ReplayBuffer
@@ -46,9 +61,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS DDPG DQN PPO QRDQN SAC TD3 TQC CrossQ MaskablePPO RecurrentPPO load",
-    "rejeu.agents.off_policy": "OffPolicyAgent",
-    "rejeu.agents.on_policy": "OnPolicyAgent",
+    "rejeu.agents": "A2C AGENTS DDPG DQN PPO QRDQN SAC TD3 TQC CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent RecurrentPPO "
+    "load register",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",
     "rejeu.buffers.uniform": "ReplayBuffer",
@@ -111,6 +125,7 @@ __all__ = [
     "make_vector",
     "plots",
     "record_video",
+    "register",
     "show_videos",
 ]
 

@@ -1,35 +1,26 @@
-"""The command ``rejeu``: one file a command.
+"""The command ``rejeu``: the arguments are in :mod:`rejeu.cli.commands`, and what each command does in a module of its name.
 
-What a command needs is imported when it runs, so that asking for help is quick.
+That module is imported when the command runs, so that help and errors in the arguments are quick.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import tyro
+from tyro.extras import subcommand_cli_from_dict
 
-from rejeu import interrupt
-from rejeu.cli import arguments, check, evaluate, list as listing, play, record, resume, train, watch
-
-COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
-    "train": (train.Train, train.run),
-    "resume": (resume.Resume, resume.run),
-    "evaluate": (evaluate.Evaluate, evaluate.run),
-    "record": (record.Record, record.run),
-    "play": (play.Play, play.run),
-    "watch": (watch.Watch, watch.run),
-    "check": (check.Check, check.run),
-    "list": (listing.List, listing.run),
-}
-"""Each command's arguments, and the function that takes them and returns the exit status."""
+import rejeu
+from rejeu import errors, interrupt
+from rejeu.cli import parsing
+from rejeu.cli.commands import COMMANDS
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
 
@@ -47,51 +38,48 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = sys.argv[1:] if argv is None else argv
     if [*argv] == ["--version"]:
-        from rejeu import __version__
-
-        print(f"rejeu {__version__}")
+        print(f"rejeu {rejeu.__version__}")
         return 0
     if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
         os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with interrupt.leaving(), warnings.catch_warnings():
         warnings.showwarning = show_warning
-        return carry_out(argv)
+        return run_command(argv)
 
 
-def carry_out(argv: Sequence[str]) -> int:
-    """Reads a command line, runs what it says and returns the exit status."""
-    kinds: dict[str, Any] = {name: kind for name, (kind, _) in COMMANDS.items()}
+def run_command(argv: Sequence[str]) -> int:
+    """Parses a command line, runs the command and returns the exit status."""
     try:
-        argv = arguments.checked(argv, kinds)
-        given = tyro.extras.subcommand_cli_from_dict(kinds, prog="rejeu", description=DESCRIPTION, args=argv)
-        run = next(function for kind, function in COMMANDS.values() if isinstance(given, kind))
-        return run(given)
+        argv = parsing.checked(argv, COMMANDS)
+        arguments = subcommand_cli_from_dict(COMMANDS, prog="rejeu", description=DESCRIPTION, args=argv)
+        for name in arguments.imports:
+            importlib.import_module("rejeu.cli.importing").import_source(name)
+        return importlib.import_module(f"rejeu.cli.{argv[0]}").run(arguments)
     except KeyboardInterrupt as error:
         print("rejeu: interrupted", file=sys.stderr)
         return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)
-    except expected_errors() as error:
+    except Exception as error:
+        if not isinstance(error, expected_errors()):
+            raise
         print(f"rejeu: error: {one_line(error)}", file=sys.stderr)
         return 2
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Prints a warning on one line, without the place in the code, which is no help on a command line."""
+    """Prints a warning on one line, without the line of code that it comes from."""
     print(f"warning: {one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
 
 
 def expected_errors() -> tuple[type[Exception], ...]:
-    """Returns the errors whose message is meant for the user; the others are defects and keep their traceback."""
-    import gymnasium
+    """Returns the errors whose message is meant for the user; the others are bugs and keep their traceback."""
+    import gymnasium  # takes longer than all that --help needs
 
-    from rejeu import errors
-
-    own: tuple[type[Exception], ...] = (errors.BadEnvironmentError, errors.NonFiniteError)
-    own += (errors.RunInUseError, errors.WorkerError, gymnasium.error.Error)
-    return ValueError, TypeError, ImportError, OSError, MemoryError, *own
+    own = (errors.BadEnvironmentError, errors.NonFiniteError, errors.RunInUseError, errors.WorkerError)
+    return ValueError, TypeError, ImportError, OSError, MemoryError, *own, gymnasium.error.Error
 
 
 def one_line(error: Exception | Warning | str) -> str:
-    r"""Returns an error's or a warning's message on one line and without colors, or its kind if it has none.
+    r"""Returns an error's or a warning's message on one line and without colors, or the name of its class if it has none.
 
     >>> one_line(ValueError("two\n  lines")), one_line(MemoryError())
     ('two lines', 'MemoryError')

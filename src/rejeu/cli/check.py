@@ -1,38 +1,22 @@
-"""``rejeu check``: what is wrong with an environment, before anything is trained on it."""
+"""``rejeu check``: finds what is wrong with an environment before training."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+import inspect
+import sysconfig
+from contextlib import closing
+from pathlib import Path
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+import gymnasium as gym
 
-from rejeu.cli.environment import EnvironmentOptions, named
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
-
-@dataclass(frozen=True)
-class Check(EnvironmentOptions):
-    """Plays an environment for a few seconds and prints what is wrong with it; exit status 1 after errors.
-
-    An environment of your own: rejeu check my_env.py, or my_package.my_module:MyEnv-v0, where the module registers it.
-    """
-
-    env: Annotated[Positional[str], arg(metavar="ENV")]
-    """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
-    all: Annotated[bool, FlagCreatePairsOff] = False
-    """Of an installed package's environment, show the warnings too, which only its authors can act on."""
+from rejeu.cli import environment
+from rejeu.cli.commands import Check
+from rejeu.envs.checker import findings
 
 
 def run(arguments: Check) -> int:
     """Prints the findings, errors first, and returns the exit status: 1 if there are errors, else 0."""
-    from contextlib import closing
-
-    from rejeu.envs.checker import findings
-
-    with closing(named(arguments.env, arguments).make()) as env:
+    with closing(environment.from_arguments(arguments.env, arguments).make()) as env:
         found = sorted(findings(env))
         package = None if arguments.all else installed_package(env)
     n_notes = 0
@@ -53,23 +37,19 @@ def run(arguments: Check) -> int:
 
 
 def installed_package(env: gym.Env) -> str | None:
-    """Returns the package that an environment's class is of, if it was installed rather than written here."""
-    import inspect
-    import sysconfig
-    from pathlib import Path
-
+    """Returns the installed package that defines an environment's class, or None for the user's own code."""
     kind = type(env.unwrapped)
     folders = {Path(sysconfig.get_path(name)).resolve() for name in ("purelib", "platlib")}
     package = kind.__module__.partition(".")[0]
     try:
         file = Path(inspect.getfile(kind)).resolve()
-    except (TypeError, OSError):  # a class without a file, such as one typed into the interpreter
+    except (TypeError, OSError):  # a class without a file, such as one of a notebook
         return None
     return package if package == "rejeu" or any(file.is_relative_to(folder) for folder in folders) else None
 
 
 def counted(n: int, what: str) -> str:
-    """Returns a number of things in words.
+    """Returns a number with its noun.
 
     >>> counted(0, "error"), counted(1, "error"), counted(2, "error")
     ('no errors', '1 error', '2 errors')

@@ -1,8 +1,8 @@
 """The environment of a command: named on the command line, or recorded in a run folder.
 
-What is typed may import code: ``my_env:Walk-v0``, ``my_env.py``, ``--wrapper my_env:Shaped``. What a file says may not: of
-a run folder only ids that are registered here are taken, with keyword arguments that are plain numbers, truth values and
-words. Everything else the user must type again, and the error says what.
+The command line may import code: ``my_env:Walk-v0``, ``my_env.py``, ``--wrapper my_env:Shaped``. A file may not: from a run
+folder come only ids that are already registered, with keyword arguments that are plain numbers, booleans and words.
+Everything else must be typed again, and the error says what.
 """
 
 from __future__ import annotations
@@ -13,47 +13,27 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
-from tyro.conf import UseAppendAction, arg
+import gymnasium as gym
 
 from rejeu.cli import settings
+from rejeu.cli.commands import EnvironmentOptions, RunOptions
 from rejeu.cli.importing import find_id, find_wrapper, imports
-from rejeu.envs.registry import are_plain
+from rejeu.envs.make import VectorEnv, make_vector
+from rejeu.envs.registry import are_plain, maker, register
 from rejeu.errors import CheckpointError
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-
-    from rejeu.envs.make import VectorEnv
-
-
-@dataclass(frozen=True, kw_only=True)
-class EnvironmentOptions:
-    """How an environment is made; abstract, a part of the arguments of commands that name one."""
-
-    env_kwargs: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="NAME=VALUE ...")] = ()
-    """Keyword arguments of the environment: sigma=2 map_name=8x8."""
-    wrapper: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE:CLASS")] = ()
-    """Wrap it in this gymnasium.Wrapper, such as gymnasium.wrappers:FlattenObservation; repeat for several, inner first."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(EnvironmentOptions):
-    """The same where a run names the environment; abstract."""
-
-    env: Annotated[str | None, arg(metavar="ENV", help_behavior_hint="")] = None
-    """Environment, as for rejeu train; by default the run's. One that is imported must be named again."""
+from rejeu.reporting.video import make_drawing
 
 
 @dataclass(frozen=True)
 class Environment:
-    """An environment that was found, and how it is made."""
+    """The id of an environment, and how it is made."""
 
     env_id: str
     """Id in Gymnasium's registry, or one that only EnvPool knows."""
     typed: str
-    """How it was named."""
+    """As typed."""
     kwargs: Mapping[str, Any]
     """Keyword arguments of the environment."""
     wrapper_names: tuple[str, ...]
@@ -63,8 +43,6 @@ class Environment:
 
     def make(self, **more: Any) -> gym.Env:
         """Returns a new one; ``more`` are further keyword arguments, such as ``render_mode``."""
-        from rejeu.envs.registry import maker
-
         return Wrapped(maker(self.env_id, **{**self.kwargs, **more}), self.wrappers)()
 
     def vector(self, n_envs: int, backend: str, seed: int | None, restart_workers: int = 0) -> VectorEnv:
@@ -73,9 +51,6 @@ class Environment:
         Raises:
             ValueError: for ``envpool`` with wrappers or keyword arguments, which it does not take.
         """
-        from rejeu.envs.make import make_vector
-        from rejeu.envs.registry import maker
-
         if not self.wrappers:
             return make_vector(
                 self.env_id, n_envs, backend, seed, restart_workers=restart_workers, **self.kwargs  # type: ignore[arg-type]
@@ -85,14 +60,12 @@ class Environment:
         make = Wrapped(maker(self.env_id, **self.kwargs), self.wrappers)
         return make_vector(make, n_envs, backend, seed, restart_workers=restart_workers)  # type: ignore[arg-type]
 
-    def drawing(self) -> gym.Env:
-        """Returns a new one that draws to arrays.
+    def rendering(self) -> gym.Env:
+        """Returns a new one that renders to arrays.
 
         Raises:
             ValueError: if it cannot.
         """
-        from rejeu.reporting.video import make_drawing
-
         return make_drawing(self.make, self.env_id)
 
     @property
@@ -101,9 +74,7 @@ class Environment:
         return not self.kwargs and not self.wrappers
 
     def is_registered(self) -> bool:
-        """Returns whether Gymnasium knows it, and not EnvPool alone."""
-        from rejeu.envs.registry import register
-
+        """Returns whether Gymnasium has it, and not EnvPool alone."""
         return register(self.env_id)
 
     def options(self) -> str:
@@ -144,11 +115,11 @@ def options(typed: str, kwargs: Mapping[str, Any], wrapper_names: Iterable[str])
     return "".join(f" {shlex.quote(word)}" for word in words)
 
 
-def named(env: str, given: EnvironmentOptions) -> Environment:
-    """Returns the environment that was named on the command line; imports what it names.
+def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
+    """Returns the environment that was named on the command line; imports its module.
 
     Raises:
-        ValueError: if there is none, with the nearest; or for what is no wrapper or no keyword argument.
+        ValueError: if there is none, with the nearest; or for an invalid wrapper or keyword argument.
         ImportError: if a module cannot be imported.
     """
     kwargs = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
@@ -156,7 +127,7 @@ def named(env: str, given: EnvironmentOptions) -> Environment:
     return Environment(find_id(env), env, kwargs, given.wrapper, wrappers)
 
 
-def recorded(
+def from_run(
     env_id: Any,
     env_argument: str,
     kwargs: Mapping[str, Any],
@@ -164,22 +135,22 @@ def recorded(
     run: Path,
     given: RunOptions,
 ) -> Environment:
-    """Returns the environment of a run: what is typed, and where that is silent what the run folder says.
+    """Returns the environment of a run: what the command line says, else what the run folder says.
 
     Args:
         env_id: as the folder or the model has it.
         env_argument: how it was named when the run began.
-        kwargs: it was made with.
-        wrapper_names: it was wrapped in.
+        kwargs: its keyword arguments.
+        wrapper_names: its wrappers.
         run: the folder or file, for messages.
-        given: what is typed now; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
+        given: the command line; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
 
     Raises:
         CheckpointError: if something must be typed again, with the options to type.
-        ValueError: as for :func:`named`.
+        ValueError: as for :func:`from_arguments`.
     """
     if given.env is not None:
-        return named(given.env, given)
+        return from_arguments(given.env, given)
     if not isinstance(env_id, str) or imports(env_id) or not re.fullmatch(r"[\w./-]{1,200}", env_id):
         raise CheckpointError(
             f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "

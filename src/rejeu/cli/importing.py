@@ -1,6 +1,6 @@
-"""What a user names on the command line and Python then imports: modules of environments and of wrappers.
+"""Imports modules that the user names on the command line: of environments, wrappers and algorithms.
 
-Nothing here is given a name from a file: :mod:`rejeu.cli.environment` sees to that.
+No name from a file gets here: see :mod:`rejeu.cli.environment`.
 """
 
 from __future__ import annotations
@@ -35,10 +35,9 @@ def find_id(name: str) -> str:
     if ".py" in name and (name.endswith(".py") or ".py:" in name):
         stem, _, env_id = name.partition(".py")
         env_id, source = env_id.removeprefix(":"), f"{stem}.py"
-        module = import_file(Path(source))
     else:
         source, _, env_id = name.partition(":")
-        module = import_here(source)
+    module = import_source(source)
     new = set(gym.registry) - before
     new |= {key for key, spec in gym.registry.items() if str(spec.entry_point).partition(":")[0] == module.__name__}
     if env_id in gym.registry:
@@ -66,15 +65,20 @@ def find_wrapper(name: str) -> Callable[[Any], Any]:
     source, colon, attribute = name.rpartition(":")
     if not colon or not source or not attribute:
         raise ValueError(f"--wrapper {name!r} must be MODULE:CLASS, such as gymnasium.wrappers:FlattenObservation")
-    module = import_file(Path(source)) if source.endswith(".py") else import_here(source)
+    module = import_source(source)
     wrapper = getattr(module, attribute, None)
     if not callable(wrapper):
         raise ValueError(f"--wrapper {name!r}: {source} has no class or function {attribute!r}")
     return wrapper
 
 
-def import_here(name: str) -> Any:
-    """Returns a module, of the current folder too; what is installed comes first.
+def import_source(source: str) -> Any:
+    """Returns the module of this name, or of a Python file whose name ends in ``.py``; see the two functions below."""
+    return import_file(Path(source)) if source.endswith(".py") else import_module(source)
+
+
+def import_module(name: str) -> Any:
+    """Returns a module, also of the current folder; installed ones come first.
 
     Raises:
         ImportError: if there is none.
@@ -87,7 +91,9 @@ def import_here(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
             raise
-        raise ModuleNotFoundError(f"there is no module {name!r} in {os.getcwd()} or among what is installed") from None
+        raise ModuleNotFoundError(
+            f"there is no module {name!r} in {os.getcwd()} or among the installed packages"
+        ) from None
 
 
 def import_file(path: Path) -> Any:

@@ -1,27 +1,23 @@
-"""``rejeu list``: what there is to train."""
+"""``rejeu list``: the algorithms and presets."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-
-@dataclass(frozen=True)
-class List:
-    """Lists the algorithms and the environments with tuned hyper-parameters."""
+from rejeu import presets
+from rejeu.agents import AGENTS
+from rejeu.cli.commands import List
 
 
 def run(arguments: List) -> int:
     """Prints the lists and returns the exit status."""
-    from rejeu import AGENTS, presets
-
     print("algorithms")
     print(columns([(name, (agent.__doc__ or "").partition("\n")[0]) for name, agent in AGENTS.items()]))
-    print("\nenvironments with tuned hyper-parameters, the preset of rejeu train first")
-    env_ids = list(dict.fromkeys(preset.env_id for preset in presets.ALL))
+    print("\nenvironments with tuned hyperparameters, the preset of rejeu train first")
+    env_ids = list(dict.fromkeys(preset.env_id for preset in presets.every()))
     rows = []
     for env_id in env_ids:
-        of_env = [preset for preset in presets.ALL if preset.env_id == env_id]
+        of_env = [preset for preset in presets.every() if preset.env_id == env_id]
         for i, preset in enumerate(of_env):
             first = env_id if i == 0 else ""
             result = presets.find_result(preset.env_id, preset.algorithm)
@@ -33,7 +29,7 @@ def run(arguments: List) -> int:
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> str:
-    """Returns rows in columns, each as wide as its longest entry; numbers, which begin with a digit, to the right.
+    """Returns a table with aligned columns; entries that begin with a digit are aligned to the right.
 
     >>> print(columns([("a", "10"), ("bcd", "7")]))
       a    10

@@ -1,66 +1,32 @@
-"""``rejeu play``: an environment played by hand, alone or beside a trained agent."""
+"""``rejeu play``: an environment played by hand, alone or next to a trained agent."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
-from tyro.conf import Positional, UseAppendAction, arg
-
-from rejeu.cli import run_folder, settings
-from rejeu.cli.environment import EnvironmentOptions, named
-from rejeu.cli.run_folder import Which
+from rejeu.agents import load
+from rejeu.cli import environment, run_folder, settings
+from rejeu.cli.commands import Play
+from rejeu.play import Game, play
+from rejeu.play.known import full_name
 from rejeu.reporting.text import counted
-
-if TYPE_CHECKING:
-    from rejeu.play import Game
-
-
-@dataclass(frozen=True)
-class Play(EnvironmentOptions):
-    """Opens a window in which you play an environment with a, s, d, w or the arrows.
-
-    Any keys may be held together. The window says what each does; r begins anew, p pauses, q quits.
-    """
-
-    env: Annotated[Positional[str], arg(metavar="ENV")]
-    """Id of an environment with Discrete or Box actions, as for rejeu train; or Car, Mountain or Lunar."""
-    keys: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEYS=ACTION ...")] = ()
-    """Other keys: a=0 d=2 none=1 for Discrete actions, w=[1,0] a+w=[1,-1] for Box actions; none is nothing held."""
-    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Of the first start; each further one has the next seed. One is drawn if none is given."""
-    fps: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Steps a second; by default the environment's own."""
-    episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Close after so many; by default when you do."""
-    record: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """New or empty folder for a Minari dataset and a video of what you play."""
-    against: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
-    """Folder of a run, or a .safetensors file, whose agent plays the same starts beside you."""
-    which: Which = "best"
-    """Of a folder: the model that evaluated best in training, or the last."""
 
 
 def run(arguments: Play) -> int:
     """Plays, prints the scores, and returns the exit status."""
-    from rejeu import load
-    from rejeu.play import play
-    from rejeu.play.known import full_name
-
-    environment = named(full_name(arguments.env), arguments)
-    env_id, agent = environment.env_id, None
+    made = environment.from_arguments(full_name(arguments.env), arguments)
+    agent = None
     if arguments.against is not None:
         model = run_folder.find_model(arguments.against, arguments.which)
         trained_on = run_folder.recorded_id(model)
-        if trained_on != env_id:
-            raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {env_id}")
+        if trained_on != made.env_id:
+            raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {made.env_id}")
         agent = load(model)
     game = play(
-        environment.make,
-        keys=assigned(chain.from_iterable(arguments.keys)),
+        made.make,
+        keys=parse_keys(chain.from_iterable(arguments.keys)),
         seed=arguments.seed,
         fps=arguments.fps,
         episodes=arguments.episodes,
@@ -74,13 +40,13 @@ def run(arguments: Play) -> int:
     return 0
 
 
-def assigned(assignments: Iterable[str]) -> dict[str, Any]:
-    """Returns actions by keys.
+def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
+    """Returns the action of each combination of keys.
 
     Raises:
         ValueError: for an assignment without ``=``.
 
-    >>> assigned(["a=0", "a+w=[1,-0.5]", "none=wait"])
+    >>> parse_keys(["a=0", "a+w=[1,-0.5]", "none=wait"])
     {'a': 0, 'a+w': [1, -0.5], 'none': 'wait'}
     """
     result = {}
@@ -93,10 +59,10 @@ def assigned(assignments: Iterable[str]) -> dict[str, Any]:
 
 
 def scores(game: Game) -> str:
-    """Returns a line for each player: episodes played to their end, their mean score and the best."""
+    """Returns a line for each player: number of complete episodes, mean and best score."""
     lines = []
     for player in game.players:
         n = len(player.scores)
-        told = counted(n, "episode")
-        lines.append(f"{player.name}: {told}" + (f", mean {player.mean:.2f}, best {player.best:.2f}" if n else ""))
+        episodes = counted(n, "episode")
+        lines.append(f"{player.name}: {episodes}" + (f", mean {player.mean:.2f}, best {player.best:.2f}" if n else ""))
     return "\n".join(lines)

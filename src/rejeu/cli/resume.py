@@ -1,69 +1,43 @@
-"""``rejeu resume``: continues a run that was stopped, exactly where it stood, or trains a complete one further."""
+"""``rejeu resume``: continues a run exactly where it was stopped, or trains a complete one further."""
 
 from __future__ import annotations
 
 import warnings
 from contextlib import closing
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
-
+from rejeu import validation
+from rejeu.agents import Agent, agent_of_file
 from rejeu.cli import run_folder
-from rejeu.cli.environment import RunOptions
+from rejeu.cli.commands import Resume
+from rejeu.cli.output import echo
 from rejeu.cli.run_folder import RunFolder
-from rejeu.cli.running import Limits, Session, Watch, carry_out, has_reached_goal, make_evaluation_env
-from rejeu.cli.telling import say
+from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
 from rejeu.interrupt import Interrupt
-
-if TYPE_CHECKING:
-    from rejeu.agents import Agent
-
-
-@dataclass(frozen=True)
-class Resume(RunOptions):
-    """Resumes a run that was stopped, or that died, from its newest checkpoint.
-
-    Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
-    """
-
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Its folder."""
-    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train so many more."""
-    minutes: Annotated[float | None, arg(metavar="M", help_behavior_hint="")] = None
-    """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
 
 
 def run(arguments: Resume) -> int:
     """Trains and returns the exit status, as ``rejeu train`` does."""
-    watch = Watch()
-    from rejeu import AGENTS
-    from rejeu.errors import CheckpointError
-    from rejeu.validation import number, whole
-
+    stopwatch = Stopwatch()
     if arguments.steps is not None and arguments.minutes is not None:
         raise ValueError("--steps and --minutes exclude each other; give one of them")
     if arguments.steps is not None:
-        whole("--steps", arguments.steps, least=1)
+        validation.whole("--steps", arguments.steps, least=1)
     if arguments.minutes is not None:
-        number("--minutes", arguments.minutes, above=0)
+        validation.number("--minutes", arguments.minutes, above=0)
     folder = RunFolder(arguments.run)
     config = run_folder.read_config(folder)
-    if config.algorithm not in AGENTS:
-        raise CheckpointError(f"{folder.config} names the algorithm {config.algorithm[:40]!r}, which is unknown")
+    kind = agent_of_file(config.algorithm, folder.config)
     environment = run_folder.of_run(folder, config, arguments)
     with closing(environment.vector(config.n_envs, config.backend, config.seed)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
-            agent = AGENTS[config.algorithm].resume(folder.checkpoints, env)
+            agent = kind.resume(folder.checkpoints, env)
         limits = choose_limits(agent, arguments)
-        say(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
-        say(f"checkpoint    {agent.resumed}")
+        echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
+        echo(f"checkpoint    {agent.resumed}")
         with closing(make_evaluation_env(config, environment)) as evaluation_env, Interrupt() as stop:
             session = Session(agent, config, folder, environment, evaluation_env, limits, is_new=False)
-            return carry_out(session, stop, watch)
+            return session.run(stop, stopwatch)
 
 
 def choose_limits(agent: Agent, arguments: Resume) -> Limits:

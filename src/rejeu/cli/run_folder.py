@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind."""
+"""Run folders: their files and their configuration."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import time
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta
 
 from rejeu.cli import environment
-from rejeu.cli.environment import Environment, RunOptions
+from rejeu.cli.commands import RunOptions, Which
+from rejeu.cli.environment import Environment
 from rejeu.errors import CheckpointError
-from rejeu.io import atomic
+from rejeu.io import atomic, checkpoint
 from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json
 
-Which = Literal["best", "last"]
 MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
 MAX_CONFIG_BYTES = 2**20
@@ -55,7 +55,7 @@ class RunFolder:
 
     @property
     def agent(self) -> Path:
-        """The model as it was at the end."""
+        """The last model."""
         return self.path / "agent.safetensors"
 
     @property
@@ -65,7 +65,7 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of the checkpoints from which the run can go on."""
+        """Folder of the checkpoints from which the run can be resumed."""
         return self.path / "checkpoints"
 
     @property
@@ -74,9 +74,10 @@ class RunFolder:
         return self.path / "curve.png"
 
     @property
-    def films(self) -> Path:
-        """Folder of films of the policy while it learnt."""
-        return self.path / "films"
+    def videos(self) -> Path:
+        """Folder of videos of the policy during training; earlier versions called it ``films``."""
+        videos, films = self.path / "videos", self.path / "films"
+        return films if films.is_dir() and not videos.exists() else videos
 
     @property
     def video(self) -> Path:
@@ -86,14 +87,14 @@ class RunFolder:
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """What a run was asked to do."""
+    """The configuration of a run."""
 
     env: str
     """Id of the environment."""
     algorithm: str
     """Name of the algorithm."""
     preset: bool
-    """Whether the hyper-parameters began from a preset."""
+    """Whether the hyperparameters are those of a preset, except where the command line changed them."""
     hyperparameters: dict[str, Any]
     """All of them, defaults included."""
     policy: str
@@ -107,18 +108,18 @@ class RunConfig:
     """Minutes of training, None where ``steps`` ended the run."""
     success_threshold: float | None
     """Return from which on an episode counts as a success where the environment does not say; None for its own."""
-    film_every: Positive | None
-    """Environment steps between two films of the policy, None for none."""
+    video_every: Positive | None
+    """Environment steps between two videos of the policy, None for none; earlier versions called it ``film_every``."""
     evaluate_every: Positive
     evaluate_episodes: Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
     checkpoint_minutes: Duration | None
     """Minutes between two checkpoints, None for none."""
     env_argument: str = ""
-    """How the environment was named on the command line; for information, and for hints. No command imports it."""
+    """How the environment was named on the command line; used in messages only, never imported."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments that the environment was made with."""
+    """Keyword arguments of the environment."""
     wrappers: tuple[str, ...] = ()
-    """What it was wrapped in, innermost first; for information, and for hints."""
+    """Names of its wrappers, innermost first; used in messages only."""
 
 
 def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
@@ -159,7 +160,7 @@ def read_config(folder: RunFolder) -> RunConfig:
     """Returns what :func:`write_config` wrote.
 
     Raises:
-        FileNotFoundError: if the folder is of no run.
+        FileNotFoundError: if it is not a run folder.
         CheckpointError: if the file is damaged.
     """
     if not folder.config.is_file():
@@ -169,13 +170,16 @@ def read_config(folder: RunFolder) -> RunConfig:
     try:
         if folder.config.stat().st_size > MAX_CONFIG_BYTES:
             raise Malformed(f"it has more than {MAX_CONFIG_BYTES:,} bytes")
-        return convert(parse_json(folder.config.read_bytes()), RunConfig)
+        content = parse_json(folder.config.read_bytes())
+        if isinstance(content, dict) and "film_every" in content:
+            content.setdefault("video_every", content.pop("film_every"))
+        return convert(content, RunConfig)
     except (Malformed, CheckpointError) as error:
         raise CheckpointError(f"{folder.config} is damaged: {error}") from None
 
 
 def versions() -> dict[str, str | None]:
-    """Returns the version of Python and of each package that shapes a run, None where it is not installed."""
+    """Returns the versions of Python and of the packages that matter for a run, None for those that are not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for package in ("rejeu", "jax", "jaxlib", "numpy", "equinox", "optax", "gymnasium", "envpool", "highway-env"):
         try:
@@ -209,7 +213,7 @@ def find_model(run: Path, which: Which) -> Path:
 
 
 def newest_inside(folder: Path) -> str:
-    """Returns a hint at the newest run in a folder of runs, for the end of a message; empty if it holds none."""
+    """Returns the part of a message that names the newest run in a folder of runs; empty if there is none."""
     runs = [path.parent for path in folder.glob("*/config.json")] if folder.is_dir() else []
     if not runs:
         return ""
@@ -219,34 +223,32 @@ def newest_inside(folder: Path) -> str:
 
 
 def environment_of(model: Path, given: RunOptions) -> Environment:
-    """Returns the environment to use a model file in: what is typed, else what the file and its run folder say.
+    """Returns the environment for a model: what the command line says, else what the file and its run folder say.
 
     Raises:
-        CheckpointError: if they do not say, if what they say must be typed again, or if the file is no model.
+        CheckpointError: if they do not say, if it must be typed again, or if the file is not a model.
         ValueError: if there is no such environment.
     """
     if given.env is not None:
-        return environment.named(given.env, given)
+        return environment.from_arguments(given.env, given)
     env_id = recorded_id(model)
     folder = RunFolder(model.parent)
     if model in (folder.best, folder.agent) and folder.config.is_file():
         config = read_config(folder)
         if config.env == env_id:
             return of_run(folder, config, given)
-    return environment.recorded(env_id, "", {}, (), model, given)
+    return environment.from_run(env_id, "", {}, (), model, given)
 
 
 def recorded_id(model: Path) -> Any:
-    """Returns the id of the environment that a model file says it was trained on, unchecked; None if it says none.
+    """Returns the id of the environment of a model file, unchecked; None if it has none.
 
     Raises:
-        CheckpointError: if the file is no model.
+        CheckpointError: if the file is not a model.
     """
-    from rejeu.io import checkpoint
-
     return checkpoint.read_header(model, "agent").get("env_id")
 
 
 def of_run(folder: RunFolder, config: RunConfig, given: RunOptions) -> Environment:
-    """Returns the environment of a run: what is typed, else what its configuration says; see :func:`environment_of`."""
-    return environment.recorded(config.env, config.env_argument, config.env_kwargs, config.wrappers, folder.path, given)
+    """Returns the environment of a run: what the command line says, else what its configuration says."""
+    return environment.from_run(config.env, config.env_argument, config.env_kwargs, config.wrappers, folder.path, given)

@@ -14,11 +14,11 @@ def apply(assignments: Iterable[str], before: Mapping[str, Any], option: str = "
     Args:
         assignments: as typed.
         before: values by name.
-        option: what they were typed after, for messages.
+        option: the option that they belong to, for messages.
 
     Raises:
         ValueError: for an assignment without ``=`` or without a name.
-        TypeError: for a dotted name that reaches into something that is no mapping.
+        TypeError: for a dotted name that reaches into something else than a mapping.
 
     >>> apply(["policy_kwargs.net_arch=[64,64]", "gamma=0.9"], {"policy_kwargs": {"layer_norm": True}})
     {'policy_kwargs': {'layer_norm': True, 'net_arch': [64, 64]}, 'gamma': 0.9}
@@ -35,7 +35,7 @@ def apply(assignments: Iterable[str], before: Mapping[str, Any], option: str = "
 
 
 def value(text: str) -> Any:
-    """Returns what a text stands for: JSON, else a Python literal, else the text itself.
+    """Returns the value of a text: JSON, else a Python literal, else the text itself.
 
     >>> [value(text) for text in ("1e-3", '[1,"episode"]', "(1, 'episode')", "False", "HerReplayBuffer")]
     [0.001, [1, 'episode'], (1, 'episode'), False, 'HerReplayBuffer']
@@ -49,7 +49,7 @@ def value(text: str) -> Any:
 
 
 def written(what: Any) -> str:
-    """Returns the text that :func:`value` reads as this, where there is one.
+    """Returns the text from which :func:`value` reads this, if there is one.
 
     >>> [value(written(one)) for one in (2, "8x8", True, [1, "a"], "2")]
     [2, '8x8', True, [1, 'a'], '2']

@@ -11,10 +11,22 @@ from rejeu.presets.preset import Preset
 from rejeu.presets.result import Result, find_result, results
 
 ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PRESETS, *ball.PRESETS, *robotics.PRESETS)
-"""Every preset. The first one of an environment is the one that ``rejeu train`` uses."""
+"""Every preset of rejeu. The first one of an environment is the one that ``rejeu train`` uses."""
+
+_registered: dict[str, tuple[Preset, ...]] = {}
 
 ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "MultiBinary": "PPO"}
 """The default algorithm of an environment without a preset, by the class of its action space."""
+
+
+def register(algorithm: str, presets: tuple[Preset, ...]) -> None:
+    """Adds presets of an algorithm that is not rejeu's; see :func:`rejeu.register`."""
+    _registered[algorithm] = presets
+
+
+def every() -> tuple[Preset, ...]:
+    """Returns the presets of rejeu, and after them those that were registered."""
+    return (*ALL, *(preset for presets in _registered.values() for preset in presets))
 
 
 def default(env_id: str, algorithm: str) -> Preset:
@@ -33,7 +45,7 @@ def default(env_id: str, algorithm: str) -> Preset:
 
 def find(env_id: str, algorithm: str | None = None) -> Preset | None:
     """Returns the preset of an environment, the first one or that of ``algorithm``, or None if there is none."""
-    return next((p for p in ALL if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
+    return next((p for p in every() if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
 
 
-__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "Result", "default", "find", "find_result", "results"]
+__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "Result", "default", "every", "find", "find_result", "register", "results"]

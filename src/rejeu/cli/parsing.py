@@ -1,4 +1,4 @@
-"""Looks over a command line before it is parsed, so that what is wrong is one line that names the fix."""
+"""Checks a command line before tyro parses it, so that a mistake gives one line that names the fix."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, ge
 
 from tyro.conf import Positional, arg
 
+RENAMED = {"--film-every": "--video-every"}
+"""Options of earlier versions, which are still accepted."""
+
 
 class Option(NamedTuple):
-    """What a command takes after ``--name``, or in a place of its own."""
+    """An option or a positional argument of a command."""
 
     name: str
-    """With its dashes; in capitals for a place."""
+    """With its dashes; of a positional argument its metavar."""
     kinds: tuple[Any, ...]
-    """Types that its value may have."""
+    """The types of its value."""
     choices: tuple[str, ...]
-    """The only values that it may have, where there are such."""
+    """The allowed values; empty if all are."""
     is_flag: bool
     """Whether it takes no value."""
     takes_many: bool
     """Whether it takes all words up to the next option."""
-    is_place: bool
-    """Whether it is given by its place and not by its name."""
+    is_positional: bool
     is_required: bool
 
 
 def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
-    """Returns a command line as the parser takes it: whole numbers such as ``1e4`` are written out.
+    """Returns a command line for the parser: whole numbers such as ``1e4`` are written out.
 
     Raises:
-        ValueError: for an unknown command or option, with the nearest; a value that is missing, is no number where one is
-            expected, or is none of the choices; a place that is not filled, or one too many.
+        ValueError: for an unknown command or option, with the nearest; a value that is missing, not a number or not among
+            the choices; a positional argument that is missing, or one too many.
     """
     if not argv or argv[0] in ("-h", "--help") or {"-h", "--help"} & {*argv[1:]}:
         return [*argv]
@@ -42,8 +44,8 @@ def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
     if command not in commands:
         raise ValueError(f"no command is called {command!r}; {nearest(command, commands)}")
     known = options(commands[command])
-    places = [one for one in known if one.is_place]
-    by_name = {one.name: one for one in known if not one.is_place}
+    positionals = [one for one in known if one.is_positional]
+    by_name = {one.name: one for one in known if not one.is_positional}
     result, filled, i = [command], 0, 0
     while i < len(words):
         word = words[i]
@@ -51,6 +53,7 @@ def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
         if word.startswith("--"):
             name, equals, text = word.partition("=")
             name = name.replace("_", "-")
+            name = RENAMED.get(name, name)
             if name not in by_name:
                 raise ValueError(f"rejeu {command} has no option {name}; {nearest(name, by_name)}")
             option = by_name[name]
@@ -67,21 +70,21 @@ def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
                 raise ValueError(f"{name} needs a value")
             result += [name, *(read(option, value) for value in values)]
             i = end
-        elif filled == len(places):
+        elif filled == len(positionals):
             raise ValueError(f"rejeu {command} does not expect {word!r}; rejeu {command} --help shows what it takes")
         else:
-            result.append(read(places[filled], word))
+            result.append(read(positionals[filled], word))
             filled += 1
-    if missing := [one.name for one in places[filled:] if one.is_required]:
+    if missing := [one.name for one in positionals[filled:] if one.is_required]:
         raise ValueError(f"rejeu {command} needs {' and '.join(missing)}; rejeu {command} --help shows what it takes")
     return result
 
 
 def read(option: Option, text: str) -> str:
-    """Returns a value as the parser takes it.
+    """Returns a value for the parser.
 
     Raises:
-        ValueError: if it is of the wrong kind.
+        ValueError: if it is of the wrong type.
     """
     if option.choices and text not in option.choices:
         raise ValueError(f"{option.name} {text!r} must be one of {', '.join(option.choices)}")
@@ -103,13 +106,13 @@ def read(option: Option, text: str) -> str:
 
 
 def nearest(name: str, known: Mapping[str, Any]) -> str:
-    """Returns which known name was probably meant, or which there are."""
+    """Returns the part of a message that names the nearest known name, or all of them."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     return f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
 
 
 def options(kind: type) -> list[Option]:
-    """Returns what the arguments of a command declare."""
+    """Returns the options of a command from the dataclass of its arguments."""
     hints = get_type_hints(kind, include_extras=True)
     return [_option(one, hints[one.name]) for one in dataclasses.fields(kind)]
 
@@ -117,13 +120,13 @@ def options(kind: type) -> list[Option]:
 def _option(field: dataclasses.Field[Any], hint: Any) -> Option:
     hint, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     said: Any = next((mark for mark in marks if isinstance(mark, type(arg()))), arg())
-    is_place = any(mark is Positional for mark in marks)
+    is_positional = any(mark is Positional for mark in marks)
     return Option(
-        name=str(said.metavar) if is_place else f"--{said.name or field.name}".replace("_", "-"),
+        name=str(said.metavar) if is_positional else f"--{said.name or field.name}".replace("_", "-"),
         kinds=get_args(hint) if isinstance(hint, UnionType) else (hint,),
         choices=get_args(hint) if get_origin(hint) is Literal else (),
         is_flag=hint is bool,
         takes_many=get_origin(hint) is tuple and get_origin(get_args(hint)[0]) is tuple,
-        is_place=is_place,
+        is_positional=is_positional,
         is_required=field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING,
     )

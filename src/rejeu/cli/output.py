@@ -5,40 +5,38 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from rejeu.agents import Agent
+from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.interrupt import NAMES
+from rejeu.reporting.logging import Sink
 from rejeu.reporting.text import counted
 
-if TYPE_CHECKING:
-    from rejeu.agents import Agent
-    from rejeu.callbacks import Evaluate, Evaluated
-    from rejeu.cli.running import Session
-    from rejeu.reporting.logging import Sink
-
-say = partial(print, flush=True)
+echo = partial(print, flush=True)
 
 
 def header(config: RunConfig, environment: Environment, backend: str, folder: RunFolder) -> str:
-    """Returns what a run says of itself before it begins; ``backend`` says what steps the environments, and why."""
-    what = "preset" if config.preset else "default hyper-parameters"
-    span = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
+    """Returns the first lines of a run; ``backend`` says what steps the environments, and why."""
+    what = "preset" if config.preset else "default hyperparameters"
+    length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
     every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"
     return "\n".join(
         [
             f"environment   {environment}, {config.n_envs} at once",
             f"backend       {backend}",
             f"algorithm     {config.algorithm}, {what}, seed {config.seed}",
-            f"training      {span}, {every}",
+            f"training      {length}, {every}",
             f"run folder    {folder.path}",
         ]
     )
 
 
 def reporter(agent: Agent, table: Sink) -> Callable[[Evaluated, bool], None]:
-    """Returns what prints an evaluation and adds it to a table."""
+    """Returns a function that prints an evaluation and adds it to a table."""
 
     def report(result: Evaluated, is_best: bool) -> None:
         evaluation = result.evaluation
@@ -55,21 +53,23 @@ def reporter(agent: Agent, table: Sink) -> Callable[[Evaluated, bool], None]:
             },
         )
         success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
-        say(f"step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}")
+        echo(f"step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}")
 
     return report
 
 
 def summary(
-    session: Session,
+    agent: Agent,
+    folder: RunFolder,
+    environment: Environment,
     evaluate: Evaluate,
     signal: int | None,
     is_complete: bool,
     seconds: float,
     compile_seconds: float,
 ) -> str:
-    """Returns what a run says at its end."""
-    agent, folder, options = session.agent, session.folder, session.environment.options()
+    """Returns the last lines of a run."""
+    options = environment.options()
     lines = [""]
     if not is_complete:
         can_resume = folder.checkpoints.is_dir()
@@ -78,11 +78,11 @@ def summary(
         saved = "; everything is saved" if agent.failed_writes.complete else ""
         lines.append(f"{what}{saved}{how}")
     if agent.ep_info_buffer:
-        lines.append(f"training      last {len(agent.ep_info_buffer)} episodes: {training(agent)}")
+        lines.append(f"training      last {len(agent.ep_info_buffer)} episodes: {training_statistics(agent)}")
     if evaluate.best is not None:
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
     files = ", ".join(sorted(path.name for path in folder.path.iterdir()))
-    backend = " --backend gymnasium" if session.environment.is_registered() else ""
+    backend = " --backend gymnasium" if environment.is_registered() else ""
     return "\n".join(
         [
             *lines,
@@ -94,10 +94,8 @@ def summary(
     )
 
 
-def training(agent: Agent) -> str:
-    """Returns what the last episodes of training came to: return, length and, where it is known, success."""
-    import numpy as np
-
+def training_statistics(agent: Agent) -> str:
+    """Returns return, length and, where it is known, success of the last training episodes."""
     returns, lengths = ([episode[key] for episode in agent.ep_info_buffer] for key in ("r", "l"))
     text = f"return {np.mean(returns):.2f} ± {np.std(returns):.2f}, length {np.mean(lengths):.1f}"
     return f"success {np.mean(agent.ep_success_buffer):.1%}, {text}" if agent.ep_success_buffer else text

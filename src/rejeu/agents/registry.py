@@ -1,0 +1,107 @@
+"""Agents by the name of their algorithm: those of rejeu, and those that are registered."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rejeu import presets as all_presets
+from rejeu.agents import model_files
+from rejeu.agents.base import Agent
+from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ
+from rejeu.agents.on_policy import A2C, PPO, MaskablePPO, RecurrentPPO
+from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
+from rejeu.presets import Preset
+
+A = TypeVar("A", bound=type[Agent])
+
+BUILT_IN = (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO)
+
+AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in BUILT_IN}
+"""Every agent by the name of its algorithm; :func:`register` adds to it."""
+
+ENTRY_POINTS = "rejeu.algorithms"
+"""Group of entry points by which an installed package offers algorithms to ``rejeu train --algo NAME``."""
+
+
+def register(agent: A, presets: Iterable[Preset] = ()) -> A:
+    """Makes an agent of your own known by the name of its algorithm, and returns it.
+
+    :func:`rejeu.load` and the commands then find it, and ``rejeu train`` uses its presets. To define the class again, as a
+    notebook does, replaces it.
+
+    Args:
+        agent: a subclass of :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`.
+        presets: tuned settings of this algorithm for some environments.
+
+    Raises:
+        ValueError: if another algorithm has this name, or a preset is for another algorithm.
+    """
+    name = agent.algorithm.Config.name
+    other = AGENTS.get(name, agent)
+    if (other.__module__, other.__qualname__) != (agent.__module__, agent.__qualname__):
+        raise ValueError(
+            f"the name {name!r} belongs to {other.__module__}.{other.__qualname__}; choose another Config.name"
+        )
+    given = tuple(presets)
+    for preset in given:
+        if preset.algorithm != name:
+            raise ValueError(f"the preset of {preset.env_id} is for {preset.algorithm!r}, not {name!r}")
+    AGENTS[name] = agent
+    all_presets.register(name, given)
+    return agent
+
+
+def find_agent(name: str) -> type[Agent]:
+    """Returns the agent of a name that the user typed, in any case of letters.
+
+    A name that is not registered is looked up among the entry points ``rejeu.algorithms`` of installed packages.
+
+    Raises:
+        ValueError: if there is no such algorithm, with the nearest name.
+    """
+    known = {key.lower(): key for key in AGENTS}
+    if name.lower() not in known and (found := entry_point(name)) is not None:
+        return register(found.load())
+    if name.lower() in known:
+        return AGENTS[known[name.lower()]]
+    near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
+    hint = f"did you mean {known[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
+    raise ValueError(f"no algorithm is called {name!r}; {hint} --import MODULE imports one that registers others")
+
+
+def agent_of_file(name: Any, path: str | Path) -> type[Agent]:
+    """Returns the agent that a file names. Imports nothing: an agent that is not registered is an error.
+
+    Raises:
+        CheckpointError: if it is not registered; the message says what to import.
+    """
+    if isinstance(name, str) and name in AGENTS:
+        return AGENTS[name]
+    hint = "import the module that registers it (--import MODULE)"
+    if isinstance(name, str) and (found := entry_point(name)) is not None:
+        hint = f"import {found.module} (--import {found.module})"
+    raise CheckpointError(
+        f"{path} contains an agent of {str(name)[:40]!r}, which is not registered; {hint}; there are {', '.join(AGENTS)}"
+    )
+
+
+def entry_point(name: str) -> metadata.EntryPoint | None:
+    """Returns the entry point of an algorithm that an installed package offers, without importing it."""
+    offered = metadata.entry_points(group=ENTRY_POINTS)
+    return next((one for one in offered if one.name.lower() == name.lower()), None)
+
+
+def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
+    """Returns the agent of a model file or a run folder, whatever its algorithm; see :meth:`Agent.load`.
+
+    Raises:
+        CheckpointError: also if the algorithm is not registered; the message says what to import.
+    """
+    path = model_files.find(path)
+    agent = agent_of_file(checkpoint.read_header(path, "agent").get("algorithm"), path)
+    return agent.load(path, env, **changes)

@@ -1,0 +1,195 @@
+"""What ``rejeu train`` and ``rejeu resume`` share: training in a run folder, and what is written there."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from rejeu import errors, xla
+from rejeu.agents import Agent, load
+from rejeu.callbacks import Checkpoint, Evaluate, Film
+from rejeu.cli.environment import Environment
+from rejeu.cli.output import echo, reporter, summary
+from rejeu.cli.run_folder import RunConfig, RunFolder
+from rejeu.envs.make import VectorEnv
+from rejeu.interrupt import Interrupt, leaving
+from rejeu.io.failed_writes import RetryingSink
+from rejeu.loops.run import Progress
+from rejeu.reporting import plots
+from rejeu.reporting.logging import CsvFile
+from rejeu.reporting.video import record_video
+
+VIDEO_EPISODES = 3
+VIDEO_STEPS = 600
+"""Most steps of a video: a poor policy's episodes are long, and highway-env renders some 70 frames a second."""
+
+
+class Limits(NamedTuple):
+    """What ends training."""
+
+    steps: int | None = None
+    """Environment steps to take; with ``minutes`` None too, the goal that the run has already."""
+    minutes: float | None = None
+    """Minutes to train for."""
+    pause_steps: int | None = None
+    """Pause after this many further environment steps, without changing the goal."""
+    pause_minutes: float | None = None
+    """Pause after this many further minutes, without changing the goal."""
+
+
+class Stopwatch:
+    """Measures wall time and compilation time since it was made."""
+
+    def __init__(self) -> None:
+        self._began, self._compiled = time.perf_counter(), xla.seconds()
+
+    def seconds(self) -> tuple[float, float]:
+        """Returns wall time, and how much of it was compilation."""
+        return time.perf_counter() - self._began, xla.seconds() - self._compiled
+
+
+class Session(NamedTuple):
+    """One ``rejeu train`` or ``rejeu resume`` of a run."""
+
+    agent: Agent
+    config: RunConfig
+    folder: RunFolder
+    environment: Environment
+    evaluation_env: VectorEnv
+    limits: Limits
+    is_new: bool
+    """Whether the run begins here, rather than being resumed."""
+
+    def run(self, stop: Interrupt, stopwatch: Stopwatch) -> int:
+        """Trains, evaluates, plots and records a video; prints a summary and returns the exit status.
+
+        That is 0, 2 if something could not be written, 130 after Ctrl-C and 143 after SIGTERM. Until the models are saved,
+        signals are requests to stop after the current step; afterwards they end the process at once.
+        """
+        agent, folder = self.agent, self.folder
+        evaluate, is_complete = self.train(stop)
+        written = agent.failed_writes.retry()
+        if is_complete:
+            with leaving(f"interrupted after training; the models are saved in {folder.path}"):
+                evaluate_now(evaluate, agent)
+                self.plot_curve(evaluate)
+                self.record_video()
+        else:
+            self.plot_curve(evaluate)
+            echo(
+                f"no video of a run that was stopped; rejeu record {folder.path}{self.environment.options()} makes one"
+            )
+        echo(summary(agent, folder, self.environment, evaluate, stop.signal, is_complete, *stopwatch.seconds()))
+        if failed := agent.failed_writes.summary():
+            print(f"warning: {failed}", file=sys.stderr)
+        if stop.signal is not None:
+            return 128 + stop.signal
+        return 0 if written else 2
+
+    def train(self, stop: Interrupt) -> tuple[Evaluate, bool]:
+        """Trains and saves; returns the evaluations, and whether the goal was reached.
+
+        Models and tables are written also after an error of the environment or of the numbers.
+        """
+        agent, folder, limits = self.agent, self.folder, self.limits
+        agent.report_folder = folder.path
+        evaluate, callbacks = self.callbacks(stop)
+        metrics = CsvFile(folder.metrics, None if self.is_new else agent.num_timesteps)
+        try:
+            agent.learn(
+                limits.steps,
+                callbacks,
+                log_interval=4 * self.config.n_envs,
+                reset_num_timesteps=self.is_new,
+                progress_bar=True,
+                minutes=limits.minutes,
+                sinks=[metrics],
+            )
+            save(agent, folder.agent)
+            if not evaluate.results:
+                save(agent, folder.best)
+        except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
+            save(agent, folder.agent)
+            raise
+        finally:
+            agent.failed_writes.attempt(f"table {folder.episodes}", lambda: agent.history.write_csv(folder.episodes))
+        return evaluate, not stop.requested and has_reached_goal(agent)
+
+    def callbacks(self, stop: Interrupt) -> tuple[Evaluate, list[Any]]:
+        """Returns the callback that evaluates, and all callbacks of the run."""
+        agent, config, folder = self.agent, self.config, self.folder
+        table = CsvFile(folder.evaluations, None if self.is_new else agent.num_timesteps)
+        report = reporter(agent, RetryingSink(table, agent.failed_writes))
+        every, episodes = config.evaluate_every, config.evaluate_episodes
+        evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
+        is_pause_due = pause(agent, self.limits)
+
+        def finish(agent: Agent, turn: Progress) -> bool:
+            if not stop.requested and has_reached_goal(agent):
+                evaluate_now(evaluate, agent)  # here, and not after learn, so that the last checkpoint contains it
+            return not (stop.requested or is_pause_due(turn))
+
+        callbacks: list[Any] = [evaluate, finish]
+        if config.video_every is not None:
+            render = self.environment.rendering
+            callbacks.append(Film(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
+        if config.checkpoint_minutes is not None:
+            callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
+        return evaluate, callbacks
+
+    def plot_curve(self, evaluate: Evaluate) -> None:
+        """Plots the learning curve, or prints why not."""
+        title = f"{self.environment.env_id}, {self.config.algorithm}"
+        try:
+            plots.learning_curve(self.agent.history, self.folder.curve, evaluations=evaluate.results, title=title)
+        except (ImportError, OSError) as error:
+            echo(f"no curve: {' '.join(str(error).split())}")
+
+    def record_video(self) -> None:
+        """Records a video of the best model, or prints why not."""
+        folder, render = self.folder, self.environment.rendering
+        try:
+            record_video(load(folder.best), folder.video, render, VIDEO_EPISODES, VIDEO_STEPS, self.config.seed)
+        except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
+            echo(f"no video: {' '.join(str(error).split())}")
+
+
+def make_evaluation_env(config: RunConfig, environment: Environment) -> VectorEnv:
+    """Returns up to 16 environments like those of training, with other seeds."""
+    seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
+    backend = "envpool" if config.backend == "envpool" else "gymnasium"
+    return environment.vector(min(config.evaluate_episodes, 16), backend, seed)
+
+
+def save(agent: Agent, path: Path) -> None:
+    """Saves a model, or warns and tries again at the end of the command."""
+    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
+
+
+def evaluate_now(evaluate: Evaluate, agent: Agent) -> None:
+    """Evaluates an agent, unless that was done at this step."""
+    if not evaluate.results or evaluate.results[-1].step != agent.num_timesteps:
+        evaluate.run(agent, agent.num_timesteps)
+
+
+def has_reached_goal(agent: Agent) -> bool:
+    """Returns whether the current or last ``learn`` reached its limit."""
+    return agent._call is None or agent._call.is_over(agent.run.step, agent.run.episode)
+
+
+def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:
+    """Returns a function that returns whether a pause is due after a turn of the loop."""
+    last_step = None if limits.pause_steps is None else agent.num_timesteps + limits.pause_steps
+    until = None if limits.pause_minutes is None else time.monotonic() + 60 * limits.pause_minutes
+
+    def is_due(turn: Progress) -> bool:
+        by_steps = last_step is not None and agent.num_timesteps >= last_step
+        return by_steps or (until is not None and time.monotonic() >= until)
+
+    return is_due
