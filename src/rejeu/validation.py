@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import difflib
 import inspect
+import itertools
 import math
 import textwrap
 from collections.abc import Iterable, Mapping
@@ -98,36 +99,43 @@ def field_names(kind: type) -> list[str]:
     return [field.name for field in dataclasses.fields(kind)]
 
 
-def _definition(kind: type) -> ast.ClassDef:
-    """Returns the source of a class, parsed; parsing a module once is quicker than finding each class's own lines."""
-    for node in _parsed(inspect.getmodule(kind)).body:
-        if isinstance(node, ast.ClassDef) and node.name == kind.__qualname__:
-            return node
-    alone = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    assert isinstance(alone, ast.ClassDef)
-    return alone
+def field_defaults(kind: type) -> dict[str, Any]:
+    """Returns the default of each field of a dataclass as an instance has it; ``inspect.Parameter.empty`` if it has none."""
+    fields = dataclasses.fields(kind)
+    if any(field.default is field.default_factory is dataclasses.MISSING for field in fields):
+        empty = inspect.Parameter.empty
+        return {field.name: empty if field.default is dataclasses.MISSING else field.default for field in fields}
+    defaults = kind()
+    return {field.name: getattr(defaults, field.name) for field in fields}
 
 
-@cache
-def _parsed(module: Any) -> ast.Module:
-    return ast.parse(inspect.getsource(module))
-
-
-@cache
 def field_docs(kind: type) -> dict[str, str]:
-    """Returns the attribute docstring of each field of a dataclass, its bases' included, each on one line."""
+    """Returns the attribute docstring of each field of a dataclass, its bases' included, each on one line.
+
+    Fields without one are left out, as are all fields of a class without source, such as one of a notebook.
+    """
     docs: dict[str, str] = {}
     for owner in reversed(kind.__mro__):
-        if not dataclasses.is_dataclass(owner):
-            continue
-        body = _definition(owner)
-        for statement, following in zip(body.body, body.body[1:], strict=False):
-            if (
-                isinstance(statement, ast.AnnAssign)
-                and isinstance(statement.target, ast.Name)
-                and isinstance(following, ast.Expr)
-                and isinstance(following.value, ast.Constant)
-                and isinstance(following.value.value, str)
-            ):
-                docs[statement.target.id] = " ".join(following.value.value.split())
+        docs.update(_attribute_docs(owner))
     return {key: docs[key] for key in field_names(kind) if key in docs}
+
+
+@cache
+def _attribute_docs(kind: type) -> dict[str, str]:
+    """Returns the docstrings that follow attributes in the source of a class."""
+    try:
+        definition = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    except (OSError, TypeError, SyntaxError):
+        return {}
+    body = definition.body if isinstance(definition, ast.ClassDef) else []
+    docs = {}
+    for statement, following in itertools.pairwise(body):
+        if (
+            isinstance(statement, ast.AnnAssign)
+            and isinstance(statement.target, ast.Name)
+            and isinstance(following, ast.Expr)
+            and isinstance(following.value, ast.Constant)
+            and isinstance(following.value.value, str)
+        ):
+            docs[statement.target.id] = " ".join(following.value.value.split())
+    return docs

@@ -13,7 +13,8 @@ import gymnasium as gym
 import pytest
 
 import rejeu
-from rejeu.cli import main
+from rejeu.cli import main, parsing
+from rejeu.cli.commands import COMMANDS
 from tests.cli.test_cli import TINY, error_of
 
 SOURCE = """
@@ -184,7 +185,7 @@ def test_a_run_folder_imports_nothing_and_says_what_to_type(lie, registered_run,
         {"n_envs": 0},
         {"evaluate_episodes": 10**9},
         {"evaluate_every": 0},
-        {"film_every": -1},
+        {"video_every": -1},
         {"steps": 0},
         {"minutes": -1.0},
         {"checkpoint_minutes": float("nan")},
@@ -209,11 +210,21 @@ def test_a_run_folder_of_an_earlier_version_is_read(registered_run, tmp_path):
     from rejeu.cli import run_folder
 
     content = json.loads((registered_run / "config.json").read_text())
-    for name in ("env_argument", "env_kwargs", "wrappers"):
+    for name in ("env_argument", "env_kwargs", "wrappers", "video_every"):
         del content[name]
-    (tmp_path / "config.json").write_text(json.dumps(content))
-    config = run_folder.read_config(run_folder.RunFolder(tmp_path))
+    (tmp_path / "config.json").write_text(json.dumps({**content, "film_every": 700}))
+    folder = run_folder.RunFolder(tmp_path)
+    config = run_folder.read_config(folder)
     assert (config.env_argument, config.env_kwargs, config.wrappers) == ("", {}, ())
+    assert config.video_every == 700
+    assert folder.videos == tmp_path / "videos"
+    (tmp_path / "films").mkdir()
+    assert folder.videos == tmp_path / "films"
+
+
+def test_film_every_is_still_accepted():
+    argv = parsing.checked(["train", "Pendulum-v1", "--film-every", "1e4"], COMMANDS)
+    assert argv == ["train", "Pendulum-v1", "--video-every", "10000"]
 
 
 def test_a_folder_of_runs_names_the_newest_inside(registered_run, capsys):

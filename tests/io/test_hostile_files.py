@@ -269,7 +269,7 @@ def test_a_path_that_is_too_long_is_refused_in_a_few_words(tmp_path):
 @pytest.mark.parametrize("env_id", ["evil:Env-v0", "os:system", "../x:y", "", "a" * 1000, "a b", 3, None])
 def test_the_environment_of_a_file_is_only_looked_for_among_those_that_are_registered(env_id, tmp_path):
     """Gymnasium imports the module that an id names before a colon, which no file may choose."""
-    from rejeu.cli.evaluate import Evaluate
+    from rejeu.cli.commands import Evaluate
     from rejeu.cli.run_folder import environment_of
 
     path = tmp_path / "model.safetensors"

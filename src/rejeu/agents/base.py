@@ -13,7 +13,6 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, ClassVar, Self
 
 import gymnasium as gym
@@ -22,7 +21,7 @@ import numpy as np
 
 from rejeu import spaces, validation, xla
 from rejeu.agents import model_files, policy as policies, resume, training
-from rejeu.agents.description import ClassOnly, describe
+from rejeu.agents.description import ClassOnly, Documentation, Signature
 from rejeu.agents.model_files import AGENT_ARGUMENTS, BEST_WINDOW, whole_seed
 from rejeu.agents.policy import check_policy
 from rejeu.agents.resume import Resumed
@@ -55,8 +54,8 @@ class Agent(ABC):
 
     takes_masks: ClassVar[bool] = False
     """Whether it asks the environment which actions are allowed."""
-    algorithm: ClassVar[ModuleType]
-    """The module with ``Config`` and ``make``."""
+    algorithm: ClassVar[Any]
+    """What has ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
     _learning: bool = False
     """Whether ``learn`` is under way."""
     report_folder: Path | None = None
@@ -565,10 +564,10 @@ class Agent(ABC):
         return f"<rejeu.{self.name} on {where}, {self.run.step} steps, {self.run.n_updates} updates>"
 
     def __init_subclass__(cls) -> None:
-        """Writes signature and docstring from the configuration, where every hyper-parameter is declared once."""
-        if "algorithm" not in cls.__dict__:
-            return
-        describe(cls, inspect.signature(Agent.__init__))
+        """Adds the hyperparameters of the configuration to docstring and signature, which are made when asked for."""
+        if "algorithm" in cls.__dict__:
+            cls.__doc__ = Documentation(cls.__doc__)  # type: ignore[assignment]
+            cls.__signature__ = Signature(inspect.signature(Agent.__init__))  # type: ignore[attr-defined]
 
 
 Agent.load = ClassOnly(Agent.__dict__["load"])  # type: ignore[method-assign,assignment]

@@ -1,40 +1,51 @@
-"""How an agent's class shows itself: signature and docstring from its configuration, and ``load`` on the class only."""
+"""The docstring and signature of an agent class, made from the configuration of its algorithm when they are asked for."""
 
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rejeu import validation
 from rejeu.agents.model_files import AGENT_ARGUMENTS
 
-if TYPE_CHECKING:
-    from rejeu.agents.base import Agent
+
+class Documentation:
+    """A class attribute ``__doc__``: the docstring of the class, of its configuration and of every hyperparameter."""
+
+    def __init__(self, text: str | None) -> None:
+        self.text = inspect.cleandoc(text or "")
+
+    def __get__(self, instance: Any, owner: type) -> str:
+        config = owner.algorithm.Config  # type: ignore[attr-defined]
+        docs = validation.field_docs(config)
+        lines = [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
+        for key, default in validation.field_defaults(config).items():
+            text = f"{docs[key]} " if key in docs else ""
+            lines.append(
+                f"    {key}: {text}" + ("" if default is inspect.Parameter.empty else f"Default: {default!r}.")
+            )
+        about = inspect.cleandoc(config.__doc__ or "")
+        return "\n".join([self.text, "", about, "", "Args:", *lines])
 
 
-def describe(cls: type[Agent], common: inspect.Signature) -> None:
-    """Writes signature and docstring of an agent's class from the configuration of its algorithm.
+class Signature:
+    """A class attribute ``__signature__``: what every agent takes, then the hyperparameters."""
 
-    Args:
-        cls: the class; its docstring and its signature are replaced.
-        common: what every agent takes, whose last parameter stands for the hyper-parameters.
-    """
-    config = cls.algorithm.Config
-    docs = validation.field_docs(config)
-    lines = [f"{(config.__doc__ or '').strip()}", "", "Args:"]
-    lines += [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
-    defaults = config()
-    parameters = list(common.parameters.values())[:-1]
-    for key in validation.field_names(config):
-        default = getattr(defaults, key)
-        lines.append(f"    {key}: {docs[key]} Default: {default!r}.")
-        parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default))
-    cls.__doc__ = "\n".join([f"{(cls.__doc__ or '').strip()}", "", *lines])
-    cls.__signature__ = inspect.Signature(parameters[1:])  # type: ignore[attr-defined]
+    def __init__(self, common: inspect.Signature) -> None:
+        self.common = common
+        """Of an agent's constructor, whose last parameter stands for the hyperparameters."""
+
+    def __get__(self, instance: Any, owner: type) -> inspect.Signature:
+        config = owner.algorithm.Config  # type: ignore[attr-defined]
+        hyperparameters = [
+            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default)
+            for key, default in validation.field_defaults(config).items()
+        ]
+        return inspect.Signature([*list(self.common.parameters.values())[1:-1], *hyperparameters])
 
 
 class ClassOnly:
-    """Makes ``load`` refuse to be called on an instance, where it would silently leave that instance as it was."""
+    """Makes ``load`` raise an error on an instance, where it would silently leave that instance as it was."""
 
     def __init__(self, method: Any) -> None:
         self.method = method

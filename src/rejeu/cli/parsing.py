@@ -31,7 +31,7 @@ class Option(NamedTuple):
     is_required: bool
 
 
-def checked(argv: Sequence[str], commands: Mapping[str, type]) -> list[str]:
+def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
     """Returns a command line for the parser: whole numbers such as ``1e4`` are written out.
 
     Raises:
