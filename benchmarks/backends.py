@@ -2,8 +2,8 @@
 
     python benchmarks/backends.py
 
-Random actions, resets included, measured as ``backend="auto"`` measures (``rejeu.envs.measuring``), in several rounds whose
-median counts. Worker processes are measured where a step in this process takes a millisecond or more. Written to
+Random actions, resets included, in several rounds, of which the median counts. Worker processes are measured where a step
+in this process takes a millisecond or more. Written to
 ``benchmarks/results/backends.json``, and printed as the table of ``docs/environments.md``.
 """
 
@@ -15,14 +15,18 @@ import os
 import platform
 import shlex
 import sys
+import time
+from contextlib import closing
 from pathlib import Path
 from statistics import median
 
+from gymnasium.vector.utils import batch_space
+
 import rejeu
 from rejeu.cli.run_folder import versions
-from rejeu.envs import measuring
 from rejeu.envs.envpool import envpool_knows
-from rejeu.envs.measuring import Choice
+from rejeu.envs.make import auto_backend
+from rejeu.xla import cores
 
 RESULT = Path(__file__).parent / "results" / "backends.json"
 CASES = {
@@ -36,22 +40,38 @@ CASES = {
     "rejeu/Ball-v0": (8,),
 }
 """Numbers of environments to measure with."""
+BACKENDS = ("envpool", "gymnasium", "gymnasium-async")
+SLOW_STEP = 1e-3
+"""Seconds that a step must take in this process for worker processes to be measured."""
+ROUND_SECONDS = 0.1
+"""Duration of one measurement."""
 
 
 def measure(env_id: str, n_envs: int, rounds: int) -> dict[str, float]:
-    def make(backend: str, n: int) -> rejeu.envs.VectorEnv:
-        return rejeu.make_vector(env_id, n, backend, seed=0)
-
     def several(backends: tuple[str, ...]) -> dict[str, float]:
-        found = [measuring.measure(make, backends, n_envs) for _ in range(rounds)]
-        for choice in found:
-            assert not choice.passed_over, choice.passed_over
-        return {backend: median(choice.measured[backend] for choice in found) for backend in backends}
+        found = [{backend: rate(env_id, n_envs, backend) for backend in backends} for _ in range(rounds)]
+        return {backend: median(one[backend] for one in found) for backend in backends}
 
     rates = several(("envpool", "gymnasium") if envpool_knows(env_id) else ("gymnasium",))
-    if n_envs > 1 and rates["gymnasium"] * measuring.SLOW_STEP < 1.0:
+    if n_envs > 1 and rates["gymnasium"] * SLOW_STEP < 1.0:
         rates |= several(("gymnasium-async",))
     return rates
+
+
+def rate(env_id: str, n_envs: int, backend: str) -> float:
+    """Returns environment steps per second on a backend."""
+    with closing(rejeu.make_vector(env_id, n_envs, backend, seed=0)) as vector:
+        space = batch_space(vector.action_space, n_envs)
+        space.seed(0)
+        actions = [space.sample() for _ in range(32)]
+        vector.reset()
+        n_steps, began = 0, time.perf_counter()
+        while n_steps < 10 or time.perf_counter() - began < ROUND_SECONDS:
+            step = vector.step(actions[n_steps % len(actions)])
+            n_steps += 1
+            if (done := step.terminated | step.truncated).any():
+                vector.reset_done(done)
+        return n_steps * n_envs / (time.perf_counter() - began)
 
 
 def main() -> None:
@@ -65,7 +85,7 @@ def main() -> None:
     ]
     machine = {
         "processor": platform.processor() or platform.machine(),
-        "cores": measuring.cores(),
+        "cores": cores(),
         "load": os.getloadavg()[0],
     }
     command = shlex.join(["python", *sys.argv])
@@ -75,10 +95,8 @@ def main() -> None:
     print("| environment | at once | EnvPool | this process | workers | `auto` takes |\n|---|---|---|---|---|---|")
     for row in rows:
         rates = row["steps_per_second"]
-        cells = [f"{rates[backend]:,}" if backend in rates else "" for backend in measuring.PREFERENCE]
-        print(
-            f"| `{row['env']}` | {row['n_envs']} | {' | '.join(cells)} | {measuring.fastest(Choice('', rates)).backend} |"
-        )
+        cells = [f"{rates[backend]:,}" if backend in rates else "" for backend in BACKENDS]
+        print(f"| `{row['env']}` | {row['n_envs']} | {' | '.join(cells)} | {auto_backend(row['env'], row['n_envs'])} |")
 
 
 if __name__ == "__main__":

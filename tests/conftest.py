@@ -19,7 +19,6 @@ from pathlib import Path
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "rejeu-test-cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "Agg")
-os.environ["REJEU_CACHE_DIR"] = ""  # which backend is the fastest is measured only by the tests of that
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 import hypothesis

@@ -139,7 +139,6 @@ def child_environment(measurement: Measurement, variant: str, cache: Path) -> di
     if measurement.library == "rejeu":
         source = str(ROOT / "src")
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH", ""))))
-        environment["REJEU_CACHE_DIR"] = ""
     else:
         environment.pop("PYTHONPATH", None)
     folder = cache / measurement.library

@@ -323,8 +323,7 @@ def startup(samples: Sequence[Sample]) -> str:
     return f"""## Starting
 
 Seconds of whole processes, from the command to its end. SBX gets a compilation cache as well, which it does not turn on by
-itself; Stable-Baselines3 compiles nothing. rejeu's first start also measures which backend is the fastest for the
-environment, and keeps that.
+itself; Stable-Baselines3 compiles nothing.
 
 {table(("", *(NAMES[library] for library in found)), rows)}"""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import OrderedDict
 
 import gymnasium as gym
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, make_vector
+import rejeu
+from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, auto_backend, make_vector
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
 from tests.environments import Counter, Reach, Sampled
@@ -319,9 +321,44 @@ def test_an_id_a_function_an_environment_and_a_vector_all_become_vectors():
     assert make_vector(vector) is vector
 
 
-def test_auto_takes_envpool_only_without_environment_arguments():
-    assert make_vector("Pendulum-v1").backend == "envpool"
-    assert make_vector("Pendulum-v1", g=9.0).backend == "gymnasium"
+@pytest.mark.parametrize(
+    ("env_id", "n_envs", "kwargs", "backend"),
+    [
+        ("Pendulum-v1", 1, {}, "gymnasium"),
+        ("Pendulum-v1", 3, {}, "gymnasium"),
+        ("Pendulum-v1", 4, {}, "envpool"),
+        ("Pendulum-v1", 4, {"g": 9.0}, "gymnasium"),
+        ("rejeu/Ball-v0", 8, {}, "gymnasium"),
+        ("Pong-v5", 1, {}, "envpool"),
+    ],
+)
+def test_auto_uses_envpool_from_four_environments_on_or_if_gymnasium_lacks_the_id(env_id, n_envs, kwargs, backend):
+    assert auto_backend(env_id, n_envs, kwargs) == backend
+
+
+def test_auto_makes_the_backend_that_its_rule_names():
+    assert make_vector("Pendulum-v1").backend == "gymnasium"
+    assert make_vector("Pendulum-v1", 4).backend == "envpool"
+
+
+@pytest.fixture
+def without_envpool(monkeypatch):
+    """Blocks the import of EnvPool, as if it were not installed."""
+    monkeypatch.setitem(sys.modules, "envpool", None)
+
+
+def test_auto_uses_gymnasium_without_envpool(without_envpool):
+    assert make_vector("Pendulum-v1", 4).backend == "gymnasium"
+    agent = rejeu.DQN("MlpPolicy", make_vector("CartPole-v1", 4), policy_kwargs={"net_arch": [4]}, seed=0).learn(8)
+    assert agent.num_timesteps == 8
+
+
+def test_the_envpool_backend_without_envpool_says_how_to_install_it_and_its_size(without_envpool):
+    said = r"EnvPool \(about 770 MB with its assets\), which is not installed; run: pip install 'rejeu\[envpool\]'"
+    with pytest.raises(rejeu.MissingExtra, match=said):
+        make_vector("Pendulum-v1", backend="envpool")
+    with pytest.raises(ValueError, match="no environment is called 'Pong-v5'"):
+        make_vector("Pong-v5")
 
 
 def test_environment_arguments_reach_the_environment():
@@ -353,7 +390,7 @@ def test_a_wrong_argument_is_named_with_its_remedy(call, words):
 
 def test_an_environment_that_only_gymnasium_has_is_referred_to_it(monkeypatch):
     monkeypatch.setitem(gym.registry, "OnlyHere-v0", gym.envs.registration.EnvSpec("OnlyHere-v0", Counter))
-    with pytest.raises(ValueError, match="EnvPool has no OnlyHere-v0; use backend='gymnasium'"):
+    with pytest.raises(ValueError, match="EnvPool does not have OnlyHere-v0; use backend='gymnasium'"):
         make_vector("OnlyHere-v0", backend="envpool")
     assert make_vector("OnlyHere-v0").backend == "gymnasium"
 
@@ -445,5 +482,5 @@ def test_a_vector_that_seeds_its_environments_itself_takes_one_number():
     from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor
 
     venv = VecMonitor(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
-    with pytest.raises(ValueError, match="VecMonitor takes one number and seeds its environments itself"):
+    with pytest.raises(ValueError, match="VecMonitor takes a single seed and seeds its environments itself"):
         make_vector(venv, seed=[1, 2])

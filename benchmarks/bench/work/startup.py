@@ -36,7 +36,6 @@ def measure(library: str) -> dict[str, Any]:
         kept = {
             "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "jax"),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "REJEU_CACHE_DIR": str(Path(folder) / "rejeu"),
         }
         result["first update, cold"] = run(first_update, **kept)
         result["first update, warm"] = run(first_update, **kept)

@@ -20,7 +20,7 @@ echo = partial(print, flush=True)
 
 
 def header(config: RunConfig, environment: Environment, backend: str, folder: RunFolder) -> str:
-    """Returns the first lines of a run; ``backend`` says what steps the environments, and why."""
+    """Returns the first lines of a run; ``backend`` describes the backend."""
     what = "preset" if config.preset else "default hyperparameters"
     length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
     every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"

@@ -18,7 +18,7 @@ from rejeu.cli.output import echo, header
 from rejeu.cli.run_folder import RunConfig
 from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
 from rejeu.envs.make import VectorEnv
-from rejeu.envs.measuring import sentence
+from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
 from rejeu.interrupt import Interrupt
 from rejeu.io.records import MAX_ENVS
 from rejeu.presets import Preset
@@ -40,7 +40,7 @@ def run(arguments: Train) -> int:
         with closing(make_evaluation_env(config, made)) as evaluation_env, Interrupt() as stop:
             folder = run_folder.create(arguments.out, config.env, config.algorithm, seed)
             run_folder.write_config(folder, config)
-            echo(header(config, made, sentence(env), folder))
+            echo(header(config, made, describe_backend(env, made, preset), folder))
             limits = Limits(config.steps, config.minutes)
             return Session(agent, config, folder, made, evaluation_env, limits, is_new=True).run(stop, stopwatch)
 
@@ -67,8 +67,22 @@ def check(arguments: Train) -> None:
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
     """Returns the training environments."""
     n_envs = arguments.envs or (preset.n_envs if preset else 1)
-    backend = preset.backend if preset and made.is_plain else "auto"
+    backend = default_backend(made, preset)
+    if backend == "envpool" and not is_envpool_installed() and made.is_registered():
+        backend = "gymnasium"
     return made.vector(n_envs, arguments.backend or backend, seed, arguments.restart_workers)
+
+
+def default_backend(made: Environment, preset: Preset | None) -> str:
+    """Returns the backend of a preset, and ``"auto"`` without one."""
+    return preset.backend if preset and made.is_plain else "auto"
+
+
+def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -> str:
+    """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
+    if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
+        return env.backend
+    return f"{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install 'rejeu[envpool]'"
 
 
 def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:

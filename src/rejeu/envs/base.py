@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -72,10 +71,6 @@ class VectorEnv(ABC):
     """Of one environment."""
     backend: str
     """Which backend steps them."""
-    measured: Mapping[str, float] = MappingProxyType({})
-    """Steps per second of each backend, over all environments, by which ``"auto"`` chose this one; empty if it had not to."""
-    passed_over: Mapping[str, str] = MappingProxyType({})
-    """Why ``"auto"`` could not measure a backend."""
     env_id: str
     """The id they are registered under, or the class name of what was given."""
     made_from: tuple[str, Mapping[str, Any]] | None = None

@@ -14,7 +14,15 @@ from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
 from rejeu.envs.base import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.registry import in_envpool, make_env, newer_version, provider, register, unknown_environment
+from rejeu.envs.registry import (
+    import_envpool,
+    in_envpool,
+    make_env,
+    newer_version,
+    provider,
+    register,
+    unknown_environment,
+)
 from rejeu.envs.seeds import END, Seed, checked
 from rejeu.spaces import cast, leaves
 from rejeu.validation import whole
@@ -46,14 +54,12 @@ class EnvPool(VectorEnv):
         self._log = self._new_log()
 
     def _make(self, seed: int | Sequence[int]) -> Any:
-        import envpool
-
         self._seed = seed
         # Of a number environment i gets the i-th after it, which EnvPool takes as int32.
         taken = seed % (2**31 - self.n_envs) if isinstance(seed, int) else list(seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
-            pool = envpool.make_gymnasium(self.env_id, num_envs=self.n_envs, seed=taken)
+            pool = import_envpool().make_gymnasium(self.env_id, num_envs=self.n_envs, seed=taken)
             pool.observation_space, pool.action_space  # noqa: B018 - made when first asked for, and kept
         return pool
 
@@ -159,12 +165,17 @@ def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
 
 
 def check_envpool_knows(env_id: str) -> None:
-    """Raises ``ValueError`` unless EnvPool has the environment, with the backend or the name to use instead."""
-    import envpool
+    """Checks that EnvPool has an environment.
 
-    if env_id not in envpool.list_all_envs():
+    Raises:
+        MissingExtra: if EnvPool is not installed.
+        ValueError: if it does not have the environment, with the backend or the id to use instead.
+    """
+    if env_id not in import_envpool().list_all_envs():
         known = register(env_id)
-        raise ValueError(f"EnvPool has no {env_id}; use backend='gymnasium'" if known else unknown_environment(env_id))
+        raise ValueError(
+            f"EnvPool does not have {env_id}; use backend='gymnasium'" if known else unknown_environment(env_id)
+        )
 
 
 def envpool_knows(env_id: str) -> bool:

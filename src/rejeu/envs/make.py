@@ -6,23 +6,27 @@ Each backend has a module of its own: :mod:`rejeu.envs.in_process`, :mod:`rejeu.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Literal
 
 import gymnasium as gym
 
-from rejeu.envs import measuring, seeds
+from rejeu.envs import seeds
 from rejeu.envs.adapters import adapter_of
 from rejeu.envs.base import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
-from rejeu.envs.registry import maker
+from rejeu.envs.registry import maker, register
 from rejeu.envs.seeds import Seed
 from rejeu.envs.workers.pool import TIMEOUT, check_options
 from rejeu.envs.workers.vector import InWorkers
 
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
+ENVPOOL_FROM = 4
+"""Smallest number of environments for which ``backend="auto"`` prefers EnvPool."""
 
 __all__ = [
     "Backend",
@@ -54,9 +58,7 @@ def make_vector(
             environment of Gymnasium's or Stable-Baselines3's kind, whose automatic resets are undone.
         n_envs: how many; ignored for vector environments.
         backend: ``"envpool"`` (C++ threads), ``"gymnasium"`` (in this process), ``"gymnasium-async"`` (one worker process
-            each), or ``"auto"``: for an id the fastest, as measured when it was first asked for on this machine (see
-            :mod:`rejeu.envs.measuring`); for a function, this process. The result's ``backend`` says which it is, its
-            ``measured`` what it was chosen by.
+            each), or ``"auto"`` (see :func:`auto_backend`). The attribute ``backend`` of the result tells which.
         seed: seeds the environments at their first reset: a number, from which environment i takes the i-th after it, or a
             sequence of one number for each environment. An agent that trains in them begins with its own seed instead of a
             number, and keeps a sequence. None draws one.
@@ -140,16 +142,7 @@ def _of_id(
     env_kwargs: dict[str, Any],
 ) -> VectorEnv:
     if backend == "auto":
-        choice = measuring.choose(
-            lambda backend, n: make_vector(env, n, backend, 0, **env_kwargs),  # type: ignore[arg-type]
-            env,
-            n_envs,
-            env_kwargs,
-            lambda: not env_kwargs and envpool_knows(env),
-        )
-        vector = make_vector(env, n_envs, choice.backend, seed, worker_timeout=worker_timeout, **env_kwargs)  # type: ignore
-        vector.measured, vector.passed_over = choice.measured, choice.passed_over
-        return vector
+        backend = auto_backend(env, n_envs, env_kwargs)
     if backend == "envpool":
         if env_kwargs:
             raise ValueError(f"the envpool backend takes no environment arguments, got {env_kwargs}; use 'gymnasium'")
@@ -163,6 +156,20 @@ def _of_id(
         worker_timeout=worker_timeout,
         restart_workers=restart_workers,
     )
+
+
+def auto_backend(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] = MappingProxyType({})) -> Backend:
+    """Returns the backend that ``"auto"`` stands for. It does not depend on the speed of the machine.
+
+    ``"envpool"`` if EnvPool is installed and has the environment, no arguments are given, and there are at least four
+    environments or Gymnasium does not have it; else ``"gymnasium"``. Worker processes are used only on request.
+
+    >>> auto_backend("Pendulum-v1", 1), auto_backend("Pendulum-v1", 8, {"g": 9.81})
+    ('gymnasium', 'gymnasium')
+    """
+    if env_kwargs or (n_envs < ENVPOOL_FROM and register(env_id)):
+        return "gymnasium"
+    return "envpool" if envpool_knows(env_id) else "gymnasium"
 
 
 def check_workers(env: Any, backend: Backend, worker_timeout: float | None, restart_workers: int) -> None:

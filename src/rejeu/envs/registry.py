@@ -23,6 +23,8 @@ LARGEST = 1e6
 """Largest number that a file may hand to an environment: larger ones could ask for any amount of memory."""
 MAKES_OWN = frozenset(("id", "env_id", "render_mode", "disable_env_checker", "vectorization_mode"))
 """Arguments of ``gymnasium.make`` itself, which are no environment's."""
+ENVPOOL_SIZE = "about 770 MB with its assets"
+"""Disk space of EnvPool 1.2.5 with the packages of assets that it depends on."""
 MOST_KWARGS = 100
 """Most keyword arguments of an environment that are taken from a file."""
 
@@ -185,10 +187,26 @@ def newer_version(env_id: str) -> str | None:
     return f"{name}-v{newest}" if newest > int(version) else None
 
 
+def import_envpool() -> Any:
+    """Returns the module ``envpool``, whose import takes half a second.
+
+    Raises:
+        MissingExtra: if it is not installed.
+    """
+    try:
+        return importlib.import_module("envpool")
+    except ImportError:
+        raise MissingExtra("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool") from None
+
+
+def is_envpool_installed() -> bool:
+    """Returns whether EnvPool is installed, without importing it."""
+    return importlib.util.find_spec("envpool") is not None
+
+
 def in_envpool(env_id: str) -> bool:
     """Returns whether EnvPool is installed and has an environment of this id."""
     try:
-        import envpool
-    except ImportError:
+        return env_id in import_envpool().list_all_envs()
+    except MissingExtra:
         return False
-    return env_id in envpool.list_all_envs()
