@@ -1,6 +1,6 @@
-"""What holds in every test: JAX refuses to broadcast ranks silently, and compiled functions are kept between runs.
+"""Settings and fixtures of all tests: JAX does not promote ranks, and compiled functions are cached on disk between runs.
 
-Programs are compiled with little optimisation, which takes half as long and is most of what tests do; ``XLA_FLAGS= pytest``
+Programs are compiled with little optimization, which takes half as long and is most of what tests do; ``XLA_FLAGS= pytest``
 compiles them as users do.
 
 Mixed dtypes are refused as well, but only around our own functions (``strict_dtypes``): Adam's bias correction in optax
@@ -14,7 +14,9 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "rejeu-test-cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
@@ -32,12 +34,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a 
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_TO_COMPILE = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+MAPS = Path("/proc/self/maps")
+STEPS, EPISODES = 64, 25
+"""The longest training of an example. Restoring the best weights takes 20 finished episodes."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Sets XLA's options before its first use; learning runs of minutes, marked slow, run longer than they compile."""
-    if config.option.markexpr == "not slow":
+    """Sets XLA's options before its first use. Slow tests train for minutes, so for them optimized programs are worth it."""
+    if config.option.markexpr.startswith("not slow"):
         os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 
 
@@ -48,9 +55,39 @@ def strict_dtypes() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cuts short the training and the evaluations of an example."""
+    from rejeu.agents import Agent
+
+    learn, evaluate = Agent.learn, Agent.evaluate
+
+    @wraps(learn)
+    def learn_shortly(
+        self: Agent,
+        total_timesteps: int | None = None,
+        *args: Any,
+        episodes: Any = None,
+        minutes: Any = None,
+        **kw: Any,
+    ) -> Agent:
+        if minutes is not None or total_timesteps is not None:
+            total_timesteps = min(total_timesteps or STEPS, STEPS)
+        episodes = None if episodes is None else min(episodes, EPISODES)
+        return learn(self, total_timesteps, *args, episodes=episodes, **kw)
+
+    @wraps(evaluate)
+    def evaluate_shortly(self: Agent, episodes: Any = None, *args: Any, minutes: Any = None, **kw: Any) -> Any:
+        return evaluate(self, 2, *args, **kw)
+
+    monkeypatch.setattr(Agent, "learn", learn_shortly)
+    monkeypatch.setattr(Agent, "evaluate", evaluate_shortly)
+
+
 @pytest.fixture(autouse=True, scope="module")
-def compiled_functions_are_let_go() -> Iterator[None]:
-    """Every compiled function is a few mappings of memory, of which Linux allows a process 65,530; JAX keeps them all."""
+def compiled_functions_are_dropped() -> Iterator[None]:
+    """Drops compiled functions before there are too many: each is a few memory maps, and Linux allows a process 65,530."""
     yield
-    jax.clear_caches()
-    gc.collect()
+    if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 30_000:
+        jax.clear_caches()
+        gc.collect()

@@ -1,7 +1,7 @@
 """The examples of README and docs run as they are written, page by page, each page's blocks in one namespace.
 
-Only their length is cut: ``learn`` takes at most ``STEPS`` steps or ``EPISODES`` episodes, an evaluation plays two episodes,
-and a window is closed after a few turns. What a page takes from the reader, it gets from ``PREPARATIONS``.
+Only their length is cut (the fixture ``short``), and a window is closed after a few turns. What a page takes from the
+reader, it gets from ``PREPARATIONS``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import re
 import shlex
 import sys
 import warnings
-from functools import wraps
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -20,12 +19,9 @@ import pytest
 
 import rejeu
 from rejeu import cli
-from rejeu.agents import Agent
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-STEPS, EPISODES = 64, 25
-"""Restoring the best weights takes 20 finished episodes."""
 TURNS = 5
 """After which a window is closed."""
 
@@ -69,26 +65,6 @@ COMMANDS = [(page, arguments) for page in PAGES for arguments in commands(page)]
 
 def name(value):
     return str(value.relative_to(ROOT)) if isinstance(value, Path) else " ".join(value)
-
-
-@pytest.fixture
-def short(monkeypatch):
-    """Cuts the length of everything that an example does."""
-    learn, evaluate = Agent.learn, Agent.evaluate
-
-    @wraps(learn)
-    def learn_shortly(self, total_timesteps=None, *args, episodes=None, minutes=None, **settings):
-        if minutes is not None or total_timesteps is not None:
-            total_timesteps = min(total_timesteps or STEPS, STEPS)
-        episodes = None if episodes is None else min(episodes, EPISODES)
-        return learn(self, total_timesteps, *args, episodes=episodes, **settings)
-
-    @wraps(evaluate)
-    def evaluate_shortly(self, episodes=None, *args, minutes=None, **settings):
-        return evaluate(self, 2, *args, **settings)
-
-    monkeypatch.setattr(Agent, "learn", learn_shortly)
-    monkeypatch.setattr(Agent, "evaluate", evaluate_shortly)
 
 
 def play_a_recording():

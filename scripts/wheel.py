@@ -1,0 +1,78 @@
+"""Builds the wheel and tries it in a fresh virtual environment, without extras.
+
+    python scripts/wheel.py [FOLDER]
+
+The wheel is left in ``FOLDER``, or thrown away without one. The exit status is 0 if the wheel holds the package and nothing
+else, installs, imports, answers on the command line, and trains.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import venv
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPT = """
+import rejeu
+agent = rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=128, seed=0).learn(512)
+print(agent.evaluate(episodes=2))
+agent.save("cartpole")
+assert rejeu.load("cartpole").num_timesteps == 512
+"""
+
+
+def run(*command: str | Path, cwd: Path = ROOT) -> str:
+    """Runs a command without the variables that could lead Python back to the sources; returns what it printed."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run(
+        command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def build(folder: Path) -> Path:
+    """Returns the path of the wheel, built into ``folder``."""
+    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT)
+    (wheel,) = folder.glob("rejeu-*.whl")
+    return wheel
+
+
+def check_contents(wheel: Path) -> None:
+    """Exits unless the wheel holds the package with its type marker, and nothing else."""
+    names = zipfile.ZipFile(wheel).namelist()
+    strangers = [name for name in names if not name.startswith(("rejeu/", "rejeu-"))]
+    if strangers or "rejeu/py.typed" not in names:
+        sys.exit(f"{wheel.name} holds {strangers[:5]}" if strangers else f"{wheel.name} has no rejeu/py.typed")
+
+
+def try_out(wheel: Path, folder: Path) -> None:
+    """Installs the wheel into a virtual environment under ``folder`` and uses it there."""
+    venv.create(folder / "venv", with_pip=True)
+    programs = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
+    python = programs / "python"
+    run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel)
+    version = run(python, "-c", "import rejeu; print(rejeu.__version__)", cwd=folder)
+    if f"rejeu-{version}-" not in wheel.name:
+        sys.exit(f"{wheel.name} says that its version is {version}")
+    run(programs / "rejeu", "--help", cwd=folder)
+    print(run(python, "-c", SCRIPT, cwd=folder))
+
+
+def main() -> None:
+    """Builds, checks and tries the wheel."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        wheels = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else folder / "dist"
+        wheel = build(wheels)
+        check_contents(wheel)
+        try_out(wheel, folder)
+    print(f"{wheel.name} installs and runs")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+"""Which parameters of a test run by default, and which only in the exhaustive tier (``scripts/test --all``)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any
+
+import pytest
+
+exhaustive = pytest.mark.exhaustive
+
+
+def only(default: Collection[Any], values: Iterable[Any]) -> list[Any]:
+    """Returns ``values``; those that are not in ``default`` belong to the exhaustive tier."""
+    return [value if value in default else pytest.param(value, marks=exhaustive) for value in values]
+
+
+def crossed(first: Sequence[Any], second: Sequence[Any]) -> list[Any]:
+    """Returns all pairs; by default run those of a diagonal, in which every value of either occurs.
+
+    >>> [getattr(pair, "values", pair) for pair in crossed("ab", [1, 2])]
+    [('a', 1), ('a', 2), ('b', 1), ('b', 2)]
+    """
+    period = min(len(first), len(second))
+    return [
+        (a, b) if i % period == j % period else pytest.param(a, b, marks=exhaustive)
+        for i, a in enumerate(first)
+        for j, b in enumerate(second)
+    ]
