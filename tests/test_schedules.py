@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.training import Call
 from rejeu.callbacks import Checkpoint
+from rejeu.loops.training_call import TrainingCall
 from rejeu.schedules import Exponential, Linear, at, parse, to_json
 from tests.environments import Counter
 from tests.helpers import small_sac
@@ -153,7 +153,7 @@ def test_schedules_follow_episodes_likewise():
 
 def test_schedules_follow_training_time_likewise(monkeypatch):
     monkeypatch.setattr("time.perf_counter", lambda: 100.0)
-    call = Call(None, None, 60.0, 0, 0, 4, 0, seconds_before=20.0, began=100.0)
+    call = TrainingCall(None, None, 60.0, 0, 0, 4, 0, seconds_before=20.0, began=100.0)
     assert call.progress(5, 1) == 20 / 80
     monkeypatch.setattr("time.perf_counter", lambda: 130.0)
     assert call.progress(5, 1) == 50 / 80
@@ -162,7 +162,7 @@ def test_schedules_follow_training_time_likewise(monkeypatch):
     agent = small_sac(Counter()).learn(8)
     spent = agent.seconds["total"]
     agent.learn(minutes=1, callback=lambda *_: False, reset_num_timesteps=False)
-    assert agent._call.seconds_before == spent
+    assert agent.training_call.seconds_before == spent
 
 
 def test_a_resumed_call_keeps_its_progress_and_its_schedules_continue_after_it(tmp_path):

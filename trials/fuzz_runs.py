@@ -64,7 +64,7 @@ def make_runs(folder: Path) -> list[tuple[Path, list[Path]]]:
         policy = "MultiInputPolicy" if env_id == BITS else "MlpPolicy"
         env = rejeu.make_vector(env_id, n_envs, "gymnasium", seed=1)
         agent = rejeu.AGENTS[name](policy, env, **settings)
-        agent._own_env = True  # it was made from its id, so resume needs none
+        agent.made_from_id = True  # it was made from its id, so resume needs none
         watching: list[Any] = [evaluation()] if i == 0 else []
         run = folder / str(i)
         agent.learn(60, [*watching, Checkpoint(run, every=8, keep=1), lambda agent, turn: turn.step < 26])
@@ -199,7 +199,7 @@ class Runs:
         """Goes on with the call that was cut off, if it is not over, with checkpoints in the folder of the run."""
         from rejeu.callbacks import Checkpoint
 
-        run, call, before = agent.run, agent._call, agent.run.step
+        run, call, before = agent.run, agent.training_call, agent.run.step
         stop = lambda agent, turn: turn.step < before + N_STEPS  # noqa: E731
         is_over = call is None or call.is_over(run.step, run.episode)
         agent.report_folder = self.folder
@@ -244,10 +244,10 @@ def share_compiled() -> None:
     import jax
 
     from rejeu import spaces
-    from rejeu.agents.base import Agent
+    from rejeu.agents.agent import Agent
     from rejeu.algorithms import config as configs
 
-    build, kept = Agent._build, {}
+    build, kept = Agent.build, {}
 
     def build_once(self: Agent, observation_space: Any, action_space: Any, n_envs: int) -> None:
         described = [spaces.describe(observation_space), spaces.describe(action_space)]
@@ -262,7 +262,7 @@ def share_compiled() -> None:
         build(self, observation_space, action_space, n_envs)
         kept[key] = self.learner
 
-    Agent._build = build_once  # type: ignore[method-assign]
+    Agent.build = build_once  # type: ignore[method-assign]
 
 
 def reader(target: str, folder: Path) -> tuple[list[bytes], Callable[[Path], None]]:

@@ -388,7 +388,7 @@ def test_a_checkpoint_that_cannot_be_written_says_that_the_one_before_is_whole(t
     monkeypatch.setattr(checkpoint, "write", fail)
     agent.learn(1)
     with pytest.raises(
-        OSError, match=r"step 21 could not be written .*No space left.*the one before is whole: .*run_0"
+        OSError, match=r"step 21 could not be written .*No space left.*the one before it is complete: .*run_0"
     ) as e:
         saver.save(agent)
     assert e.value.errno == 28
@@ -409,7 +409,7 @@ def test_signals_end_training_with_a_checkpoint(number, tmp_path):
 
 def test_minutes_between_checkpoints(tmp_path, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(rejeu.agents.run_files.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rejeu.callbacks.checkpoint.time, "monotonic", lambda: now[0])
 
     def tick(agent, turn):
         now[0] += 7.0
@@ -468,7 +468,7 @@ def test_callbacks_that_differ_from_the_saved_ones_are_named(tmp_path):
     cut_run(tmp_path, callbacks=[evaluate])
     with pytest.warns(UserWarning, match="saved with Evaluate, which learn was not given now"):
         rejeu.SAC.resume(tmp_path).learn()
-    with pytest.warns(UserWarning, match="without a Counting; it begins anew"):
+    with pytest.warns(UserWarning, match="without a Counting; it starts from the beginning"):
         rejeu.SAC.resume(tmp_path).learn(callback=[evaluate, Counting()])
 
 

@@ -128,7 +128,7 @@ def test_training_continues_while_the_disk_is_full_and_nothing_is_lost_after_it(
     said = warned(record)
     assert len(said) == 3  # one for each of the two that failed, and one at the end
     assert sum("training continues" in one for one in said[:2]) == 2
-    assert any(one.startswith("checkpoints in") and "the one before is whole: " in one for one in said[:2])
+    assert any(one.startswith("checkpoints in") and "the one before it is complete: " in one for one in said[:2])
     assert said[2].startswith("written late (No space left on device): ")
     assert "metrics.csv" in said[2]
     assert rejeu.SAC.resume(tmp_path / "full" / "run").num_timesteps == 100
@@ -152,7 +152,7 @@ def test_a_disk_that_stays_full_is_reported_at_the_end(tmp_path, disk):
 
 def test_a_checkpoint_that_failed_is_tried_again_after_a_minute(tmp_path, disk, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(rejeu.agents.run_files.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rejeu.callbacks.checkpoint.time, "monotonic", lambda: now[0])
 
     def tick(agent, turn):
         now[0] += 10.0

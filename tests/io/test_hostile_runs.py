@@ -32,7 +32,7 @@ def make_run(case, folder):
     """A kind of agent, a folder with one checkpoint of it in the course of an episode, and what was compiled for it."""
     name, env_id, settings = CASES[case]
     agent = rejeu.AGENTS[name]("MlpPolicy", vector(env_id, 2)(), **settings)
-    agent._own_env = True  # its environments were made from an id
+    agent.made_from_id = True  # its environments were made from an id
     keep = lambda agent, turn: agent.remember_best((0.5, 1.0)) if turn.step == 6 else None  # noqa: E731
     agent.learn(60, [keep, Checkpoint(folder, every=1000, keep=1), lambda agent, turn: turn.step < 24])
     return rejeu.AGENTS[name], folder, agent.learner
@@ -273,7 +273,7 @@ def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):
     try:
         with compiled_once():
             agent = rejeu.SAC("MlpPolicy", rejeu.make_vector("tests/Counted-v0", 2, "gymnasium"), **OFF)
-            agent._own_env = True
+            agent.made_from_id = True
             agent.learn(10, Checkpoint(tmp_path, keep=1))
             agent.env.close()
             path = run_files(tmp_path)[0]

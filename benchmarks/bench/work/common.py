@@ -68,9 +68,7 @@ def threads_used(agent: Any, library: str, n_envs: int) -> dict[str, Any]:
     """Returns how many threads torch has, and whether rejeu takes one (1) or all (0) for an agent's updates."""
     used: dict[str, Any] = {"torch_threads": threads_of(library)}
     if library == "rejeu":
-        from rejeu import xla
-
-        used["threads"] = 1 if agent._work(n_envs) <= xla.LITTLE_WORK else 0
+        used["threads"] = 1 if agent.n_threads(n_envs) == 1 else 0
     return used
 
 

@@ -6,7 +6,22 @@ import inspect
 from typing import Any
 
 from rejeu import validation
-from rejeu.agents.model_files import AGENT_ARGUMENTS
+
+AGENT_ARGUMENTS = {
+    "policy": "``MlpPolicy``, ``MultiInputPolicy`` (Dict observations) or ``CnnPolicy`` (images). All three build what "
+    "the observation space needs; a name that does not fit the space is an error.",
+    "env": "An id, a Gymnasium environment, a function that makes one, or a vector environment.",
+    "seed": "Seeds everything: networks, exploration, batches and environments. None draws one.",
+    "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
+    "tensorboard_log": "Folder for TensorBoard logs, None for none.",
+    "stats_window_size": "Episodes over which reported means are taken.",
+    "success_threshold": "Return from which on an episode counts as a success where the environment does not say; None: "
+    "the environment's own reward threshold, if it has one.",
+    "best_window": "Training episodes over whose mean return the best weights are kept; 1 keeps those of the best single "
+    "episode. Raising it is surer to find a policy that is good again, as a single return may be luck.",
+    "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
+}
+"""What every agent takes beside its hyper-parameters, with its meaning."""
 
 
 class Documentation:

@@ -13,7 +13,8 @@ import numpy as np
 from msgspec import Meta
 
 from rejeu import spaces, validation, xla
-from rejeu.agents.policy import check_policy
+from rejeu.agents.base import BEST_WINDOW, BaseAgent, check_policy, whole_seed
+from rejeu.agents.description import AGENT_ARGUMENTS
 from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
@@ -22,11 +23,8 @@ from rejeu.io.records import Positive, Seed, convert
 from rejeu.networks import settled
 
 if TYPE_CHECKING:
-    from rejeu.agents.base import Agent
     from rejeu.envs.make import VectorEnv
 
-BEST_WINDOW = 20
-"""Training episodes over whose mean return the best weights are judged by default."""
 SIZES = ("n_critics", "n_quantiles")
 """Hyper-parameters outside ``policy_kwargs`` that set the size of networks."""
 MAX_LAYERS = 256
@@ -122,17 +120,6 @@ def brief(error: BaseException) -> str:
     return text if len(text) <= 400 else text[:397] + "..."
 
 
-def whole_seed(seed: Any) -> int:
-    """Returns a seed as an int in [0, 2^32).
-
-    Raises:
-        ValueError: otherwise.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
-    return int(seed)
-
-
 def check_space(description: Any, own: gym.Space, kind: str) -> None:
     """Raises ``ValueError`` unless a space of a file is the agent's, apart from the bounds of observations.
 
@@ -185,26 +172,10 @@ def _torso(changes: Mapping[str, Any]) -> dict[str, Any]:
     return {}
 
 
-A = TypeVar("A", bound="Agent")
-
-AGENT_ARGUMENTS = {
-    "policy": "``MlpPolicy``, ``MultiInputPolicy`` (Dict observations) or ``CnnPolicy`` (images). All three build what "
-    "the observation space needs; a name that does not fit the space is an error.",
-    "env": "An id, a Gymnasium environment, a function that makes one, or a vector environment.",
-    "seed": "Seeds everything: networks, exploration, batches and environments. None draws one.",
-    "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
-    "tensorboard_log": "Folder for TensorBoard logs, None for none.",
-    "stats_window_size": "Episodes over which reported means are taken.",
-    "success_threshold": "Return from which on an episode counts as a success where the environment does not say; None: "
-    "the environment's own reward threshold, if it has one.",
-    "best_window": "Training episodes over whose mean return the best weights are kept; 1 keeps those of the best single "
-    "episode. Raising it is surer to find a policy that is good again, as a single return may be luck.",
-    "device": "Accepted for Stable-Baselines3's sake: JAX chooses the device (environment variable JAX_PLATFORMS).",
-}
-"""Arguments of every agent in addition to its hyper-parameters, with their meanings."""
+A = TypeVar("A", bound=BaseAgent)
 
 
-def header(agent: Agent) -> dict[str, Any]:
+def header(agent: BaseAgent) -> dict[str, Any]:
     """Returns the header of an agent's model file: everything except arrays, as JSON values."""
     run = agent.run
     return {
@@ -213,7 +184,7 @@ def header(agent: Agent) -> dict[str, Any]:
         "policy": agent.policy,
         "observation_space": spaces.describe(agent.observation_space),
         "action_space": spaces.describe(agent.action_space),
-        "env_id": run.env.env_id if run.env is not None else agent._trained_on and agent._trained_on[0],
+        "env_id": run.env.env_id if run.env is not None else agent.trained_on and agent.trained_on[0],
         "made_from": made_from(agent),
         "seed": agent.seed,
         "stats_window_size": agent.stats_window_size,
@@ -221,8 +192,8 @@ def header(agent: Agent) -> dict[str, Any]:
         "best_window": agent.best_window,
         "counters": {
             "step": run.step,
-            "steps_before": agent._steps_before,
-            "episodes_before": agent._episodes_before,
+            "steps_before": agent.reset_step,
+            "episodes_before": agent.reset_episode,
             "episode": run.episode,
             "n_updates": run.n_updates,
         },
@@ -230,9 +201,9 @@ def header(agent: Agent) -> dict[str, Any]:
     }
 
 
-def made_from(agent: Agent) -> dict[str, Any] | None:
+def made_from(agent: BaseAgent) -> dict[str, Any] | None:
     """Returns id and keyword arguments of an agent's environments for a header; None if a file may not hold them."""
-    source = agent._trained_on if agent.run.env is None else agent.run.env.made_from
+    source = agent.trained_on if agent.run.env is None else agent.run.env.made_from
     if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
         return None
     return {"env_id": source[0], "env_kwargs": dict(source[1])}
@@ -296,21 +267,21 @@ def load(
     agent = cls.__new__(cls)
     _set_up(agent, saved, own)
     try:
-        agent._build(saved.observation_space, saved.action_space)
+        agent.build(saved.observation_space, saved.action_space)
     except WRONG as error:
         raise CheckpointError(f"{path}: {brief(error)}") from None
     checkpoint.match(agent.learner.shapes, checkpoint.within(file.specs, prefix), path)
     arrays = checkpoint.within(file.read(prefix), prefix)
     checkpoint.require_finite(arrays, path)
     state = checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path)
-    agent._trained_on = trained_on(header)
+    agent.trained_on = trained_on(header)
     vector = make_env(agent)
     if vector is not None:
-        agent._check_spaces(vector, "the given environment")
+        agent.check_spaces(vector, "the given environment")
     n_envs = 1 if vector is None else vector.n_envs
-    xla.start_device(agent._threads(n_envs) if threads is None else threads)
+    xla.start_device(agent.n_threads(n_envs) if threads is None else threads)
     try:
-        agent._start(vector, agent.learner.pack(state))
+        agent.start_run(vector, agent.learner.pack(state))
         _restore_counters(agent, saved.header)
     except (ArithmeticError, MemoryError, ValueError) as error:
         if changes.keys() & {"buffer_size", "n_steps", "n_episodes"}:
@@ -319,7 +290,7 @@ def load(
     return agent
 
 
-def _set_up(agent: Agent, saved: Saved, given: Mapping[str, Any]) -> None:
+def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
     """Sets what a model file says of an agent, and what the user sets otherwise.
 
     Raises:
@@ -330,7 +301,7 @@ def _set_up(agent: Agent, saved: Saved, given: Mapping[str, Any]) -> None:
         for key in ("policy", "seed", "stats_window_size", "success_threshold", "best_window")
     )
     check_policy(policy, saved.observation_space)
-    agent._set_up(
+    agent.configure(
         policy,
         saved.config,
         whole_seed(seed),
@@ -342,11 +313,11 @@ def _set_up(agent: Agent, saved: Saved, given: Mapping[str, Any]) -> None:
     )
 
 
-def _restore_counters(agent: Agent, saved: AgentHeader) -> None:
+def _restore_counters(agent: BaseAgent, saved: AgentHeader) -> None:
     """Sets the counters and random numbers of a loaded agent; its replay buffer is empty until one is loaded."""
     run, counters = agent.run, saved.counters
     run.step, run.episode, run.n_updates = counters.step, counters.episode, counters.n_updates
     run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": msgspec.structs.asdict(saved.rng)}
-    run.learn_from = agent._learn_from(run.step)
+    run.learn_from = agent.first_learning_step(run.step)
     run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
-    agent._steps_before, agent._episodes_before = counters.steps_before, counters.episodes_before
+    agent.reset_step, agent.reset_episode = counters.steps_before, counters.episodes_before

@@ -11,7 +11,7 @@ import numpy as np
 
 from rejeu import spaces
 from rejeu.agents import model_files, policy
-from rejeu.agents.base import Agent
+from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
@@ -73,7 +73,7 @@ class OffPolicyAgent(Agent):
             raise CheckpointError(f"{path}: {model_files.brief(error)}") from None
         self.run.learn_from = self.config.learning_starts
         self.run.td_errors = []  # of steps that are gone
-        self._give_up_episodes()
+        self.abandon_episodes()
 
     def q_values(
         self, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
@@ -105,29 +105,29 @@ class OffPolicyAgent(Agent):
         """
         return policy.q_values(self, observation, action, critics)
 
-    def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return make_vector(env, n_envs, backend, seed)
 
-    def _with_masks(self, obs: Any, masks: Any) -> Any:
+    def with_masks(self, obs: Any, masks: Any) -> Any:
         refuse_masks(masks, self.name)
         return obs
 
-    def _noise(self) -> Noise | None:
+    def make_noise(self) -> Noise | None:
         return for_actions(self.config.action_noise, self.action_space)
 
-    def _batch_size(self, n_envs: int) -> int:
+    def gradient_batch_size(self, n_envs: int) -> int:
         return self.config.batch_size
 
-    def _learn_from(self, step: int) -> int:
+    def first_learning_step(self, step: int) -> int:
         return step + self.config.learning_starts
 
-    def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+    def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
-    def _begin_episodes(self) -> None:
+    def start_episodes(self) -> None:
         begin_episodes(self.run)
 
-    def _make_buffer(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
+    def make_buffer(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
         config = self.config
         if config.hindsight is not None:
             spaces.check_goal_space(env.observation_space)
@@ -135,7 +135,7 @@ class OffPolicyAgent(Agent):
         ring = Ring(
             config.buffer_size,
             env.n_envs,
-            self._obs_leaves,
+            self.obs_leaves,
             spaces.structure(env.observation_space),
             action.shape[1:],
             action.dtype,
@@ -149,10 +149,10 @@ class OffPolicyAgent(Agent):
         goals = self._goals(env)
         return HerReplayBuffer(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
 
-    def _drop_rollout(self) -> None:
+    def drop_rollout(self) -> None:
         """Nothing: learners with a replay buffer use the experience of any policy."""
 
-    def _keep_buffer(self, env: VectorEnv) -> None:
+    def keep_buffer(self, env: VectorEnv) -> None:
         if isinstance(self.run.replay, HerReplayBuffer):
             self.run.replay.goals = self._goals(env)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rejeu import spaces
 from rejeu.agents import policy
-from rejeu.agents.base import Agent
+from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
 from rejeu.algorithms.actor_critic import OnPolicyConfig
@@ -54,10 +54,10 @@ class OnPolicyAgent(Agent):
         """
         return policy.value(self, observation, state, episode_start)
 
-    def _vector(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
 
-    def _with_masks(self, obs: Any, masks: Any) -> Any:
+    def with_masks(self, obs: Any, masks: Any) -> Any:
         if not self.takes_masks:
             refuse_masks(masks, self.name)
             return obs
@@ -67,25 +67,25 @@ class OnPolicyAgent(Agent):
             raise ValueError(f"action_masks has shape {mask.shape}, expected {(n, size)}")
         return Masked(obs, mask.reshape(n, size))
 
-    def _noise(self) -> Noise | None:
+    def make_noise(self) -> Noise | None:
         return None
 
-    def _batch_size(self, n_envs: int) -> int:
+    def gradient_batch_size(self, n_envs: int) -> int:
         return self.config.steps_per_gradient(n_envs)
 
-    def _learn_from(self, step: int) -> int:
+    def first_learning_step(self, step: int) -> int:
         return step
 
-    def _turns(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+    def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         return on_policy(self.run, self.learner, self.config, n_steps, progress)
 
-    def _begin_episodes(self) -> None:
+    def start_episodes(self) -> None:
         begin_episodes(self.run, self.config)
 
-    def _make_buffer(self, env: VectorEnv) -> RolloutBuffer:
+    def make_buffer(self, env: VectorEnv) -> RolloutBuffer:
         config = self.config
         action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
-        structure, obs_leaves = spaces.structure(env.observation_space), self._obs_leaves
+        structure, obs_leaves = spaces.structure(env.observation_space), self.obs_leaves
         if self.takes_masks:
             structure = jax.tree.structure(Masked(jax.tree.unflatten(structure, obs_leaves), 0))
             obs_leaves = (*obs_leaves, mask_leaf(env.action_space, env.env_id))
@@ -94,11 +94,11 @@ class OnPolicyAgent(Agent):
             n_steps = config.n_episodes * (env.max_episode_steps or config.n_steps)
         return RolloutBuffer(n_steps, env.n_envs, obs_leaves, structure, action.shape[1:], action.dtype, config.gamma)
 
-    def _keep_buffer(self, env: VectorEnv) -> None:
+    def keep_buffer(self, env: VectorEnv) -> None:
         """Forgets the rollout under way, which is of another environment."""
-        self._drop_rollout()
+        self.drop_rollout()
 
-    def _drop_rollout(self) -> None:
+    def drop_rollout(self) -> None:
         """Forgets the rollout under way; another begins with new episodes."""
         run = self.run
         if run.replay is not None and run.replay.length:

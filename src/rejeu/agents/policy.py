@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import jax
 import numpy as np
 
 from rejeu import spaces
+from rejeu.agents.base import BaseAgent
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
@@ -20,25 +21,6 @@ from rejeu.loops.run import clock_of
 from rejeu.reporting.evaluation import Evaluation, evaluate
 from rejeu.spaces import Leaf
 from rejeu.validation import number, whole
-
-if TYPE_CHECKING:
-    from rejeu.agents.base import Agent
-
-POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
-
-
-def check_policy(policy: str, space: gym.Space) -> None:
-    """Raises ``ValueError`` if there is no such policy, or if it is not for observations of ``space``."""
-    if policy not in POLICIES:
-        raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
-    is_dict = isinstance(space, gym.spaces.Dict)
-    if policy == "MlpPolicy" and is_dict:
-        raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
-    if policy == "MultiInputPolicy" and not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
-    if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in spaces.leaves(space)):
-        raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
-
 
 CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "min": lambda values: values.min(axis=0),
@@ -93,7 +75,7 @@ def described(observation: Any) -> str:
     return type(observation).__name__
 
 
-def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
+def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
     """Returns actions in the algorithm's range, and what the policy remembers (None without a memory).
 
     Args:
@@ -120,17 +102,17 @@ def act(agent: Agent, obs: Any, deterministic: bool, memory: Any, ended: np.ndar
     if deterministic:
         action, memory = learner.recall(run.state, memory, obs, ended)
         return np.asarray(action), memory
-    clock = clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent._n_predictions % 2**31))
-    agent._n_predictions += 1
+    clock = clock_of(run, 1.0)._replace(step=np.uint32(2**32 - 1 - agent.n_predictions % 2**31))
+    agent.n_predictions += 1
     action, memory = learner.sample(run.state, memory, obs, ended, run.key, clock)
     return np.asarray(action), memory if has_memory else None
 
 
-def q_values(agent: Agent, observation: Any, action: Any, critics: str) -> np.ndarray:
+def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> np.ndarray:
     """Returns what the critics say of actions; see :meth:`OffPolicyAgent.q_values`."""
     if critics not in CRITICS:
         raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
-    obs, single = as_batch(observation, agent.observation_space, agent._obs_leaves)
+    obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
     space = agent.action_space
     is_discrete = isinstance(space, gym.spaces.Discrete)
@@ -164,11 +146,11 @@ def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
     return spaces.unscale_action(space, array)
 
 
-def value(agent: Agent, observation: Any, memory: Any, episode_start: Any) -> np.ndarray:
+def value(agent: BaseAgent, observation: Any, memory: Any, episode_start: Any) -> np.ndarray:
     """Returns what the critic says of observations; see :meth:`OnPolicyAgent.value`."""
     if agent.takes_masks:
         observation, _ = split(observation, None)
-    obs, single = as_batch(observation, agent.observation_space, agent._obs_leaves)
+    obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
     learner = agent.learner
     finite.settle(agent)
@@ -183,12 +165,12 @@ def value(agent: Agent, observation: Any, memory: Any, episode_start: Any) -> np
     return values[0] if single else values
 
 
-def check_memory(agent: Agent, memory: Any, n: int) -> None:
+def check_memory(agent: BaseAgent, memory: Any, n: int) -> None:
     """Raises ``ValueError`` unless ``memory`` is what the agent's policy remembers of ``n`` episodes."""
-    if agent._memory_form is None:  # found out once: it takes longer than a prediction
-        agent._memory_form = jax.eval_shape(lambda: agent.learner.initial_carry(1))
+    if agent.carry_shapes is None:  # found out once: it takes longer than a prediction
+        agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_carry(1))
     given = jax.tree.map(np.shape, memory)
-    expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent._memory_form)
+    expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent.carry_shapes)
     if given != expected:
         raise ValueError(
             f"{agent.name}.predict was given a state of the shapes {given}, expected {expected}; give what its last call "
@@ -209,7 +191,7 @@ MOST_ENVS = 16
 
 
 def play(
-    agent: Agent,
+    agent: BaseAgent,
     episodes: int | None,
     env: Any,
     deterministic: bool,
@@ -231,17 +213,17 @@ def play(
     n_envs = MOST_ENVS if episodes is None else min(episodes, MOST_ENVS)
     made_here = isinstance(env, str) or callable(env)
     if env is not None:
-        vector = agent._vector(env, n_envs if isinstance(env, str) else 1, seed=seed)
+        vector = agent.make_envs(env, n_envs if isinstance(env, str) else 1, seed=seed)
     elif run.env is None:
-        vector = agent._vector(trained_on(agent), n_envs, seed=seed)
+        vector = agent.make_envs(trained_on(agent), n_envs, seed=seed)
         made_here = True
-    elif agent._own_env:
-        vector = agent._vector(run.env.env_id, n_envs, run.env.backend, seed)
+    elif agent.made_from_id:
+        vector = agent.make_envs(run.env.env_id, n_envs, run.env.backend, seed)
         made_here = True
     else:
         vector = run.env
     try:
-        agent._check_spaces(vector, "the environment to evaluate in")
+        agent.check_spaces(vector, "the environment to evaluate in")
         check_scaled(agent, vector)
         again = None if made_here else seed  # others have just been made with it
         with lent(agent, vector, seeded=again is not None):
@@ -251,15 +233,15 @@ def play(
             vector.close()
 
 
-def trained_on(agent: Agent) -> str | Callable[[], gym.Env]:
+def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
     """Returns what a loaded agent was trained on, as ``make_vector`` takes it.
 
     Raises:
         ValueError: if its file does not say, or if that is not registered here.
     """
-    if agent._trained_on is None:
+    if agent.trained_on is None:
         raise ValueError("this agent has no environment; give one: evaluate(env=...)")
-    env_id, env_kwargs = agent._trained_on
+    env_id, env_kwargs = agent.trained_on
     if not register(env_id) and not envpool_knows(env_id):
         raise ValueError(
             f"this agent was trained on {env_id}, which is not registered here; import the module that registers it, or give "
@@ -269,7 +251,7 @@ def trained_on(agent: Agent) -> str | Callable[[], gym.Env]:
 
 
 @contextmanager
-def lent(agent: Agent, vector: VectorEnv, seeded: bool = False) -> Iterator[None]:
+def lent(agent: BaseAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[None]:
     """While entered, ``vector`` may be played in: if the agent trains on the same environments, its episodes are given up.
 
     Training goes on in new ones, whether it is under way or still to come; ``seeded`` says that the environments were seeded
@@ -283,10 +265,10 @@ def lent(agent: Agent, vector: VectorEnv, seeded: bool = False) -> Iterator[None
     if shared:
         if seeded:
             run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
-        agent._give_up_episodes()
+        agent.abandon_episodes()
 
 
-def policy(agent: Agent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
+def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
     """Returns the policy as :func:`rejeu.reporting.evaluation.evaluate` takes it; it remembers from call to call."""
     memory: Any = None
 
@@ -298,7 +280,7 @@ def policy(agent: Agent, deterministic: bool) -> Callable[[Any, np.ndarray], np.
     return choose
 
 
-def check_scaled(agent: Agent, vector: VectorEnv) -> None:
+def check_scaled(agent: BaseAgent, vector: VectorEnv) -> None:
     """Raises ``ValueError`` if the agent learns from a ``VecNormalize`` and ``vector`` is none."""
     if agent.get_vec_normalize_env() is not None and vector.vec_normalize is None:
         raise ValueError(

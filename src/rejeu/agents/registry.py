@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from rejeu import presets as all_presets
 from rejeu.agents import model_files
-from rejeu.agents.base import Agent
+from rejeu.agents.agent import Agent
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ
 from rejeu.agents.on_policy import A2C, PPO, MaskablePPO, RecurrentPPO
 from rejeu.errors import CheckpointError

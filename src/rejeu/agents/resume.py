@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import jax
@@ -16,8 +16,9 @@ from jax import Array
 
 from rejeu import spaces, xla
 from rejeu.agents import model_files
-from rejeu.agents.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_files
-from rejeu.agents.training import Call
+from rejeu.agents.base import BaseAgent, Best, Resumed, whole_seed
+from rejeu.agents.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_files, run_folder
+from rejeu.agents.training import fill_windows
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
@@ -28,12 +29,10 @@ from rejeu.io import checkpoint, json_arrays
 from rejeu.io.records import MAX_ENVS, convert
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Run, is_finite
+from rejeu.loops.training_call import TrainingCall
 from rejeu.validation import number
 
-if TYPE_CHECKING:
-    from rejeu.agents.base import Agent
-
-A = TypeVar("A", bound="Agent")
+A = TypeVar("A", bound=BaseAgent)
 
 MAX_OTHER_BYTES = 2**26
 """Upper limit on the bytes of history, environments and callbacks in a checkpoint; beyond it they must not be a hole in the
@@ -42,22 +41,6 @@ MAX_ZEROS = 64
 """Upper limit on their size relative to that of the file without its holes."""
 PER_BUFFER = ("heads", "started")
 """Arrays of a replay buffer and of a rollout with one entry per environment; a run has one of them."""
-
-
-class Resumed(NamedTuple):
-    """Where a run was resumed."""
-
-    step: int
-    """Environment steps that had been taken."""
-    exact: bool
-    """Whether the run continues as it would have without the break, bit for bit."""
-    reason: str
-    """What differs otherwise; empty where it is exact."""
-    skipped: tuple[str, ...] = ()
-    """The errors of newer checkpoints, which could not be read; newest first."""
-
-    def __str__(self) -> str:
-        return f"resumed at step {self.step:,}, {'exactly where it stood' if self.exact else self.reason}"
 
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
@@ -103,17 +86,17 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     except model_files.WRONG as error:
         raise refusal(path, error) from error
 
-    def make_env(agent: Agent) -> VectorEnv:
+    def make_env(agent: BaseAgent) -> VectorEnv:
         if env is not None:
-            vector = agent._vector(env, seed=agent.seed)
+            vector = agent.make_envs(env, seed=agent.seed)
             if vector.n_envs != header.n_envs:
                 raise CheckpointError(f"the run had {header.n_envs} environments, and {vector.n_envs} are given")
             return vector
         env_id, backend = environment(path, header)
         try:
-            vector = agent._vector(env_id, header.n_envs, backend, agent.seed)
+            vector = agent.make_envs(env_id, header.n_envs, backend, agent.seed)
             made.callback(vector.close)
-            agent._check_spaces(vector, f"{env_id} as it is here")
+            agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:
             raise CheckpointError(
                 f"{path}: the environments of the run cannot be made again ({model_files.brief(error)}); give them: "
@@ -131,7 +114,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
         if "train_freq" not in changes:
             check_owed(agent)
-        agent._run_id, agent._own_env = header.run_id, env is None
+        agent.run_id, agent.made_from_id = header.run_id, env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
     except model_files.WRONG as error:
@@ -139,11 +122,13 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     if parts:
         ring = agent.run.replay.ring
         heads = [part["head"] for part in parts]
-        agent._rows[path.parent.resolve()] = RowFiles(list(zip(header.rows, heads, strict=True)), ring, ring.version)
+        run_folder(agent, path.parent).row_files = RowFiles(
+            list(zip(header.rows, heads, strict=True)), ring, ring.version
+        )
     return agent
 
 
-def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
+def check_specs(agent: BaseAgent, file: checkpoint.Contents) -> None:
     """Checks the arrays of a run's file before they are read; those of the agent's state were checked before.
 
     Raises:
@@ -165,7 +150,7 @@ def check_specs(agent: Agent, file: checkpoint.Contents) -> None:
         raise ValueError(f"it says that it holds {found:,} bytes of the run, nearly all of them a hole in the file")
 
 
-def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
+def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
     """Returns the arrays of a file of rows, after checking that they fit the agent's buffer.
 
     Raises:
@@ -176,7 +161,7 @@ def read_rows(path: Path, agent: Agent) -> dict[str, np.ndarray]:
         return file.read()
 
 
-def compared(agent: Agent, header: RunHeader) -> Resumed:
+def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
     """Returns how a run resumes whose environments were restored."""
     here = xla.threads()
     before = here if header.threads is None else header.threads
@@ -196,7 +181,7 @@ def refusal(path: Path, error: BaseException) -> CheckpointError:
     return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {model_files.brief(error)}")
 
 
-def check_owed(agent: Agent) -> None:
+def check_owed(agent: BaseAgent) -> None:
     """Checks that no more gradient steps are due than are possible with this configuration.
 
     Raises:
@@ -225,7 +210,7 @@ def environment(path: Path, header: RunHeader) -> tuple[str, Backend]:
 
 
 def restore(
-    agent: Agent, saved: SavedRun, rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
+    agent: BaseAgent, saved: SavedRun, rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
 ) -> str:
     """Restores the run of an agent that was loaded from the same checkpoint.
 
@@ -253,20 +238,20 @@ def restore(
     if saved.envs is not None:
         reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
     elif saved.seed is not None:
-        run.seed = model_files.whole_seed(saved.seed)
+        run.seed = whole_seed(saved.seed)
     agent.history.replace(saved.history)
-    agent._fill_windows()
+    fill_windows(agent)
     if saved.best is not None:
         restore_best(agent, saved.best, best, path)
-    agent._call = None if saved.call is None else Call.from_json(saved.call)
-    agent._saved_callbacks = list(saved.callbacks)
+    agent.training_call = None if saved.call is None else TrainingCall.from_json(saved.call)
+    agent.saved_callbacks = list(saved.callbacks)
     statistics = agent.get_vec_normalize_env()
     if statistics is not None and saved.vec_normalize is not None:
         statistics.put_statistics(saved.vec_normalize)
     return f"at the start of new episodes: {reason}" if reason else ""
 
 
-def restore_counters(agent: Agent, saved: SavedRun) -> None:
+def restore_counters(agent: BaseAgent, saved: SavedRun) -> None:
     """Restores counters, durations, random numbers and the logger of a run."""
     run = agent.run
     if saved.steps_since_update > run.step:
@@ -279,13 +264,13 @@ def restore_counters(agent: Agent, saved: SavedRun) -> None:
     run.rng.bit_generator.state = saved.rng
     run.watch.n_skipped = saved.n_skipped
     run.seconds = {key: saved.seconds[key] for key in run.seconds}
-    agent._seconds_before = number("before", saved.seconds.get("before", 0.0), least=0, most=run.seconds["total"])
-    values, agent.logger._counts = saved.logger
+    agent.reset_seconds = number("before", saved.seconds.get("before", 0.0), least=0, most=run.seconds["total"])
+    values, agent.logger.name_to_count = saved.logger
     agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
-    agent._n_predictions = saved.n_predictions
+    agent.n_predictions = saved.n_predictions
 
 
-def restore_best(agent: Agent, saved: SavedBest, arrays: dict[str, np.ndarray], path: Path) -> None:
+def restore_best(agent: BaseAgent, saved: SavedBest, arrays: dict[str, np.ndarray], path: Path) -> None:
     """Restores the best weights.
 
     Raises:
@@ -296,7 +281,7 @@ def restore_best(agent: Agent, saved: SavedBest, arrays: dict[str, np.ndarray], 
     scores = saved.score if isinstance(saved.score, tuple) else (saved.score,)
     if not all(isinstance(part, int | float) for part in scores):
         raise TypeError(f"the best score is {saved.score!r}, expected numbers")
-    agent._put_best(saved.score, saved.by, saved.step, packed)
+    agent.best = Best(saved.score, saved.by, saved.step, packed)
 
 
 def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:

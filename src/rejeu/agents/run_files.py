@@ -15,15 +15,12 @@ process dies, the newest complete checkpoint is at most one interval old.
 
 from __future__ import annotations
 
-import math
 import re
 import secrets
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import jax
 import msgspec
@@ -33,22 +30,16 @@ from msgspec import Meta
 
 from rejeu import xla
 from rejeu.agents import model_files
+from rejeu.agents.base import BaseAgent
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.io import atomic, checkpoint, json_arrays
-from rejeu.io.failed_writes import RETRY_SECONDS
 from rejeu.io.records import Count, Positive, Seconds
 from rejeu.loops import finite
-from rejeu.loops.run import Progress, Run
-from rejeu.validation import number, whole
+from rejeu.loops.run import Run
 
-if TYPE_CHECKING:
-    from rejeu.agents.base import Agent
-
-MINUTES = 5.0
-"""Default interval between two checkpoints."""
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 ROWS_FILE = re.compile(r"rows_\d{12}_[0-9a-f]+\.safetensors")
 SCALARS = ("learn_from", "owed", "steps_since_update")
@@ -81,131 +72,80 @@ class RowFiles:
         self.files = [one for one in self.files if (one[1] >= oldest).any()]
 
 
-class Checkpoint:
-    """Saves the whole run at an interval of environment steps or minutes, and when ``learn`` ends.
+def run_folder(agent: BaseAgent, folder: Path) -> RunFolder:
+    """Returns the folder of an agent's checkpoints, always the same object for the same path."""
+    path = folder.resolve()
+    if path not in agent.run_folders:
+        agent.run_folders[path] = RunFolder(agent, folder)
+    found = agent.run_folders[path]
+    assert isinstance(found, RunFolder)
+    return found
 
-    Ctrl-C, SIGTERM and errors of the environment also end ``learn`` with a checkpoint. ``Agent.resume(folder)`` resumes the
-    run. The folder belongs to one run; the last ``keep`` checkpoints are kept.
 
-    >>> import rejeu, tempfile
-    >>> folder = tempfile.mkdtemp()
-    >>> agent = rejeu.SAC("MlpPolicy", "rejeu/Ball-v0", seed=0, buffer_size=1000)
-    >>> stop = lambda agent, progress: progress.step < 150
-    >>> _ = agent.learn(300, [Checkpoint(folder, every=100), stop])
-    >>> rejeu.SAC.resume(folder).learn().num_timesteps
-    300
-    """
+class RunFolder:
+    """A folder with the checkpoints of an agent's run. Mutable; see :meth:`Agent.run_folder`."""
 
-    def __init__(
-        self, folder: str | Path, every: int | None = None, *, minutes: float | None = None, keep: int = 2
-    ) -> None:
-        """Sets the interval; nothing is saved yet.
-
-        Args:
-            folder: of the checkpoints; new, or of the same run. It is created with the first checkpoint.
-            every: environment steps between two checkpoints.
-            minutes: wall time between two checkpoints; 5 if neither is given.
-            keep: number of checkpoints that are kept, at least 1.
-        """
-        if isinstance(folder, int):
-            raise TypeError(f"folder={folder!r} must be a path: Checkpoint(folder, every={folder})")
-        self.folder = Path(folder)
-        self.every = None if every is None else whole("every", every, least=1)
-        given = None if minutes is None else number("minutes", minutes, above=0)
-        self.minutes = MINUTES if given is None and every is None else given
-        self.keep = whole("keep", keep, least=1)
-        self.seconds = 0.0
-        """Wall time spent saving."""
-        self._saved: tuple[int, int] | None = None
+    def __init__(self, agent: BaseAgent, folder: Path) -> None:
+        self.agent = agent
+        self.folder = folder
+        self.row_files = RowFiles()
+        self._lock = FileLock(folder / "lock")
         self._named: dict[Path, list[str]] = {}
-        self._last_step = 0
-        self._last_time = 0.0
-        self._retry_at = math.inf
 
-    @contextmanager
-    def held(self, agent: Agent) -> Iterator[None]:
-        """Locks the folder for this process.
+    def open(self) -> None:
+        """Makes the folder and locks it for this process.
 
         Raises:
-            RunInUseError: if another process holds it.
-            FileExistsError: if it holds the checkpoints of another run.
+            RunInUseError: if another process holds the lock.
+            FileExistsError: if the folder contains the checkpoints of another run.
         """
         atomic.make_folder(self.folder)
-        lock = FileLock(self.folder / "lock")
         try:
-            lock.acquire(timeout=0)
+            self._lock.acquire(timeout=0)
         except Timeout:
             raise RunInUseError(
                 f"another process is training in {self.folder}; wait for it, stop it, or give Checkpoint another folder"
             ) from None
         try:
-            self._check_owner(agent)
+            self._check_owner()
             for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote
                 path.unlink(missing_ok=True)
             for path in run_files(self.folder):
-                if step_of(path) > agent.run.step:  # a damaged one, which resume has passed over
+                if step_of(path) > self.agent.run.step:  # a damaged one, which resume has skipped
                     path.rename(path.with_name(f"{path.name}.damaged"))
-            self._last_step, self._last_time = agent.run.step, time.monotonic()
-            if not run_files(self.folder):
-                self.save(agent)
-            if agent.report_folder is None:
-                agent.report_folder = self.folder
-            yield
-        finally:
-            lock.release()
+        except BaseException:
+            self.close()
+            raise
+        if self.agent.report_folder is None:
+            self.agent.report_folder = self.folder
 
-    def _check_owner(self, agent: Agent) -> None:
-        for path in run_files(self.folder):
-            try:
-                header = checkpoint.read_header(path, "run")
-            except CheckpointError:
-                continue
-            if header.get("run_id") != agent._run_id:
-                raise FileExistsError(
-                    f"{self.folder} holds the checkpoints of another run; go on with it by {agent.name}.resume(folder), or "
-                    "give Checkpoint another folder"
-                )
-            return
+    def close(self) -> None:
+        """Releases the lock."""
+        self._lock.release()
 
-    def __call__(self, agent: Agent, progress: Progress) -> None:
-        """Saves if a checkpoint is due in this step."""
-        before, self._last_step = self._last_step, progress.step
-        by_steps = self.every is not None and before // self.every < progress.step // self.every
-        now = time.monotonic()
-        by_time = self.minutes is not None and now - self._last_time >= 60 * self.minutes
-        if by_steps or by_time or now >= self._retry_at:
-            self.attempt(agent)
+    def is_empty(self) -> bool:
+        """Returns whether the folder contains no checkpoint."""
+        return not run_files(self.folder)
 
-    def attempt(self, agent: Agent) -> None:
-        """Saves as :meth:`save` does; if that fails, warns and retries after a minute."""
-        written = agent.failed_writes.attempt(f"checkpoints in {self.folder}", lambda: self.save(agent), retry=False)
-        self._retry_at = math.inf
-        if not written:
-            self._last_time = time.monotonic()
-            self._retry_at = self._last_time + RETRY_SECONDS
-
-    def save(self, agent: Agent, reason: str = "") -> Path | None:
-        """Saves now and returns the path; returns None if nothing has changed since the last checkpoint.
+    def save(self, keep: int, reason: str = "") -> Path:
+        """Writes a checkpoint of the run as it is now, deletes all but the newest ``keep``, and returns its path.
 
         Args:
-            agent: the agent.
-            reason: why the state of the environments is not valid; empty if it is.
+            keep: how many checkpoints are kept.
+            reason: why the environments' state cannot be trusted; empty if it can.
 
         Raises:
-            OSError: if the checkpoint cannot be written; earlier checkpoints are not changed.
-            NonFiniteError: if the last update left numbers that are not finite; nothing is saved then.
+            OSError: if it cannot be written; earlier checkpoints are unchanged.
+            NonFiniteError: if the last update left numbers that are not finite; nothing is written then.
         """
-        began = time.monotonic()
+        agent = self.agent
         finite.settle(agent)
         run = agent.run
-        if self._saved == (run.step, run.n_updates) and not reason:
-            return None
-        row_files = agent._rows.setdefault(self.folder.resolve(), RowFiles())
         try:
             if not isinstance(run.replay, RolloutBuffer):
-                self._write_rows(run.replay.ring, row_files, run.step)
+                self._write_rows(run.replay.ring, run.step)
             header, arrays = content(agent, reason)
-            header["rows"] = [name for name, _ in row_files.files]
+            header["rows"] = [name for name, _ in self.row_files.files]
             path = checkpoint.write(self.folder / f"run_{run.step:012d}.safetensors", "run", arrays, header)
             self._named[path], agent.last_saved = header["rows"], path
         except OSError as error:
@@ -213,44 +153,46 @@ class Checkpoint:
             raise OSError(
                 error.errno,
                 f"the checkpoint of step {run.step} could not be written ({error}); "
-                + (f"the one before is whole: {left[0]}" if left else "there is none before it"),
+                + (f"the one before it is complete: {left[0]}" if left else "there is none before it"),
             ) from error
-        self._tidy()
-        self._saved, self._last_step, self._last_time = (run.step, run.n_updates), run.step, time.monotonic()
-        self.seconds += self._last_time - began
+        self._delete_old(keep)
         return path
 
-    def save_after(self, error: Exception, agent: Agent) -> None:
-        """Saves after an error within a step; the run resumes at the start of new episodes."""
-        if any(array.is_deleted() for array in agent.run.state):
-            return  # the error came between two states
-        reason = f"the run ended with {type(error).__name__}"
-        try:
-            agent.failed_writes.attempt(f"checkpoints in {self.folder}", lambda: self.save(agent, reason), retry=False)
-        except Exception as second:  # the first error is what the user must see
-            error.add_note(f"and no checkpoint could be saved: {second}")
+    def _check_owner(self) -> None:
+        for path in run_files(self.folder):
+            try:
+                header = checkpoint.read_header(path, "run")
+            except CheckpointError:
+                continue
+            if header.get("run_id") != self.agent.run_id:
+                raise FileExistsError(
+                    f"{self.folder} contains the checkpoints of another run; continue it with "
+                    f"{self.agent.name}.resume(folder), or give Checkpoint another folder"
+                )
+            return
 
-    def _write_rows(self, ring: Ring, row_files: RowFiles, step: int) -> None:
+    def _write_rows(self, ring: Ring, step: int) -> None:
+        row_files = self.row_files
         if not all((self.folder / name).exists() for name, _ in row_files.files):
-            row_files.files = []  # the folder was cleared: all rows are written again
+            row_files.files = []  # somebody has cleared the folder: all rows are written again
         rows = ring.rows_since(row_files.heads(ring))
         name = f"rows_{step:012d}_{secrets.token_hex(4)}.safetensors"
         checkpoint.write(self.folder / name, "rows", rows, {})
         row_files.add(name, ring)
 
-    def _tidy(self) -> None:
-        """Deletes checkpoints beyond ``keep``, and the rows that no other checkpoint needs."""
+    def _delete_old(self, keep: int) -> None:
+        """Deletes all but the newest ``keep`` checkpoints, and the files of rows that none of these needs."""
         found = run_files(self.folder)
-        for path in found[self.keep :]:
+        for path in found[keep:]:
             _remove(path)
             self._named.pop(path, None)
-        needed = {name for path in found[: self.keep] for name in self._rows_of(path)}
+        needed = {name for path in found[:keep] for name in self._rows_of(path)}
         for path in self.folder.iterdir():
             if ROWS_FILE.fullmatch(path.name) and path.name not in needed:
                 _remove(path)
 
     def _rows_of(self, path: Path) -> list[str]:
-        """Returns the files of rows that a checkpoint needs; none if it is damaged."""
+        """Returns the files of rows that a checkpoint needs; none, if it is damaged."""
         if path not in self._named:
             try:
                 self._named[path] = [str(name) for name in checkpoint.read_header(path, "run")["rows"]]
@@ -336,7 +278,7 @@ class SavedRun(msgspec.Struct, kw_only=True):
     vec_normalize: Any
 
 
-def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Returns header and arrays of a run, without the rows of its replay buffer."""
     run = agent.run
     states = None if reason or run.obs is None else run.env.snapshot()
@@ -363,22 +305,22 @@ def content(agent: Agent, reason: str) -> tuple[dict[str, Any], dict[str, np.nda
         "metrics": None if run.metrics is None else {key: np.asarray(value) for key, value in run.metrics.items()},
         "n_skipped": run.watch.n_skipped,
         "td_errors": leaves([td_error for _, td_error in run.td_errors]),
-        "seconds": {**{key: float(value) for key, value in run.seconds.items()}, "before": agent._seconds_before},
+        "seconds": {**{key: float(value) for key, value in run.seconds.items()}, "before": agent.reset_seconds},
         "buffer": buffer_content(run),
         "history": agent.history.table(),
         "best": best,
-        "logger": [dict(agent.logger.name_to_value), dict(agent.logger._counts)],
-        "n_predictions": agent._n_predictions,
-        "call": None if agent._call is None else agent._call.to_json(),
-        "callbacks": [[type(one).__name__, one.state_dict()] for one in agent._callbacks],
+        "logger": [dict(agent.logger.name_to_value), dict(agent.logger.name_to_count)],
+        "n_predictions": agent.n_predictions,
+        "call": None if agent.training_call is None else agent.training_call.to_json(),
+        "callbacks": [[type(one).__name__, one.state_dict()] for one in agent.callbacks],
         "vec_normalize": None if statistics is None else statistics.statistics(),
     }
     header = {
         **model_files.header(agent),
-        "run_id": agent._run_id,
+        "run_id": agent.run_id,
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,
-        "own_env": agent._own_env,
+        "own_env": agent.made_from_id,
         "threads": xla.threads(),
         "run": json_arrays.encode(everything, arrays, "run"),
     }

@@ -2,135 +2,272 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from rejeu import xla
+from rejeu.agents.base import BaseAgent, Best
 from rejeu.agents.model_files import WRONG, brief
-from rejeu.agents.run_files import Checkpoint
-from rejeu.errors import CheckpointError, NonFiniteError
-from rejeu.hooks import Hooks, told_apart
+from rejeu.callbacks.base import Callback, Stateful, TrainingCallback
+from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.errors import CheckpointError
 from rejeu.interrupt import Interrupt
 from rejeu.io.failed_writes import RetryingSink
-from rejeu.io.records import Count, Duration, Positive, Seconds, convert
 from rejeu.loops import finite
-from rejeu.loops.learner import PackedState
-from rejeu.loops.run import Episode, time_shares
+from rejeu.loops.run import Episode, Progress, time_shares
+from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Console, Sink, TensorBoard, next_folder
 from rejeu.reporting.text import counted
 from rejeu.validation import number, whole
 
-if TYPE_CHECKING:
-    from rejeu.agents.base import Agent, Callback
+TABLE_SECONDS = 2.0
+"""Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
+DETERMINISTIC = ("DDPG", "TD3")
+"""Algorithms whose policy for continuous actions does not explore by itself."""
+RENAMED_CALLBACKS = {"Film": "RecordVideo"}
+"""Classes of callbacks that older checkpoints know by another name."""
 
 
-@dataclass
-class Call:
-    """One call of ``learn``. Mutable: ``logged`` moves on."""
+def start_call(
+    agent: BaseAgent,
+    total_timesteps: int | None,
+    episodes: int | None,
+    minutes: float | None,
+    log_interval: int,
+    reset_num_timesteps: bool,
+) -> TrainingCall:
+    """Returns the limits of a call of ``learn``, and prepares the agent's counters and environments for it.
 
-    n_steps: Positive | None
-    """Environment steps to take, None where something else ends it."""
-    n_episodes: Positive | None
-    """Episodes to finish, likewise."""
-    seconds: Duration | None
-    """Wall time to take, likewise."""
-    first_step: Count
-    """Environment steps taken in all when it began."""
-    first_episode: Count
-    """Episodes finished in all when it began."""
-    log_interval: Count
-    """Episodes between two rows of statistics."""
-    logged: Count
-    """Episodes in the history when the last row was written."""
-    steps_before: Count = 0
-    """Environment steps that schedules count as taken before it: those since the last ``learn`` that began to count."""
-    episodes_before: Count = 0
-    """Episodes likewise."""
-    seconds_before: Seconds = 0.0
-    """Training time likewise."""
-    spent: Seconds = 0.0
-    """Wall time that it had taken when it was last taken up, in seconds."""
-    began: float = dataclasses.field(default_factory=time.perf_counter)
-    """When it was begun or last taken up, by ``time.perf_counter``."""
-
-    @property
-    def elapsed(self) -> float:
-        """Wall time that it has taken, interruptions left out, in seconds."""
-        return self.spent + time.perf_counter() - self.began
-
-    @property
-    def last_step(self) -> int | None:
-        """Environment steps taken in all when it will be over, None where something else ends it."""
-        return None if self.n_steps is None else self.first_step + self.n_steps
-
-    def progress(self, step: int, episode: int) -> float:
-        """Returns the progress of schedules, in [0, 1], when so many steps and episodes have passed in all.
-
-        As in Stable-Baselines3, what came before counts as done, and as part of the whole: with 100 steps before and 300
-        to take, progress goes from 0.25 to 1. Of several limits the nearest counts.
-        """
-        by_steps = share(self.steps_before, step - self.first_step, self.n_steps)
-        by_episodes = share(self.episodes_before, episode - self.first_episode, self.n_episodes)
-        by_time = share(self.seconds_before, self.elapsed, self.seconds)
-        return min(max(by_steps, by_episodes, by_time), 1.0)
-
-    def is_over(self, step: int, episode: int) -> bool:
-        """Returns whether one of its limits is reached."""
-        by_steps = self.last_step is not None and step >= self.last_step
-        by_episodes = self.n_episodes is not None and episode - self.first_episode >= self.n_episodes
-        return by_steps or by_episodes or (self.seconds is not None and self.elapsed >= self.seconds)
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns it as plain JSON values."""
-        return {**{key: getattr(self, key) for key in SAVED}, "spent": self.elapsed}
-
-    @classmethod
-    def from_json(cls, saved: Mapping[str, Any]) -> Call:
-        """Returns the call that :meth:`to_json` described, continued now.
-
-        Raises:
-            CheckpointError: if it is damaged.
-        """
-        call = convert(saved, cls)
-        call.began = time.perf_counter()
-        return call
-
-
-def share(before: float, taken: float, limit: float | None) -> float:
-    """Returns which share of ``before + limit`` is done once ``taken`` more have passed; 0 without a limit.
-
-    >>> share(100, 0, 300), share(100, 300, 300), share(100, 50, None)
-    (0.25, 1.0, 0.0)
+    Raises:
+        ValueError: without an environment; without a limit, unless the agent resumes an unfinished ``learn``.
     """
-    return 0.0 if limit is None else (before + taken) / (before + limit)
+    run = agent.run
+    if run.env is None:
+        raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
+    resumes = total_timesteps is None and minutes is None and episodes is None
+    if resumes:
+        call = unfinished_call(agent)
+    else:
+        n_steps = None if total_timesteps is None else whole("total_timesteps", total_timesteps, least=1)
+        n_episodes = None if episodes is None else whole("episodes", episodes, least=1)
+        seconds = None if minutes is None else 60 * number("minutes", minutes, above=0)
+        if reset_num_timesteps:
+            agent.reset_step, agent.reset_episode = run.step, run.episode
+            agent.reset_seconds = run.seconds["total"]
+        call = TrainingCall(
+            n_steps,
+            n_episodes,
+            seconds,
+            first_step=run.step,
+            first_episode=run.episode,
+            log_interval=log_interval,
+            logged=len(agent.history),
+            steps_before=run.step - agent.reset_step,
+            episodes_before=run.episode - agent.reset_episode,
+            seconds_before=run.seconds["total"] - agent.reset_seconds,
+        )
+    if run.env.venv is not None and (reset_num_timesteps or resumes):  # may have been stepped by hand since
+        run.obs = run.action = None
+    return call
 
 
-SAVED = [field.name for field in dataclasses.fields(Call) if field.name not in ("spent", "began")]
+def unfinished_call(agent: BaseAgent) -> TrainingCall:
+    """Returns the ``learn`` that a resumed agent was in when it was saved.
+
+    Raises:
+        ValueError: if there is none, or if it is complete.
+    """
+    call = agent.training_call if agent.resumed is not None else None
+    if call is None:
+        raise ValueError("learn needs total_timesteps, episodes or minutes (or an agent from resume(), to continue)")
+    if call.is_over(agent.run.step, agent.run.episode):
+        raise ValueError(
+            "the run is complete; to train on, say how long: total_timesteps (--steps), episodes or minutes (--minutes)"
+        )
+    return call
 
 
-class Best(NamedTuple):
-    """The best weights of a run so far."""
+def train(
+    agent: BaseAgent,
+    call: TrainingCall,
+    callback: Callback | Iterable[Callback] | None,
+    tb_log_name: str | None,
+    progress_bar: bool,
+    sinks: Iterable[Sink],
+) -> None:
+    """Trains until a limit of ``call`` is reached, a callback returns ``False``, or Ctrl-C or SIGTERM arrives.
 
-    score: float | tuple[float, ...]
-    """Mean training return, or what evaluations are judged by: success rate and mean return."""
-    by: str
-    """``"training"`` or ``"evaluation"``."""
-    step: int
-    """Environment steps taken when they were kept."""
-    state: PackedState
-    """The algorithm's whole state at that moment, packed."""
+    The other arguments are those of :meth:`Agent.learn`.
+    """
+    warn_without_noise(agent)
+    run, bar = agent.run, []
+    if progress_bar:
+        bar = [ProgressBar(call.n_steps, call.seconds, taken=run.step - call.first_step, spent=call.spent)]
+    callbacks = in_order([*(() if callback is None else [callback] if callable(callback) else callback), *bar])
+    agent.training_call = call
+    agent.callbacks = stateful(callbacks)
+    agent.interrupted, agent.interrupted_by = False, None
+    run.success_threshold = agent.success_threshold
+    agent.failed_writes.forget_written()
+    with ExitStack() as stack:
+        stack.callback(agent.failed_writes.warn)
+        outputs = open_outputs(agent, sinks, tb_log_name, stack)
+        stack.callback(agent.failed_writes.retry)
+        stack.enter_context(marked_as_learning(agent, outputs))
+        stack.enter_context(listening(agent, callbacks))
+        try:
+            with Interrupt() as interrupt:
+                first = run.step
+                remaining = None if call.last_step is None else call.last_step - first
+                for turn in agent.loop(remaining, lambda taken: call.progress(first + taken, run.episode)):
+                    record_turn(agent, call, turn, outputs)
+                    answers = [callback(agent, turn) for callback in callbacks]
+                    agent.failed_writes.retry_if_due()
+                    stopped = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
+                    if stopped or interrupt.requested or call.is_over(turn.step, run.episode):
+                        break
+            agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
+            finite.settle(agent)
+        except finite.Broken as broken:
+            raise finite.reported(agent, broken) from None
 
 
-def note_training_return(agent: Agent, ended: int) -> None:
+def in_order(callbacks: Iterable[Callback]) -> list[Callback]:
+    """Returns callbacks in the order in which they are called: those that run last behind the others."""
+    return sorted(callbacks, key=lambda callback: isinstance(callback, TrainingCallback) and callback.runs_last)
+
+
+def stateful(callbacks: Iterable[Any]) -> list[Stateful]:
+    """Returns the callbacks whose state a checkpoint contains."""
+    return [one for one in callbacks if isinstance(one, Stateful)]
+
+
+@contextmanager
+def listening(agent: BaseAgent, callbacks: Sequence[Callback]) -> Iterator[None]:
+    """Tells callbacks that training starts and, on exit, that it has ended; restores their state in a resumed run."""
+    started: list[TrainingCallback] = []
+    error: BaseException | None = None
+    saved = None if agent.saved_callbacks is None else unpacked(agent.saved_callbacks, callbacks)
+    try:
+        for callback in callbacks:
+            if isinstance(callback, TrainingCallback):
+                callback.before_training(agent)
+                started.append(callback)
+            if saved is not None and isinstance(callback, Stateful):
+                restore_callback(callback, saved)
+        agent.saved_callbacks = None
+        if saved:
+            names = ", ".join(name for name, _ in saved)
+            warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=5)
+        yield
+    except BaseException as raised:
+        error = raised
+        raise
+    finally:
+        with ExitStack() as ends:
+            for one in reversed(started):
+                ends.callback(one.after_training, agent, error)
+
+
+def unpacked(saved: Sequence[tuple[str, Any]], callbacks: Sequence[Callback]) -> list[tuple[str, Any]]:
+    """Returns the saved states of callbacks under the present names of their classes.
+
+    Older checkpoints hold several callbacks with hooks as one ``CallbackList``.
+
+    Raises:
+        CheckpointError: if such a list is damaged.
+    """
+    given = {type(callback).__name__ for callback in callbacks}
+    states: list[tuple[str, Any]] = []
+    for name, state in saved:
+        try:
+            inside = state["inside"] if name == "CallbackList" and name not in given else [(name, state)]
+            states += [(RENAMED_CALLBACKS.get(inner, inner), part) for inner, part in inside]
+        except WRONG as error:
+            raise CheckpointError(f"the saved state of {name} is damaged: {brief(error)}") from error
+    return states
+
+
+def restore_callback(callback: Stateful, saved: list[tuple[str, Any]]) -> None:
+    """Restores a callback from the first saved state of its class, which is removed from ``saved``; warns without one.
+
+    Raises:
+        CheckpointError: if that state is damaged.
+    """
+    name = type(callback).__name__
+    match = next((entry for entry in saved if entry[0] == name), None)
+    if match is None:
+        warnings.warn(f"the run was saved without a {name}; it starts from the beginning", UserWarning, stacklevel=6)
+        return
+    saved.remove(match)
+    try:
+        callback.load_state_dict(match[1])
+    except WRONG as error:
+        raise CheckpointError(f"the saved state of {name} is damaged: {brief(error)}") from error
+
+
+@contextmanager
+def marked_as_learning(agent: BaseAgent, outputs: Sequence[Sink]) -> Iterator[None]:
+    """While entered, the agent counts as learning, and its logger writes to ``outputs``."""
+    loggers = agent.logger.outputs
+    agent.logger.outputs, agent.is_learning = [*outputs], True
+    try:
+        yield
+    finally:
+        agent.logger.outputs, agent.is_learning = loggers, False
+
+
+def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: Sequence[Sink]) -> None:
+    """Adds what one turn of the loop did to the statistics, writes a row if one is due, and keeps the best weights."""
+    agent.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
+    for episode in turn.episodes:
+        record_episode(agent, episode)
+    if len(agent.history) - call.logged >= call.log_interval and outputs:
+        call.logged = len(agent.history)
+        row = statistics_row(agent) | agent.logger.take()
+        for output in outputs:
+            output.write(agent.num_timesteps, row)
+    if turn.episodes:
+        note_training_return(agent, len(turn.episodes))
+
+
+def warn_without_noise(agent: BaseAgent) -> None:
+    """Warns, at the beginning of a run, if its policy is deterministic and nothing makes it try other actions."""
+    deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
+    if deterministic and agent.make_noise() is None and agent.run.step == 0:
+        warnings.warn(
+            f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
+            f"learning_starts={agent.config.learning_starts} it tries nothing new; set action_noise=0.1 (--set "
+            "action_noise=0.1), 'ou(0.2)' or ParameterNoise()",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def open_outputs(
+    agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, held: ExitStack
+) -> Sequence[RetryingSink]:
+    """Returns where rows of statistics go; ``held`` closes those that are opened here."""
+    loggers = agent.logger.outputs
+    outputs: list[Sink] = [*sinks, *loggers]
+    if agent.verbose and not loggers:
+        console = Console(TABLE_SECONDS)
+        held.callback(console.close)
+        outputs.append(console)
+    if agent.tensorboard_log is not None and not loggers:
+        tensorboard = TensorBoard(next_folder(agent.tensorboard_log, tb_log_name or agent.name))
+        held.callback(tensorboard.close)
+        outputs.append(tensorboard)
+    return [RetryingSink(output, agent.failed_writes) for output in outputs]
+
+
+def note_training_return(agent: BaseAgent, ended: int) -> None:
     """Keeps the present weights if ``ended`` episodes that have just ended bring the best mean return so far.
 
     Where several ended at once, each of them closes a window of its own.
@@ -139,10 +276,10 @@ def note_training_return(agent: Agent, ended: int) -> None:
     returns = [episode.episode_return for episode in agent.history.last(window + ended - 1)]
     if len(returns) >= window and (agent.best is None or agent.best.by == "training"):
         means = np.lib.stride_tricks.sliding_window_view(returns, window).mean(axis=-1)
-        agent.remember_best(float(means.max()), "training")
+        remember_best(agent, float(means.max()), "training")
 
 
-def remember_best(agent: Agent, score: float | tuple[float, ...], by: str) -> bool:
+def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str) -> bool:
     """Keeps the present weights if ``score`` is the best of its kind so far; returns whether it is."""
     if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
         return False
@@ -151,7 +288,7 @@ def remember_best(agent: Agent, score: float | tuple[float, ...], by: str) -> bo
     return True
 
 
-def restore_best(agent: Agent) -> None:
+def restore_best(agent: BaseAgent) -> None:
     """Puts the best weights back.
 
     Raises:
@@ -163,10 +300,10 @@ def restore_best(agent: Agent) -> None:
             "ended, and at every evaluation by rejeu.callbacks.Evaluate"
         )
     agent.run.state = agent.learner.copy(agent.best.state)
-    agent._drop_rollout()
+    agent.drop_rollout()
 
 
-def record_episode(agent: Agent, episode: Episode) -> None:
+def record_episode(agent: BaseAgent, episode: Episode) -> None:
     """Adds an episode to the history and to the windows."""
     agent.history.append(episode)
     agent.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
@@ -174,7 +311,7 @@ def record_episode(agent: Agent, episode: Episode) -> None:
         agent.ep_success_buffer.append(episode.success)
 
 
-def fill_windows(agent: Agent) -> None:
+def fill_windows(agent: BaseAgent) -> None:
     """Fills the windows from the history."""
     episodes = agent.history.last(agent.stats_window_size)
     agent.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
@@ -182,7 +319,7 @@ def fill_windows(agent: Agent) -> None:
     agent.ep_success_buffer.extend(successes[~np.isnan(successes)][-agent.stats_window_size :].tolist())
 
 
-def statistics_row(agent: Agent) -> dict[str, float]:
+def statistics_row(agent: BaseAgent) -> dict[str, float]:
     """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
     numbers: dict[str, float] = {}
     if agent.ep_info_buffer:
@@ -204,233 +341,3 @@ def statistics_row(agent: Agent) -> dict[str, float]:
     for key, value in (run.metrics or {}).items():
         numbers[f"train/{key}"] = float(value)
     return numbers
-
-
-TABLE_SECONDS = 2.0
-"""Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
-
-
-DETERMINISTIC = ("DDPG", "TD3")
-"""Algorithms whose policy for continuous actions does not explore by itself."""
-
-
-class Company(NamedTuple):
-    """Who is called in the course of a ``learn``, turn by turn and in this order."""
-
-    outputs: Sequence[Sink]
-    """Where rows of statistics go."""
-    callbacks: Sequence[Callback]
-    """Functions of ``(agent, progress)``."""
-    hooks: Hooks
-    """Callbacks with hooks."""
-    savers: Sequence[Checkpoint]
-    """Checkpoints; last, so that they hold what the others did."""
-
-
-def begin(
-    agent: Agent,
-    total_timesteps: int | None,
-    episodes: int | None,
-    minutes: float | None,
-    log_interval: int,
-    reset_num_timesteps: bool,
-) -> Call:
-    """Returns what ``learn`` is to do, and readies the agent's counters and environments for it.
-
-    Raises:
-        ValueError: without an environment; if no limit is given and there is no ``learn`` to go on with.
-    """
-    run = agent.run
-    if run.env is None:
-        raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
-    goes_on = total_timesteps is None and minutes is None and episodes is None
-    if goes_on:
-        call = cut_off(agent)
-    else:
-        n_steps = None if total_timesteps is None else whole("total_timesteps", total_timesteps, least=1)
-        n_episodes = None if episodes is None else whole("episodes", episodes, least=1)
-        seconds = None if minutes is None else 60 * number("minutes", minutes, above=0)
-        if reset_num_timesteps:
-            agent._steps_before, agent._episodes_before = run.step, run.episode
-            agent._seconds_before = run.seconds["total"]
-        call = Call(
-            n_steps,
-            n_episodes,
-            seconds,
-            first_step=run.step,
-            first_episode=run.episode,
-            log_interval=log_interval,
-            logged=len(agent.history),
-            steps_before=run.step - agent._steps_before,
-            episodes_before=run.episode - agent._episodes_before,
-            seconds_before=run.seconds["total"] - agent._seconds_before,
-        )
-    if run.env.venv is not None and (reset_num_timesteps or goes_on):  # may have been stepped by hand since
-        run.obs = run.action = None
-    return call
-
-
-def cut_off(agent: Agent) -> Call:
-    """Returns the ``learn`` that a resumed agent was in when it was saved.
-
-    Raises:
-        ValueError: if there is none, or if it is complete.
-    """
-    call = agent._call if agent.resumed is not None else None
-    if call is None:
-        raise ValueError("learn needs total_timesteps, episodes or minutes (or an agent from resume(), to go on with)")
-    if call.is_over(agent.run.step, agent.run.episode):
-        raise ValueError(
-            "the run is complete; to train on, say how long: total_timesteps (--steps), episodes or minutes (--minutes)"
-        )
-    return call
-
-
-def carry_out(
-    agent: Agent,
-    call: Call,
-    callback: Any,
-    tb_log_name: str | None,
-    progress_bar: bool,
-    sinks: Iterable[Sink],
-    arguments: dict[str, Any],
-) -> None:
-    """Trains as ``call`` says.
-
-    Args:
-        agent: which learns.
-        call: for how long.
-        callback: as for ``learn``, as the next three.
-        tb_log_name: see there.
-        progress_bar: see there.
-        sinks: see there.
-        arguments: of ``learn``, that callbacks with hooks are told.
-    """
-    warn_without_noise(agent)
-    hooks, callbacks = told_apart(callback)
-    savers = [one for one in callbacks if isinstance(one, Checkpoint)]
-    callbacks = [one for one in callbacks if not isinstance(one, Checkpoint)]
-    agent._call = call
-    agent._callbacks = [one for one in (*callbacks, hooks.callback) if hasattr(one, "state_dict")]
-    agent.failed_writes.forget_written()
-    with ExitStack() as held:
-        held.callback(agent.failed_writes.warn)
-        outputs = open_outputs(agent, sinks, tb_log_name, held)
-        if progress_bar:
-            from rejeu.callbacks import ProgressBar
-
-            taken = agent.run.step - call.first_step
-            bar = ProgressBar(call.n_steps, call.seconds, taken=taken, spent=call.spent)
-            held.callback(bar.close)
-            callbacks.append(bar)
-        agent.interrupted, agent.interrupted_by = False, None
-        agent.run.success_threshold = agent.success_threshold
-        held.callback(_stop, agent, agent.logger.outputs)
-        agent.logger.outputs, agent._learning = [*outputs], True
-        for saver in savers:
-            held.enter_context(saver.held(agent))
-        remaining = None if call.last_step is None else call.last_step - agent.run.step
-        hooks.begin(agent, remaining, arguments)
-        saved, agent._saved_callbacks = agent._saved_callbacks, None
-        if saved is not None:
-            restore_callbacks(agent._callbacks, saved)
-        try:
-            with Interrupt() as interrupt:
-                iterate(agent, call, Company(outputs, callbacks, hooks, savers), interrupt)
-            agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal  # after the last turn, too
-            finite.settle(agent)
-        except finite.Broken as broken:
-            raise finite.reported(agent, broken) from None
-        except NonFiniteError:
-            raise
-        except Exception as error:
-            for saver in savers:
-                saver.save_after(error, agent)
-            raise
-        hooks.end()
-        for saver in savers:
-            saver.attempt(agent)
-        agent.failed_writes.retry()
-
-
-def warn_without_noise(agent: Agent) -> None:
-    """Warns, at the beginning of a run, if its policy is deterministic and nothing makes it try other actions."""
-    deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
-    if deterministic and agent._noise() is None and agent.run.step == 0:
-        warnings.warn(
-            f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
-            f"learning_starts={agent.config.learning_starts} it tries nothing new; set action_noise=0.1 (--set "
-            "action_noise=0.1), 'ou(0.2)' or ParameterNoise()",
-            UserWarning,
-            stacklevel=4,
-        )
-
-
-def open_outputs(
-    agent: Agent, sinks: Iterable[Sink], tb_log_name: str | None, held: ExitStack
-) -> Sequence[RetryingSink]:
-    """Returns where rows of statistics go; ``held`` closes those that are opened here."""
-    loggers = agent.logger.outputs
-    outputs: list[Sink] = [*sinks, *loggers]
-    if agent.verbose and not loggers:
-        console = Console(TABLE_SECONDS)
-        held.callback(console.close)
-        outputs.append(console)
-    if agent.tensorboard_log is not None and not loggers:
-        tensorboard = TensorBoard(next_folder(agent.tensorboard_log, tb_log_name or agent.name))
-        held.callback(tensorboard.close)
-        outputs.append(tensorboard)
-    return [RetryingSink(output, agent.failed_writes) for output in outputs]
-
-
-def _stop(agent: Agent, loggers: list[Sink]) -> None:
-    """Gives back what ``learn`` held, however it ended."""
-    agent.logger.outputs, agent._learning = loggers, False
-
-
-def iterate(agent: Agent, call: Call, company: Company, interrupt: Interrupt) -> None:
-    """Trains until a limit is reached, a callback says so or Ctrl-C is pressed."""
-    run, first = agent.run, agent.run.step
-    remaining = None if call.last_step is None else call.last_step - first
-    for turn in agent._turns(remaining, lambda taken: call.progress(first + taken, run.episode)):
-        agent.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
-        for episode in turn.episodes:
-            record_episode(agent, episode)
-        if len(agent.history) - call.logged >= call.log_interval and company.outputs:
-            call.logged = len(agent.history)
-            row = agent.statistics() | agent.logger.take()
-            for output in company.outputs:
-                output.write(agent.num_timesteps, row)
-        if turn.episodes:
-            note_training_return(agent, len(turn.episodes))
-        answers = [callback(agent, turn) for callback in company.callbacks]
-        answers.append(company.hooks.step(agent, turn, run.obs))
-        for saver in company.savers:
-            saver(agent, turn)
-        agent.failed_writes.retry_if_due()
-        agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
-        refused = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
-        if refused or agent.interrupted or call.is_over(turn.step, run.episode):
-            break
-
-
-def restore_callbacks(callbacks: Sequence[Any], saved: Sequence[Any]) -> None:
-    """Gives callbacks what those of the same kind remembered when the run was saved, in order.
-
-    Those for which nothing was saved begin anew, with a warning, and what was saved for others is passed over likewise.
-    """
-    left = [(name, state) for name, state in saved]
-    for one in callbacks:
-        name = type(one).__name__
-        match = next((entry for entry in left if entry[0] == name), None)
-        if match is None:
-            warnings.warn(f"the run was saved without a {name}; it begins anew", UserWarning, stacklevel=4)
-            continue
-        left.remove(match)
-        try:
-            one.load_state_dict(match[1])
-        except WRONG as error:
-            raise CheckpointError(f"what {name} remembered is damaged: {brief(error)}") from error
-    if left:
-        names = ", ".join(name for name, _ in left)
-        warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=4)

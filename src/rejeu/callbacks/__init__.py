@@ -5,7 +5,8 @@ A callback is anything that ``agent.learn`` can call after every step of the env
 whatever the number of environments.
 """
 
-from rejeu.agents.run_files import Checkpoint
+from rejeu.callbacks.base import Callback, TrainingCallback
+from rejeu.callbacks.checkpoint import Checkpoint
 from rejeu.callbacks.due import crossed, step_before
 from rejeu.callbacks.evaluate import EVALUATED, EVALUATION, Evaluate, Evaluated, better, merit
 from rejeu.callbacks.film import Film
@@ -27,11 +28,13 @@ __all__ = [
     "LINE_SECONDS",
     "RATE_SECONDS",
     "REFRESH_SECONDS",
+    "Callback",
     "Checkpoint",
     "Evaluate",
     "Evaluated",
     "Film",
     "ProgressBar",
+    "TrainingCallback",
     "better",
     "crossed",
     "duration",

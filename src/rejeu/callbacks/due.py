@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from rejeu.callbacks.base import TrainedAgent
 from rejeu.loops.run import Progress
-
-if TYPE_CHECKING:
-    from rejeu.agents import Agent
 
 
 def crossed(before: int, now: int, every: int) -> bool:
@@ -19,7 +15,7 @@ def crossed(before: int, now: int, every: int) -> bool:
     return now // every > before // every
 
 
-def step_before(agent: Agent, progress: Progress, n_steps: int | None = None) -> int:
+def step_before(agent: TrainedAgent, progress: Progress, n_steps: int | None = None) -> int:
     """Returns the step count before this first turn of a run that takes ``n_steps`` (None: more than one turn's)."""
     taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
     return max(progress.step - taken, 0)

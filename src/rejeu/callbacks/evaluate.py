@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
+from rejeu.callbacks.base import TrainedAgent
 from rejeu.callbacks.due import crossed, step_before
 from rejeu.envs.make import VectorEnv, make_vector
 from rejeu.loops.run import Progress
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.validation import whole
-
-if TYPE_CHECKING:
-    from rejeu.agents import Agent
 
 EVALUATED = ("returns", "lengths", "successes")
 """The arrays of an :class:`Evaluation`."""
@@ -79,14 +77,14 @@ class Evaluate:
         self.seed = seed
         self._last_step: int | None = None
 
-    def __call__(self, agent: Agent, progress: Progress) -> None:
+    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
         """Evaluates if an evaluation has fallen due in this step."""
         before = step_before(agent, progress) if self._last_step is None else self._last_step
         self._last_step = progress.step
         if crossed(before, progress.step, self.every):
             self.run(agent, progress.step)
 
-    def run(self, agent: Agent, step: int) -> Evaluated:
+    def run(self, agent: TrainedAgent, step: int) -> Evaluated:
         """Evaluates now, whatever ``every`` says, and returns the result, which is also kept.
 
         Raises:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 
+from rejeu.callbacks.base import TrainedAgent
 from rejeu.callbacks.due import crossed, step_before
 from rejeu.loops.run import Progress
 from rejeu.validation import whole
-
-if TYPE_CHECKING:
-    from rejeu.agents import Agent
 
 DIGITS = 9
 """Of the step in the name of a film."""
@@ -65,7 +63,7 @@ class Film:
         self._last_step: int | None = None
         self._n_episodes = 0
 
-    def __call__(self, agent: Agent, progress: Progress) -> None:
+    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
         """Films if that has fallen due in this step."""
         before = step_before(agent, progress) if self._last_step is None else self._last_step
         self._last_step = progress.step

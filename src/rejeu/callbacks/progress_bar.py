@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
+from rejeu.callbacks.base import TrainedAgent, TrainingCallback
 from rejeu.callbacks.due import step_before
 from rejeu.loops.run import Progress, time_shares
 from rejeu.reporting.notebook import Display
@@ -15,7 +16,6 @@ from rejeu.reporting.notebook import Display
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from rejeu.agents import Agent
 
 REFRESH_SECONDS = 0.125
 """Least time between two refreshes of the progress bar on a terminal."""
@@ -40,7 +40,7 @@ class _Mark(NamedTuple):
     """See :attr:`Agent.seconds`."""
 
 
-class ProgressBar:
+class ProgressBar(TrainingCallback):
     """Shows how far training has come; on a terminal and in a notebook as a bar, elsewhere as a line every ten seconds.
 
     Beneath the bar, or at the end of the line, stands what the time went into: the environment's steps and resets, the replay
@@ -83,11 +83,11 @@ class ProgressBar:
         self._refresh_at = 0.0
         self._taken, self._spent = taken, spent
         self._first_step = 0
-        self._latest: tuple[Agent, int] | None = None
+        self._latest: tuple[TrainedAgent, int] | None = None
         self._shown_step = -1
         self._marks: deque[_Mark] = deque()
 
-    def __call__(self, agent: Agent, progress: Progress) -> None:
+    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
         """Takes note of the step, and shows it if the last refresh is long enough ago."""
         now = time.perf_counter()
         if self._latest is None:
@@ -95,6 +95,10 @@ class ProgressBar:
         self._latest = agent, progress.step
         if now >= self._refresh_at:
             self._refresh(agent, progress.step, now)
+
+    def after_training(self, agent: TrainedAgent, error: BaseException | None) -> None:
+        """Closes it."""
+        self.close()
 
     def close(self) -> None:
         """Shows where the run ended and gives the terminal back."""
@@ -106,7 +110,7 @@ class ProgressBar:
         if self._animated:
             self._bar.stop()
 
-    def _start(self, agent: Agent, progress: Progress, now: float) -> None:
+    def _start(self, agent: TrainedAgent, progress: Progress, now: float) -> None:
         before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
         self._first_step = before - self._taken
         self._marks.append(_Mark(self._began, before, agent.seconds))
@@ -115,7 +119,7 @@ class ProgressBar:
         elif self._display is None:
             self._refresh_at = now + LINE_SECONDS
 
-    def _refresh(self, agent: Agent, step: int, now: float) -> None:
+    def _refresh(self, agent: TrainedAgent, step: int, now: float) -> None:
         self._shown_step = step
         self._refresh_at = now + self._period
         self._marks.append(_Mark(now, step, agent.seconds))

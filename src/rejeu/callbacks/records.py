@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from rejeu.callbacks.base import TrainedAgent
 from rejeu.loops.run import Progress
 
-if TYPE_CHECKING:
-    from rejeu.agents import Agent
 
-
-def print_records(agent: Agent, progress: Progress) -> None:
+def print_records(agent: TrainedAgent, progress: Progress) -> None:
     """Prints a line for every record: an episode that returned more than all before it in the agent's history.
 
     Give it to ``learn`` as a callback. ``agent.history.records()`` returns the same episodes.

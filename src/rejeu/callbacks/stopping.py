@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rejeu.callbacks.base import Callback, TrainedAgent
 from rejeu.loops.run import Episode, Progress
 from rejeu.validation import whole
-
-if TYPE_CHECKING:
-    from rejeu.agents import Agent, Callback
 
 
 def stop_on_return(threshold: float, episodes: int = 100) -> Callback:
@@ -41,7 +38,7 @@ def stop_on_success(rate: float, episodes: int = 100) -> Callback:
 def _stop_on_mean(least: float, episodes: int, value: Callable[[Episode], float]) -> Callback:
     whole("episodes", episodes, least=1)
 
-    def stop(agent: Agent, progress: Progress) -> bool:
+    def stop(agent: TrainedAgent, progress: Progress) -> bool:
         last = agent.history.last(episodes) if progress.episodes else []
         return not (len(last) == episodes and np.mean([value(episode) for episode in last]) >= least)
 

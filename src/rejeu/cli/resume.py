@@ -54,8 +54,8 @@ def choose_limits(agent: Agent, arguments: Resume) -> Limits:
                 "--steps N, or --minutes M"
             )
         return Limits(steps, minutes)
-    assert agent._call is not None
-    last = agent._call.last_step
+    assert agent.training_call is not None
+    last = agent.training_call.last_step
     if steps is not None and last is not None and agent.run.step + steps > last:
         return Limits(steps)
     return Limits(pause_steps=steps, pause_minutes=minutes)

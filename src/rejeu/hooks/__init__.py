@@ -11,7 +11,7 @@ called.
 """
 
 from rejeu.hooks.base import BaseCallback, CallbackList, ConvertCallback, EventCallback, hooked
-from rejeu.hooks.calling import Hooks, infos_of, told_apart
+from rejeu.hooks.calling import infos_of
 from rejeu.hooks.evaluation import EvalCallback, StopTrainingOnNoModelImprovement, StopTrainingOnRewardThreshold
 from rejeu.hooks.ready_made import (
     CheckpointCallback,
@@ -28,12 +28,10 @@ __all__ = [
     "EvalCallback",
     "EventCallback",
     "EveryNTimesteps",
-    "Hooks",
     "ProgressBarCallback",
     "StopTrainingOnMaxEpisodes",
     "StopTrainingOnNoModelImprovement",
     "StopTrainingOnRewardThreshold",
     "hooked",
     "infos_of",
-    "told_apart",
 ]

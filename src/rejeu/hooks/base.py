@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from rejeu.callbacks.base import TrainingCallback
+from rejeu.hooks.calling import infos_of
+from rejeu.loops.run import Progress
 from rejeu.reporting.logging import Logger
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 
@@ -13,7 +16,7 @@ if TYPE_CHECKING:
     from rejeu.agents import Agent
 
 
-class BaseCallback(ABC):
+class BaseCallback(TrainingCallback):
     """What ``learn`` calls while it trains. Abstract: an heir defines ``_on_step``.
 
     Args:
@@ -46,6 +49,51 @@ class BaseCallback(ABC):
         self.globals: dict[str, Any] = {}
         self.parent: BaseCallback | None = None
         """What calls it, where that is a callback itself."""
+
+    def before_training(self, agent: Agent) -> None:
+        """Calls ``init_callback``, ``on_training_start`` and ``on_rollout_start``."""
+        call = agent.training_call
+        assert call is not None
+        self.init_callback(agent)
+        known = {
+            "self": agent,
+            "env": agent.get_env(),
+            "callback": self,
+            "total_timesteps": None if call.last_step is None else call.last_step - agent.run.step,
+            "log_interval": call.log_interval,
+            "reset_num_timesteps": call.steps_before == 0,
+        }
+        self.on_training_start(known, globals())
+        self.on_rollout_start()
+
+    def __call__(self, agent: Agent, progress: Progress) -> bool:
+        """Calls ``update_locals``, ``on_step`` and, around an update, ``on_rollout_end`` and ``on_rollout_start``."""
+        call, result = agent.training_call, progress.result
+        assert call is not None
+        assert result is not None
+        self.update_locals(
+            {
+                "progress": progress,
+                "actions": progress.action,
+                "new_obs": agent.run.obs,
+                "rewards": result.reward,
+                "dones": result.terminated | result.truncated,
+                "infos": infos_of(agent, progress),
+            }
+        )
+        if not self.on_step():
+            return False
+        is_last = call.last_step is not None and progress.step >= call.last_step
+        if progress.rollout_ended or is_last:
+            self.on_rollout_end()
+            if not is_last:
+                self.on_rollout_start()
+        return True
+
+    def after_training(self, agent: Agent, error: BaseException | None) -> None:
+        """Calls ``on_training_end``, unless an exception ended training."""
+        if error is None:
+            self.on_training_end()
 
     @property
     def training_env(self) -> VecEnv:
@@ -109,26 +157,26 @@ class BaseCallback(ABC):
         self.locals.update(locals_)
         self.update_child_locals(locals_)
 
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:  # noqa: B027 - a hook, empty by intention
+    def update_child_locals(self, locals_: dict[str, Any]) -> None:
         """Hands that on to what it calls."""
 
-    def _init_callback(self) -> None:  # noqa: B027
+    def _init_callback(self) -> None:
         """For heirs: once the agent is known."""
 
-    def _on_training_start(self) -> None:  # noqa: B027
+    def _on_training_start(self) -> None:
         """For heirs: before the first step."""
 
-    def _on_rollout_start(self) -> None:  # noqa: B027
+    def _on_rollout_start(self) -> None:
         """For heirs: before the first step after an update."""
 
     @abstractmethod
     def _on_step(self) -> bool:
         """For heirs: after each step of the environments; returns whether to go on."""
 
-    def _on_rollout_end(self) -> None:  # noqa: B027
+    def _on_rollout_end(self) -> None:
         """For heirs: after the last step before an update."""
 
-    def _on_training_end(self) -> None:  # noqa: B027
+    def _on_training_end(self) -> None:
         """For heirs: after the last step."""
 
 

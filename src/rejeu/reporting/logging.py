@@ -213,7 +213,8 @@ class Logger:
         self.outputs = list(output_formats)
         self.name_to_value: dict[str, float] = {}
         """What was recorded since the last row."""
-        self._counts: dict[str, int] = {}
+        self.name_to_count: dict[str, int] = {}
+        """How many numbers the means among them are of."""
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
         """Adds a number to the next row, in place of one of that name.
@@ -232,13 +233,13 @@ class Logger:
         """Does the same with the mean of what was given under that name since the last row; None is passed over."""
         if value is None:
             return
-        n = self._counts[key] = self._counts.get(key, 0) + 1
+        n = self.name_to_count[key] = self.name_to_count.get(key, 0) + 1
         mean = self.name_to_value.get(key, 0.0)
         self.name_to_value[key] = mean + (_number(key, value) - mean) / n
 
     def take(self) -> dict[str, float]:
         """Returns what was recorded, and forgets it."""
-        taken, self.name_to_value, self._counts = self.name_to_value, {}, {}
+        taken, self.name_to_value, self.name_to_count = self.name_to_value, {}, {}
         return taken
 
     def dump(self, step: int = 0) -> None:

@@ -1,0 +1,100 @@
+"""Callbacks: functions of ``(agent, progress)``, and objects that are also told when training starts and ends."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from rejeu.envs.base import VectorEnv
+from rejeu.io.failed_writes import FailedWrites
+from rejeu.loops.run import Progress, Run
+from rejeu.loops.training_call import TrainingCall
+from rejeu.reporting.evaluation import Evaluation
+from rejeu.reporting.history import History
+
+Callback = Callable[[Any, Progress], bool | None]
+"""Called after every step of the environments as ``callback(agent, progress)``. Only ``False`` stops training."""
+
+
+class TrainingCallback(ABC):
+    """A callback that is also told when training starts and ends. Abstract: subclasses define ``__call__``."""
+
+    runs_last: ClassVar[bool] = False
+    """Whether it is called after all others. A checkpoint is, so that it contains what they did."""
+
+    def before_training(self, agent: Any) -> None:  # noqa: B027 - optional
+        """Called by ``learn`` before the first step; ``agent.training_call`` has its limits."""
+
+    @abstractmethod
+    def __call__(self, agent: Any, progress: Progress) -> bool | None:
+        """Called after every step of the environments; ``False`` stops training."""
+
+    def after_training(self, agent: Any, error: BaseException | None) -> None:  # noqa: B027 - optional
+        """Called by ``learn`` at its end; ``error`` is the exception that ended it, None if there is none."""
+
+
+@runtime_checkable
+class Stateful(Protocol):
+    """A callback whose state a checkpoint contains."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns its state: numbers, strings, lists, dicts and arrays."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+
+
+class RunFolder(Protocol):
+    """The folder of the checkpoints of a run."""
+
+    def open(self) -> None:
+        """Locks the folder for this process, after a check that it belongs to this run."""
+
+    def close(self) -> None:
+        """Releases the lock."""
+
+    def is_empty(self) -> bool:
+        """Returns whether it contains no checkpoint."""
+
+    def save(self, keep: int, reason: str = "") -> Path:
+        """Writes a checkpoint, deletes all but the newest ``keep``, and returns its path."""
+
+
+class TrainedAgent(Protocol):
+    """What the callbacks of this package use of an agent."""
+
+    run: Run
+    history: History
+    seed: int
+    failed_writes: FailedWrites
+    ep_info_buffer: deque[dict[str, float]]
+    """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
+    ep_success_buffer: deque[float]
+    training_call: TrainingCall | None
+
+    @property
+    def env(self) -> VectorEnv | None:
+        """The environments it trains on."""
+
+    @property
+    def n_envs(self) -> int:
+        """How many these are."""
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall time spent training, by what it was spent on."""
+
+    def evaluate(self, episodes: int | None = None, env: Any = None, *, seed: int | None = None) -> Evaluation:
+        """Plays whole episodes and returns their returns, lengths and successes."""
+
+    def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
+        """Keeps the present weights if ``score`` is the best so far."""
+
+    def snapshot(self, path: str | Path) -> Callable[[], Path]:
+        """Returns a function that saves the model as it is now."""
+
+    def run_folder(self, folder: str | Path) -> RunFolder:
+        """Returns the folder of its checkpoints."""
