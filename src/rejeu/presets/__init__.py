@@ -13,7 +13,8 @@ from rejeu.presets.result import Result, find_result, results
 ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PRESETS, *ball.PRESETS, *robotics.PRESETS)
 """Every preset of rejeu. The first one of an environment is the one that ``rejeu train`` uses."""
 
-_registered: dict[str, tuple[Preset, ...]] = {}
+registered: dict[str, tuple[Preset, ...]] = {}
+"""Presets of algorithms that are not rejeu's, by the name of the algorithm; see :func:`register`."""
 
 ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "MultiBinary": "PPO"}
 """The default algorithm of an environment without a preset, by the class of its action space."""
@@ -21,12 +22,12 @@ ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "Multi
 
 def register(algorithm: str, presets: tuple[Preset, ...]) -> None:
     """Adds presets of an algorithm that is not rejeu's; see :func:`rejeu.register`."""
-    _registered[algorithm] = presets
+    registered[algorithm] = presets
 
 
 def every() -> tuple[Preset, ...]:
     """Returns the presets of rejeu, and after them those that were registered."""
-    return (*ALL, *(preset for presets in _registered.values() for preset in presets))
+    return (*ALL, *(preset for presets in registered.values() for preset in presets))
 
 
 def default(env_id: str, algorithm: str) -> Preset:
