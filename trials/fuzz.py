@@ -349,7 +349,7 @@ def header_reader(path: Path) -> Callable[[], None]:
     def read() -> None:
         header = checkpoint.read_header(path, "agent")
         kind = agents.AGENTS.get(str(header.get("algorithm")), agents.SAC)
-        model_files.interpret(header, path.stat().st_size, kind.algorithm.Config, {}, {})
+        model_files.interpret(header, path.stat().st_size, kind.algorithm.Config, {})
 
     return read
 

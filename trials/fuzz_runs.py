@@ -249,7 +249,7 @@ def share_compiled() -> None:
 
     build, kept = Agent.build, {}
 
-    def build_once(self: Agent, observation_space: Any, action_space: Any, n_envs: int) -> None:
+    def build_once(self: Agent, observation_space: Any, action_space: Any) -> None:
         described = [spaces.describe(observation_space), spaces.describe(action_space)]
         key = json.dumps([self.name, configs.to_json(self.config), described])
         if key in kept:
@@ -259,7 +259,7 @@ def share_compiled() -> None:
         if len(kept) > 200:
             kept.clear()
             jax.clear_caches()
-        build(self, observation_space, action_space, n_envs)
+        build(self, observation_space, action_space)
         kept[key] = self.learner
 
     Agent.build = build_once  # type: ignore[method-assign]
