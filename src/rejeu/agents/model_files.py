@@ -156,9 +156,10 @@ def check_sizes(config: Any, room: int) -> None:
     widths = {key: value for key, value in vars(policy).items() if isinstance(value, tuple)}
     numbers = {key: value for key, value in vars(policy).items() if type(value) is int}
     numbers |= {key: value for key, value in vars(config).items() if key in SIZES}
-    for key, layers in {**widths, "n_blocks": range(policy.n_blocks)}.items():
-        if len(layers) > MAX_LAYERS:
-            raise CheckpointError(f"{key} has {len(layers)} layers, expected {MAX_LAYERS} at most")
+    depths = {key: len(layers) for key, layers in widths.items()}
+    for key, depth in {**depths, "n_blocks": policy.n_blocks}.items():
+        if depth > MAX_LAYERS:
+            raise CheckpointError(f"{key} has {depth} layers, expected {MAX_LAYERS} at most")
     for key, value in [*numbers.items(), *((key, max(layers, default=0)) for key, layers in widths.items())]:
         if value > largest:
             raise CheckpointError(f"{key}={value} is larger than all that the file holds; it has other networks")
