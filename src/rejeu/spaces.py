@@ -416,8 +416,8 @@ class MultiBinaryRecord(msgspec.Struct):
 def _rebuild(description: Any, check: Callable[[int], None], depth: int = 0) -> spaces.Space:
     """Returns the space; ``check`` is called with the size of each array before it is made."""
     ((kind, body),) = description.items()
-    if depth > MAX_DEPTH:
-        raise ValueError(f"nested more than {MAX_DEPTH} deep")
+    if depth > MAX_DEPTH or len(body) > MAX_LEAVES:
+        raise ValueError(f"nested more than {MAX_DEPTH} deep, or more than {MAX_LEAVES} parts")
     if kind == "Dict":
         return spaces.Dict({key: _rebuild(part, check, depth + 1) for key, part in body.items()})
     if kind == "Tuple":
