@@ -15,6 +15,7 @@ from rejeu.reporting.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv
 from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
+from tests.tiers import crossed
 
 NEVER = 10**6
 """``learning_starts`` of agents that only act at random."""
@@ -143,8 +144,10 @@ def test_callbacks_after_one_that_evaluated_see_observations_of_new_episodes():
     assert [obs[:2] for obs in seen] == [[0, 1], [0, 2], [2, 0], [2, 1]]
 
 
-@pytest.mark.parametrize("env", [lambda: gym.make("Pendulum-v1"), lambda: make_vector("Pendulum-v1", 1, "envpool")])
-@pytest.mark.parametrize("kind", ["SAC", "PPO"])
+@pytest.mark.parametrize(
+    ("kind", "env"),
+    crossed(["SAC", "PPO"], [lambda: gym.make("Pendulum-v1"), lambda: make_vector("Pendulum-v1", 1, "envpool")]),
+)
 def test_a_checkpoint_right_after_an_evaluation_is_resumed_exactly(tmp_path, kind, env):
     def make(env):
         if kind == "SAC":

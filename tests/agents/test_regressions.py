@@ -146,6 +146,7 @@ from tests.environments import Counter, Reach, Sampled
 from tests.every_agent import KINDS, env_of, shared_functions, small
 from tests.helpers import assert_same_parameters, count_updates, small_sac
 from tests.reporting.test_video import Lamp
+from tests.tiers import only
 
 NEVER = 10**6
 HERE = Path(__file__).parents[1]
@@ -319,7 +320,7 @@ def test_settings_are_the_same_after_any_number_of_savings(name, tmp_path):
 # Numbers of environments.
 
 
-@every_algorithm
+@pytest.mark.parametrize("kind", only([KINDS["SAC"], KINDS["DQN"]], KINDS.values()), ids=KINDS)
 def test_a_loaded_agent_learns_with_any_number_of_environments(kind, tmp_path):
     make = lambda n: InProcess([env_of(kind) for _ in range(n)])  # noqa: E731
     path = small(kind, make(3), learning_starts=16, train_freq=8).learn(40).save(tmp_path / "model")

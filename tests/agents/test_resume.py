@@ -30,6 +30,7 @@ from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
 from tests.every_agent import KINDS
 from tests.helpers import small_sac
+from tests.tiers import only
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 3}
 OFF = {**SMALL, "learning_starts": 20, "batch_size": 8, "buffer_size": 90}
@@ -69,6 +70,13 @@ CASES = {
     "A2C": ("A2C", vector("MountainCar-v0"), {**SMALL, "n_steps": 5}),
     "RecurrentPPO": ("RecurrentPPO", vector("rejeu/CartPoleNoVelocity-v0"), {**SMALL, "n_steps": 16, "batch_size": 16}),
 }
+
+DEFAULT_CASES = {
+    *("SAC", "DDPG, Discrete", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO, normalised", "A2C", "RecurrentPPO"),
+    *("priorities, n steps", "episodes", "normalised", "EnvPool", "worker processes", "EnvPool, whole episodes"),
+    next(case for case in CASES if case.endswith(" noise")),
+}
+"""Each algorithm, backend and kind of loop once; the others are exhaustive."""
 
 
 def facts(agent):
@@ -117,7 +125,7 @@ def compiled_once():
         yield
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", only(DEFAULT_CASES, CASES))
 def test_a_run_that_is_cut_off_goes_on_as_if_it_had_not_been(case, tmp_path):
     name, make_env, settings = CASES[case]
     n, cut = 230, 107

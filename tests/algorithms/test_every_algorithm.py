@@ -11,6 +11,7 @@ from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Probe
 from tests.every_agent import KINDS, LEARNING, env_of, shared_functions, small
 from tests.helpers import assert_same_parameters, same_parameters
+from tests.tiers import crossed, only
 
 every_algorithm = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 OBS = np.linspace(-1.0, 1.0, 7, dtype=np.float32)[:, None]
@@ -50,10 +51,10 @@ def changed(before, after):
     }
 
 
-@every_algorithm
-@pytest.mark.parametrize("n_envs", [1, 3, 8])
-def test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe(kind, n_envs):
-    """45 steps, of which 29 are learnt from, once every 8."""
+@pytest.mark.parametrize(("name", "n_envs"), crossed(list(KINDS), [1, 3, 8]))
+def test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe(name, n_envs):
+    """45 steps, of which 29 are learned from, once every 8."""
+    kind = KINDS[name]
     agent = small(kind, wanderers(kind, n_envs), learning_starts=16, train_freq=8).learn(45)
     assert agent.num_timesteps == agent.replay_buffer.size() == 45
     assert agent.n_updates == int(agent.state.n_updates) == 3
@@ -154,7 +155,7 @@ def assert_precise(agent):
     assert all(Precise.action_space.contains(one) for one in action)
 
 
-@every_algorithm
+@pytest.mark.parametrize("kind", only([KINDS["SAC"], KINDS["CrossQ"], KINDS["DQN"]], KINDS.values()), ids=KINDS)
 def test_batches_of_one_transition_are_learnt_from(kind):
     agent = small(kind, wanderers(kind, 1), learning_starts=16, batch_size=1)
     before = networks(agent)

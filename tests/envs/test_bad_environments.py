@@ -23,6 +23,7 @@ from rejeu.loops.run import check_finite
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac
+from tests.tiers import crossed
 
 ENDING = [name for name, fault in EVERY.items() if fault.trained is not None]
 GOING_ON = [name for name, fault in EVERY.items() if fault.trained is None]
@@ -86,8 +87,7 @@ BACKENDS = {
 }
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", ENDING)
+@pytest.mark.parametrize(("name", "backend"), crossed(list(ENDING), list(BACKENDS)))
 def test_a_fault_that_nobody_looked_for_is_explained(name, backend):
     fault = EVERY[name]
     if name == "nan seen" and backend == "self-resetting":
@@ -100,8 +100,7 @@ def test_a_fault_that_nobody_looked_for_is_explained(name, backend):
         assert re.search(SEEN, str(caught.value)), str(caught.value)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", [name for name in GOING_ON if name != "endless"])
+@pytest.mark.parametrize(("name", "backend"), crossed([name for name in GOING_ON if name != "endless"], list(BACKENDS)))
 def test_a_fault_that_can_be_mended_or_borne_does_not_end_a_run(name, backend):
     if name == "folded in info" and backend == "self-resetting":
         pytest.skip("the info is what such a vector says of time limits")

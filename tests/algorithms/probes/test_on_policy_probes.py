@@ -7,10 +7,16 @@ import pytest
 
 from tests.algorithms.probes.environments import BySight, BySightAndAction, Constant, Cut, CutByLimit, Endless, Later
 from tests.on_policy_agents import KINDS
+from tests.tiers import crossed, only
 
 GAMMA = 0.5
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+some_kinds = pytest.mark.parametrize(
+    "kind", only([KINDS["PPO, Box"], KINDS["A2C, Discrete"]], KINDS.values()), ids=KINDS
+)
 both_algorithms = pytest.mark.parametrize("kind", [KINDS["PPO, Discrete"], KINDS["A2C, Box"]], ids=["PPO", "A2C"])
+
+algorithms_and_numbers = pytest.mark.parametrize(("name", "n_envs"), crossed(["PPO, Discrete", "A2C, Box"], [1, 3, 8]))
 
 
 def solve(kind, probe, steps=800, n_envs=1):
@@ -26,28 +32,26 @@ def test_the_value_is_a_constant(kind):
     assert values(solve(kind, Constant), [0.0]) == pytest.approx([1.0], abs=0.05)
 
 
-@every_kind
+@some_kinds
 def test_the_value_uses_the_observation(kind):
     assert values(solve(kind, BySight), [-1.0, 1.0]) == pytest.approx([-1.0, 1.0], abs=0.08)
 
 
-@every_kind
+@some_kinds
 def test_the_value_discounts_what_comes_later(kind):
     assert values(solve(kind, Later), [0.0, 1.0]) == pytest.approx([GAMMA, 1.0], abs=0.05)
 
 
-@pytest.mark.parametrize("n_envs", [1, 3, 8])
-@both_algorithms
-def test_a_time_limit_bootstraps_from_the_state_it_was_reached_in(kind, n_envs):
+@algorithms_and_numbers
+def test_a_time_limit_bootstraps_from_the_state_it_was_reached_in(name, n_envs):
     """From what is seen next, in a new episode, it would be 1/3: gamma times the mean of both places' values."""
-    agent = solve(kind, CutByLimit, 800 * n_envs, n_envs)
+    agent = solve(KINDS[name], CutByLimit, 800 * n_envs, n_envs)
     assert values(agent, [-1.0, 1.0]) == pytest.approx([GAMMA, 1.0], abs=0.05)
 
 
-@pytest.mark.parametrize("n_envs", [1, 3, 8])
-@both_algorithms
-def test_a_terminal_state_is_worth_nothing(kind, n_envs):
-    assert values(solve(kind, Cut, 800 * n_envs, n_envs), [-1.0, 1.0]) == pytest.approx([0.0, 1.0], abs=0.05)
+@algorithms_and_numbers
+def test_a_terminal_state_is_worth_nothing(name, n_envs):
+    assert values(solve(KINDS[name], Cut, 800 * n_envs, n_envs), [-1.0, 1.0]) == pytest.approx([0.0, 1.0], abs=0.05)
 
 
 @both_algorithms
