@@ -1,4 +1,4 @@
-"""The record of a training run: one row an episode, as data and as a picture."""
+"""The training history: one row per episode, with a summary and a plot."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from rejeu.reporting.figures import Picture
 
 LAST_EPISODES = 20
-"""How many the representation sums up."""
+"""Number of episodes that ``repr`` averages."""
 COLUMNS = ("step", "env", "return", "length", "success", "seconds")
 
 
 class History:
-    """A growing table of episodes, 48 bytes each."""
+    """A table of episodes, 48 bytes each."""
 
     def __init__(self, episodes: Iterable[Episode] = ()) -> None:
         self._values = array("d")
         self._records = array("q")
-        """Rows of the episodes that returned more than all before them."""
+        """Rows of the episodes with a higher return than all before them."""
         self.best_return = -math.inf
         """The highest return of an episode; minus infinity before the first."""
         for episode in episodes:
@@ -48,7 +48,7 @@ class History:
             KeyError: for another name.
         """
         if column not in COLUMNS:
-            raise KeyError(f"{column!r} is no column; there are {', '.join(COLUMNS)}")
+            raise KeyError(f"{column!r} is not a column; expected one of {', '.join(COLUMNS)}")
         return np.array(self._values[COLUMNS.index(column) :: len(COLUMNS)], np.float64)
 
     def __repr__(self) -> str:
@@ -64,7 +64,7 @@ class History:
 
     @property
     def episodes(self) -> list[Episode]:
-        """All episodes, oldest first; a list made anew."""
+        """All episodes, oldest first; a new list."""
         return self.last(len(self))
 
     def last(self, n: int) -> list[Episode]:
@@ -72,7 +72,7 @@ class History:
         return [self._episode(row) for row in range(max(len(self) - n, 0), len(self))]
 
     def records(self) -> list[Episode]:
-        """Returns the episodes that returned more than all before them, oldest first; the first episode is one.
+        """Returns the episodes with a higher return than all before them, oldest first, including the first episode.
 
         >>> history = History(Episode(10 * i, 0, value, 10, math.nan, i) for i, value in enumerate([1.0, 5.0, 5.0, 7.0]))
         >>> [episode.episode_return for episode in history.records()]
@@ -82,7 +82,7 @@ class History:
 
     @property
     def record_rows(self) -> np.ndarray:
-        """Where in the table :meth:`records` stand, ``int64 (n_records,)``."""
+        """Rows of :meth:`records` in the table, ``int64 (n_records,)``."""
         return np.array(self._records, np.int64)
 
     def _episode(self, row: int) -> Episode:
@@ -91,7 +91,7 @@ class History:
         return Episode(int(step), int(env), value, int(length), success, seconds)
 
     def summary(self, window: int = 100) -> Summary:
-        """Returns what the run came to, over all episodes and over the last ``window``; printed, it is a small table.
+        """Returns a summary over all episodes and over the last ``window``; ``print`` shows it as a table.
 
         Raises:
             ValueError: if ``window`` is below 1.
@@ -99,7 +99,7 @@ class History:
         return Summary.of(self, whole("window", window, least=1))
 
     def append(self, episode: Episode) -> None:
-        """Adds one episode at the end."""
+        """Appends an episode."""
         if episode.episode_return > self.best_return:
             self.best_return = episode.episode_return
             self._records.append(len(self))
@@ -110,7 +110,7 @@ class History:
         return np.array(self._values, np.float64).reshape(-1, len(COLUMNS))
 
     def replace(self, table: np.ndarray) -> None:
-        """Puts what :meth:`table` returned in place of everything.
+        """Replaces all episodes by those of a table, as :meth:`table` returns it.
 
         Raises:
             ValueError: if it is no such table.
@@ -126,7 +126,7 @@ class History:
         self.best_return = float(best[-1])
 
     def moving_average(self, column: str = "return", window: int = 50) -> np.ndarray:
-        """Returns the mean of each value and up to ``window - 1`` before it, NaN left out, ``(n_episodes,)``."""
+        """Returns the mean of each value and up to ``window - 1`` values before it, ignoring NaN, ``(n_episodes,)``."""
         values = self[column]
         known = np.isfinite(values)
         sums = np.cumsum(np.where(known, values, 0.0))
@@ -136,7 +136,7 @@ class History:
         return sums / np.where(counts, counts, np.nan)
 
     def write_csv(self, path: str | Path) -> None:
-        """Writes the table with a header line; an older file is replaced only once the new one is complete."""
+        """Writes the table with a header line, atomically."""
         text = io.StringIO()
         writer = csv.writer(text)
         writer.writerow(COLUMNS)
@@ -145,7 +145,7 @@ class History:
             file.write(text.getvalue().encode())
 
     def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
-        """Returns a matplotlib figure of returns and, where known, success; a notebook shows it by itself.
+        """Returns a matplotlib figure of returns and, if known, success; notebooks display it.
 
         Args:
             path: of a file to write, whose suffix says the format; None for none.
@@ -166,10 +166,10 @@ class History:
 
 @dataclass(frozen=True)
 class Averages:
-    """What a number of episodes came to; NaN where there is none, or where nothing is known."""
+    """Averages over episodes; NaN if there are none, or if nothing is known."""
 
     n: int
-    """How many."""
+    """Number of episodes."""
     mean_return: float
     std_return: float
     """Standard deviation over episodes, dividing by n."""
@@ -177,11 +177,11 @@ class Averages:
     """In steps."""
     std_length: float
     success_rate: float
-    """Share of those that are known to have succeeded or not."""
+    """Share of successes among the episodes where success is known."""
 
     @classmethod
     def of(cls, returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray) -> Averages:
-        """Returns those of episodes, ``(n,)`` each."""
+        """Returns the averages of episodes, ``(n,)`` each."""
         if not len(returns):
             return cls(0, math.nan, math.nan, math.nan, math.nan, math.nan)
         known = successes[np.isfinite(successes)]
@@ -198,7 +198,7 @@ class Averages:
 
 @dataclass(frozen=True, repr=False)
 class Summary:
-    """What a run came to; ``print`` shows it as a table, and so do a notebook and the interactive interpreter."""
+    """Summary of a run; ``print`` and notebooks show it as a table."""
 
     steps: int
     """Environment steps taken when the last episode ended."""
@@ -207,15 +207,15 @@ class Summary:
     all: Averages
     """Over all episodes."""
     last: Averages
-    """Over the last ``window``, or all if there are fewer."""
+    """Over the last ``window`` episodes, or all if there are fewer."""
     records: int
-    """How many episodes returned more than all before them."""
+    """Number of episodes with a higher return than all before them."""
     best: Episode | None
-    """The episode of the highest return, the first of equals; None before the first."""
+    """The first episode with the highest return; None if there are no episodes."""
 
     @classmethod
     def of(cls, history: History, window: int) -> Summary:
-        """Returns that of a history; see :meth:`History.summary`."""
+        """Returns the summary of a history; see :meth:`History.summary`."""
         columns = [history[column] for column in ("return", "length", "success")]
         records = history.records()
         return cls(
