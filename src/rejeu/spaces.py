@@ -1,4 +1,4 @@
-"""What an algorithm needs to know of an environment's spaces: their leaves, their checks, the scaling of actions."""
+"""Observation and action spaces: leaves, checks, scaling of actions, and descriptions in JSON."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium import spaces
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
-LARGEST = 2**20
-"""Upper limit on the numbers and choices, together, of a space in a file, unless the file is itself large enough to hold
-networks for more: a damaged file must not exhaust the memory."""
+MAX_NUMBERS = 2**20
+"""Upper limit on the numbers and choices of a space in a file, unless the file is large enough to hold networks for more: a
+damaged file must not exhaust the memory."""
 MAX_LEAVES = 1024
 """Upper limit on the arrays of an observation in a file."""
 MAX_DEPTH = 32
@@ -27,21 +27,21 @@ class Leaf:
     """One array of an observation: static and hashable, so that a network can hold it."""
 
     path: str
-    """Where it sits in the observation, such as ``"camera.left"``; empty for a plain array."""
+    """Path in the observation, such as ``"camera.left"``; empty if the observation is an array."""
     kind: Literal["continuous", "image", "categorical", "binary"]
-    """How it is to be read; ``image`` is a uint8 array with three axes."""
+    """Meaning of the numbers; ``image`` is a uint8 array with three axes."""
     shape: tuple[int, ...]
     """Of one observation, without the batch axis."""
     dtype: str
-    """As stored and handed to the network: 64-bit numbers are halved."""
+    """As stored and passed to the network: 64-bit numbers become 32-bit."""
     sizes: tuple[int, ...] = ()
-    """For ``categorical``: how many values each component may take."""
+    """For ``categorical``: number of values of each component."""
     starts: tuple[int, ...] = ()
     """For ``categorical``: the smallest value of each component."""
 
     @property
     def n_features(self) -> int:
-        """Length of the vector that this leaf becomes when it is flattened and one-hot encoded."""
+        """Length of the leaf when it is flattened and one-hot encoded."""
         return sum(self.sizes) if self.kind == "categorical" else int(np.prod(self.shape, dtype=int))
 
     @property
@@ -102,18 +102,17 @@ def flat_keys(tree_structure: Any) -> list[str] | None:
 
 
 def narrow(dtype: Any) -> str:
-    """Returns the name of the dtype in which values are kept: 64-bit floats and integers become 32-bit ones."""
+    """Returns the name of the dtype in which values are stored: 64-bit floats and integers become 32-bit."""
     return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(
         np.dtype(dtype).name, np.dtype(dtype).name
     )
 
 
 def plain(space: spaces.Space, observation: Any) -> Any:
-    """Returns an observation in plain dicts and tuples, nested as ``space`` is; its arrays are left as they are.
+    """Returns an observation as plain dicts and tuples, nested like ``space``; its arrays are not copied.
 
-    JAX takes the leaves of a dict in the order of its sorted keys, but those of an ``OrderedDict`` (which highway-env
-    returns) as they were put in, and a list is to it another structure than a tuple: what follows :func:`leaves` must
-    not depend on that.
+    JAX sorts the keys of a dict, but keeps the order of an ``OrderedDict`` (which highway-env returns), and distinguishes
+    lists from tuples. The order of :func:`leaves` must not depend on that.
 
     Raises:
         KeyError: if a key of the space is missing.
@@ -126,7 +125,7 @@ def plain(space: spaces.Space, observation: Any) -> Any:
 
 
 def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
-    """Returns a batch of observations as plain dicts and tuples of arrays of the kept dtypes; copies what differs."""
+    """Returns a batch of observations as plain dicts and tuples of arrays of the stored dtypes; copies only if needed."""
     arrays, tree = jax.tree.flatten(plain(space, observation))
     return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
 
@@ -211,18 +210,17 @@ def action_dimension(space: spaces.Box) -> int:
 
 
 def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
-    """Returns actions in the environment's own range from what an algorithm gives.
+    """Returns actions in the range of the environment from those of an algorithm.
 
-    Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; what lies beyond is clipped, and
-    components without finite bounds are left as they are. Of a Box of integers, each number from low to high is given an
-    equal part of [-1, 1]. Discrete and MultiDiscrete: from 0 to n - 1 to the space's own
-    numbers. MultiBinary: the bits.
+    Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; actions are clipped, and components
+    without finite bounds are not scaled. Of a Box of integers, each number from low to high gets an equal part of [-1, 1].
+    Discrete and MultiDiscrete: from 0 to n - 1 to the numbers of the space. MultiBinary: the bits.
     """
     return action_scaler(space)(action)
 
 
 def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns :func:`scale_action` for one space, which looks at the space once."""
+    """Returns :func:`scale_action` for one space."""
     if isinstance(space, spaces.Box):
         shape = (-1, *space.shape)
         if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
@@ -252,10 +250,10 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
-    """Returns actions as an algorithm gives them from ones in the environment's own range: undoes :func:`scale_action`.
+    """Returns actions of an algorithm from those in the range of the environment: the inverse of :func:`scale_action`.
 
-    ``space`` is a Box or Discrete, ``action`` ``(batch, *shape)``. Of a Box, what lies beyond its bounds lies beyond
-    [-1, 1]; where both bounds are equal, 0.
+    ``space`` is a Box or Discrete, ``action`` ``(batch, *shape)``. Actions outside the bounds of a Box are outside [-1, 1];
+    if both bounds are equal, they are 0.
 
     >>> unscale_action(spaces.Box(0.0, 4.0, (1,)), np.array([[3.0]])).tolist()
     [[0.5]]
@@ -285,12 +283,12 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.n
 
 
 def check_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
-    """Checks actions ``(..., action_dim)`` or, of Discrete, ``(...)`` of a file, as algorithms give them.
+    """Checks actions of a file in the range of algorithms, ``(..., action_dim)`` or for Discrete ``(...)``.
 
-    ``owner`` is what holds them, for the message.
+    ``owner`` names their source in the message.
 
     Raises:
-        ValueError: if they are not finite, or choices that the space has not: nothing later would notice these.
+        ValueError: if they are not finite or not in the space; no later code would detect this.
     """
     if not np.isfinite(action).all():
         raise ValueError(f"{owner} has actions that are not finite")
@@ -302,9 +300,9 @@ def check_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
 
 
 def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
-    """Checks actions ``(n, ...)`` of a file in the environment's own range, before they are handed to an environment.
+    """Checks actions ``(n, ...)`` of a file in the range of the environment, before an environment gets them.
 
-    ``owner`` is what holds them, for the message.
+    ``owner`` names their source in the message.
 
     Raises:
         ValueError: if one is not in the space, up to rounding.
@@ -324,7 +322,7 @@ def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> No
 def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
     """Returns whether two spaces hold arrays of the same structure, shapes and dtypes, and the same bounds if asked.
 
-    Observation bounds are declared differently by different backends of one environment, and nothing depends on them.
+    Backends declare different observation bounds for the same environment, and nothing depends on them.
     """
     if bounds:
         return describe(space) == describe(other)
@@ -332,7 +330,7 @@ def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
 
 
 def describe(space: spaces.Space) -> Any:
-    """Returns a JSON-able description of a space, enough to tell two of them apart; infinite bounds as strings."""
+    """Returns a description of a space in JSON values; infinite bounds are strings."""
     if isinstance(space, spaces.Dict):
         return {"Dict": {key: describe(part) for key, part in sorted(space.spaces.items())}}
     if isinstance(space, spaces.Tuple):
@@ -356,7 +354,7 @@ def describe(space: spaces.Space) -> Any:
     raise TypeError(f"cannot describe the space {space}")
 
 
-def rebuild(description: Any, largest: int = LARGEST) -> spaces.Space:
+def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
     """Returns the space that :func:`describe` described: the inverse, over a fixed set of names.
 
     Args:
@@ -461,7 +459,7 @@ def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
 
 
 def _bounds(bounds: np.ndarray) -> Any:
-    """A single number where all are equal, a nested list otherwise; infinities as the strings ``inf`` and ``-inf``."""
+    """Returns one number if all bounds are equal, else a nested list; infinities as the strings ``inf`` and ``-inf``."""
     values = bounds.astype(np.float64)
     all_equal = values.size and (values == values.flat[0]).all()
     return jax.tree.map(

@@ -34,7 +34,7 @@ def test_columns_come_by_name_in_order():
 
 
 def test_an_unknown_column_is_named_with_the_known_ones():
-    with pytest.raises(KeyError, match="'reward' is no column; there are step, env, return"):
+    with pytest.raises(KeyError, match="'reward' is not a column; expected one of step, env, return"):
         history()["reward"]
 
 

@@ -104,7 +104,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         saved = convert(header, AgentHeader)
         said = _with_widths(saved.config, kind)
         config = configs.rebuild(kind, said, _torso(changes))
-        largest = max(spaces.LARGEST, room)
+        largest = max(spaces.MAX_NUMBERS, room)
         observation_space = spaces.rebuild(saved.observation_space, largest)
         check_policy(saved.policy, observation_space)
         action_space = spaces.rebuild(saved.action_space, largest)
@@ -130,7 +130,7 @@ def check_space(description: Any, own: gym.Space, kind: str) -> None:
     """
     if description == spaces.describe(own):
         return
-    other = spaces.rebuild(description, max(spaces.LARGEST, sum(leaf.nbytes for leaf in spaces.leaves(own))))
+    other = spaces.rebuild(description, max(spaces.MAX_NUMBERS, sum(leaf.nbytes for leaf in spaces.leaves(own))))
     if not spaces.same(other, own, bounds=kind == "action"):
         raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
 
