@@ -1,7 +1,6 @@
-"""Files made to deceive a reader, from valid ones, always the same: what no reader may crash, hang, or be fooled by.
+"""The hostile corpus: invalid files made from valid ones, which every reader must refuse without crashing or hanging.
 
-The parts of a file are put together here without rejeu, checksums right, so that what is false is exactly what is meant
-to be.
+Files are assembled without rejeu and with correct checksums, so that only the intended part is invalid.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ DTYPES = {name: dtype for dtype, name in NAMES.items()}
 
 
 class Parts(NamedTuple):
-    """What a file is made of."""
+    """The parts of a file."""
 
     header: dict[str, Any]
     """Without checksums."""
@@ -34,7 +33,7 @@ class Variant(NamedTuple):
     """A hostile file."""
 
     kind: str
-    """What is wrong with it, in one word or two."""
+    """What is invalid, in one or two words."""
     name: str
     content: bytes
 
@@ -54,12 +53,12 @@ def take_apart(content: bytes) -> Parts:
 
 
 def checksum(array: np.ndarray) -> int:
-    """Returns the checksum of an array as a valid file has it."""
+    """Returns the checksum of an array in a valid file."""
     return zlib.crc32(array.tobytes(), zlib.crc32(f"{array.dtype.name}{list(array.shape)}".encode()))
 
 
 def table_of(header: Any, arrays: dict[str, np.ndarray], text: str | None = None) -> dict[str, Any]:
-    """Returns the table of a file with right checksums; ``text`` stands in for the header's."""
+    """Returns the table of a file with correct checksums; ``text`` replaces the JSON of the header."""
     if text is None:
         sums = {name: checksum(array) for name, array in arrays.items()}
         full = {**header, "checksums": sums} if isinstance(header, dict) else header
@@ -75,26 +74,26 @@ def table_of(header: Any, arrays: dict[str, np.ndarray], text: str | None = None
 
 
 def join(table: Any, data: bytes, length: int | None = None) -> bytes:
-    """Returns a file of a table (a text or a JSON value) and the bytes after it; ``length`` is what it says of itself."""
+    """Returns a file from a table (bytes or a JSON value) and the bytes after it; ``length`` is the stated length."""
     text = table if isinstance(table, bytes) else json.dumps(table).encode()
     return (len(text) if length is None else length).to_bytes(8, "little") + text + data
 
 
 def put_together(parts: Parts, text: str | None = None) -> bytes:
-    """Returns a file of these parts, everything in it right but what the parts say."""
+    """Returns a file of these parts, otherwise valid."""
     arrays = {name: np.asarray(array, order="C") for name, array in parts.arrays.items()}
     return join(table_of(parts.header, arrays, text), b"".join(array.tobytes() for array in arrays.values()))
 
 
 def changed(content: bytes, change: Callable[[dict, dict], Any]) -> bytes:
-    """Returns a file with its header and arrays changed by ``change(header, arrays)``, checksums right."""
+    """Returns a file with its header and arrays changed by ``change(header, arrays)`` and correct checksums."""
     parts = take_apart(content)
     change(parts.header, parts.arrays)
     return put_together(parts)
 
 
 def variants(content: bytes) -> Iterator[Variant]:
-    """Yields hostile files made of a valid one of any kind; flips and truncations apart, see :func:`flipped`."""
+    """Yields hostile files made from a valid one of any kind, without flips (see :func:`flipped`) and truncations."""
     yield from foreign()
     yield from bad_tables(content)
     yield from bad_arrays(content)
@@ -102,7 +101,7 @@ def variants(content: bytes) -> Iterator[Variant]:
 
 
 def foreign() -> Iterator[Variant]:
-    """Yields what other programs write."""
+    """Yields files of other programs."""
     zipped, array = io.BytesIO(), io.BytesIO()
     with zipfile.ZipFile(zipped, "w") as file:
         file.writestr("data", "{}")
@@ -126,7 +125,7 @@ def foreign() -> Iterator[Variant]:
 
 
 def bad_tables(content: bytes) -> Iterator[Variant]:
-    """Yields files whose table lies about lengths, places, shapes and names."""
+    """Yields files whose table has invalid lengths, offsets, shapes and names."""
     parts = take_apart(content)
     table, data = table_of(parts.header, parts.arrays), content_of(parts)
     size = len(json.dumps(table))
@@ -202,7 +201,7 @@ def bad_tables(content: bytes) -> Iterator[Variant]:
 
 
 def bad_arrays(content: bytes) -> Iterator[Variant]:
-    """Yields files whose arrays are not those that belong there."""
+    """Yields files with wrong arrays."""
     parts = take_apart(content)
     for name, array in parts.arrays.items():
         if (array.dtype.kind == "f" and name.split(".")[0] not in ("obs",)) or name in ("obs.mean", "obs.var"):
@@ -257,7 +256,7 @@ def bad_arrays(content: bytes) -> Iterator[Variant]:
 
 
 def bad_texts(content: bytes) -> Iterator[Variant]:
-    """Yields files whose header is not what a header is, its checksum being right."""
+    """Yields files with an invalid header and its correct checksum."""
     parts = take_apart(content)
     good = json.dumps({**parts.header, "checksums": {name: checksum(a) for name, a in parts.arrays.items()}})
     texts = [
@@ -300,11 +299,11 @@ CODE = (
     "../../evil",
     "gASVAAAAAA==",
 )
-"""Names of code, and of files: a header may say them, and nothing may look for what they name."""
+"""Names of code and files, which may occur in a header and must not be looked up."""
 
 
 def bad_models(content: bytes) -> Iterator[Variant]:
-    """Yields model files whose header asks for what does not exist, for code, or for more than there is."""
+    """Yields model files whose header asks for unknown names, for code, or for too much memory."""
 
     def of(kind: str, name: str, change: Callable[[dict, dict], Any]) -> Variant:
         return Variant(kind, name, changed(content, change))
@@ -436,7 +435,7 @@ def bad_models(content: bytes) -> Iterator[Variant]:
 
 
 def bad_statistics(content: bytes) -> Iterator[Variant]:
-    """Yields files of normalisation statistics that no statistics are."""
+    """Yields files with invalid normalization statistics."""
 
     def of(name: str, change: Callable[[dict, dict], Any]) -> Variant:
         return Variant("statistics", name, changed(content, change))
@@ -467,7 +466,7 @@ def bad_statistics(content: bytes) -> Iterator[Variant]:
 
 
 def bad_buffers(content: bytes) -> Iterator[Variant]:
-    """Yields replay files whose counters would lead out of the ring, or that hold what no environment returns."""
+    """Yields replay files whose counters lead out of the ring, or that hold numbers that no environment returns."""
 
     def of(name: str, change: Callable[[dict, dict], Any]) -> Variant:
         return Variant("buffer", name, changed(content, change))
@@ -478,7 +477,7 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
             yield of(f"{kind} {i}", lambda h, a, k=kind, v=value: h.update({k: v}))
         yield of(f"{kind} gone", lambda h, a, k=kind: h.pop(k))
         yield of(f"{kind} of another", lambda h, a, k=kind: h.update({k: {"MultiBinary": {"shape": [7]}}}))
-    # Where a full ring begins is for its file to say: with the newest row elsewhere it is another ring, and whole.
+    # A full ring may begin anywhere: with another newest row the file is valid.
     is_full = (arrays["head"] >= arrays["kind"].shape[1]).all()
     for name in ("head", "n_steps"):
         for value in (-2, -1, 0, 10**6, 2**62, 2**63 - 1, -(2**63)):
@@ -488,7 +487,7 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
         yield of(f"{name} of more", lambda h, a, n=name: a.update({n: np.repeat(a[n], 2)}))
     for value in (3, 255):
         yield of(f"kind {value}", lambda h, a, v=value: a["kind"].fill(v))
-    # What older files count for every row, and newer ones leave out.
+    # Counters of each row, which only older files hold.
     for name in ("since_start", "until_end"):
         for value in (10**6, 2**31 - 1, -1, -(2**31)):
             yield of(f"{name} {value}", lambda h, a, n=name, v=value: a.update({**counters(a), n: counters(a)[n] + v}))
@@ -503,7 +502,7 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
 
 
 def bad_runs(content: bytes) -> Iterator[Variant]:
-    """Yields files of a run, or of its rows, whose header has other values than it should, or none."""
+    """Yields files of a run, or of its rows, whose header has wrong or missing values."""
     parts = take_apart(content)
     values = (
         None,
@@ -540,16 +539,16 @@ def bad_runs(content: bytes) -> Iterator[Variant]:
 
 
 class Sparse(NamedTuple):
-    """The beginning of a file, the rest of which is a hole."""
+    """The beginning of a file whose rest is a hole."""
 
     name: str
     content: bytes
     size: int
-    """Of the whole file, in bytes."""
+    """Size of the whole file in bytes."""
 
 
 def sparse(content: bytes, size: int = 6 * 2**30) -> Iterator[Sparse]:
-    """Yields files in which one array has some 6 GiB, all of them in a hole: a few KiB on disk."""
+    """Yields files in which one array has about 6 GiB, all in a hole: a few KiB on disk."""
     parts = take_apart(content)
     rows = {name: array for name, array in parts.arrays.items() if array.ndim}
     for name in ("a", min(rows), max(rows), max(rows, key=lambda name: rows[name].nbytes)):
@@ -566,19 +565,19 @@ def sparse(content: bytes, size: int = 6 * 2**30) -> Iterator[Sparse]:
 
 
 def counters(arrays: dict) -> dict[str, np.ndarray]:
-    """Returns what older replay files count for every row: zeros, which are no lie."""
+    """Returns the counters of each row in older replay files: zeros, which are valid."""
     return {name: np.zeros(arrays["kind"].shape, np.int32) for name in ("since_start", "until_end")}
 
 
 def only_counter(arrays: dict, name: str) -> None:
-    """Leaves but one of the two counters in a file."""
+    """Keeps only one of the two counters in a file."""
     for other in counters(arrays):
         arrays.pop(other, None)
     arrays[name] = counters(arrays)[name]
 
 
 def flipped(content: bytes, bit: int) -> bytes:
-    """Returns a file with one bit the other way round; ``bit`` counts from its beginning."""
+    """Returns a file with one bit flipped; ``bit`` counts from the beginning."""
     damaged = bytearray(content)
     damaged[bit // 8] ^= 1 << bit % 8
     return bytes(damaged)
@@ -595,6 +594,6 @@ def box(shape: Any = (3,), dtype: Any = "float32", low: Any = "-inf") -> Any:
 
 
 def bad_rate(number: Any) -> Any:
-    """Returns what no learning rate is, from what mostly is none."""
+    """Returns an invalid learning rate, from a number that may be valid."""
     fine = isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number < math.inf
     return {"schedule": "linear", "start": 1.0, "slope": number} if fine else number
