@@ -136,7 +136,7 @@ def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert "environment   Pendulum-v1, 1 at once\nbackend       envpool\n" in text
     assert "SAC, preset, seed 1" in text
     assert "60/60 steps" in text
-    assert "95 % interval" in text
+    assert "95 % CI" in text
     assert re.search(r"[\d.]+ s in all, [\d.]+ s of them compiling", text)
 
 

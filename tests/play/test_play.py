@@ -16,7 +16,7 @@ from rejeu.cli import main
 from rejeu.envs.registry import make_env
 from rejeu.play import Game, play, watch
 from rejeu.play.game import Pace, Player
-from rejeu.play.window import HEADER, MARGIN, Window, message, so_far
+from rejeu.play.window import HEADER, MARGIN, Window, message, score_summary
 from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
 
 
@@ -35,8 +35,8 @@ EFFECTS = [
     ("MountainCar-v0", "a", "velocity", lambda e: e.state[1], -1),
     ("MountainCarContinuous-v0", "right", "velocity", lambda e: e.state[1], +1),
     ("MountainCarContinuous-v0", "a", "velocity", lambda e: e.state[1], -1),
-    ("Pendulum-v1", "a", "anticlockwise speed", lambda e: e.state[1], +1),
-    ("Pendulum-v1", "d", "anticlockwise speed", lambda e: e.state[1], -1),
+    ("Pendulum-v1", "a", "counterclockwise speed", lambda e: e.state[1], +1),
+    ("Pendulum-v1", "d", "counterclockwise speed", lambda e: e.state[1], -1),
     ("Acrobot-v1", "d", "speed of the joint", lambda e: e.state[3], +1),
     ("LunarLander-v3", "a", "speed to the right", lambda e: e.lander.linearVelocity.x, -1),
     ("LunarLander-v3", "d", "speed to the right", lambda e: e.lander.linearVelocity.x, +1),
@@ -376,10 +376,10 @@ def test_a_lost_episode_is_called_failed():
 
 def test_scores_are_summed_up_once_there_is_one():
     player = Player("you", None, None)
-    assert so_far(player, by_hand=False) == so_far(player, by_hand=True) == ""
+    assert score_summary(player, by_hand=False) == score_summary(player, by_hand=True) == ""
     player.scores.append(-3.0)
-    assert so_far(player, by_hand=False) == "mean -3 of 1 episode   best -3"
-    assert so_far(player, by_hand=True) == "best -3"
+    assert score_summary(player, by_hand=False) == "mean -3 of 1 episode   best -3"
+    assert score_summary(player, by_hand=True) == "best -3"
 
 
 def test_a_smaller_window_shows_everything_smaller():
@@ -512,11 +512,11 @@ def test_watch_can_be_paused_begun_anew_and_closed():
         (["play", "MountanCar-v0"], "did you mean MountainCar-v0"),
         (
             ["play", "rejeu-play-test/Dark-v0"],
-            "cannot be drawn: it has the render modes ['ansi'], which lack 'rgb_array'",
+            "cannot be rendered to arrays: its render modes are ['ansi']",
         ),
         (["play", "rejeu-play-test/Switches-v0"], "MultiBinary(3) cannot be played by hand"),
         (["play", LEVER, "--keys", "a"], "--keys 'a' must be keys=action"),
-        (["play", LEVER, "--keys", "a=5"], "a=5 must be a whole number from 0 to 2"),
+        (["play", LEVER, "--keys", "a=5"], "a=5 must be an integer from 0 to 2"),
         (["play", LEVER, "--keys", "q=1"], "'q' cannot be bound"),
         (["play", LEVER, "--fps", "0"], "fps=0"),
         (["play", LEVER, "--episodes", "0"], "episodes=0"),
@@ -545,7 +545,7 @@ def test_without_a_screen_there_is_an_error_and_no_hidden_window(capsys, monkeyp
         monkeypatch.setenv("SDL_VIDEODRIVER", driver)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    assert "no window can be opened here" in error_of(capsys, "play", LEVER)
+    assert "cannot open a window" in error_of(capsys, "play", LEVER)
 
 
 def test_environments_are_closed_and_the_window_is_gone_after_a_game():

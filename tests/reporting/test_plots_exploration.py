@@ -65,10 +65,10 @@ def test_saturation_is_drawn_in_red_and_counted_with_and_without_the_boundary():
 
 @pytest.mark.parametrize("noise", [NormalActionNoise([0.0], 0.1), OrnsteinUhlenbeckActionNoise([0.0], 0.1)])
 def test_saturation_of_noise_without_a_boundary_is_an_error_that_says_what_to_give(noise):
-    with pytest.raises(ValueError, match=r"no repulsive boundary; give .*repulsive=1e-4"):
+    with pytest.raises(ValueError, match=r"no repulsive boundary; use .*repulsive=1e-4"):
         plots.saturation(noise)
 
 
 def test_noise_on_parameters_cannot_be_drawn_as_noise_on_actions():
-    with pytest.raises(TypeError, match="no noise on actions"):
+    with pytest.raises(TypeError, match="not action noise"):
         plots.noise([ParameterNoise()])

@@ -246,7 +246,7 @@ def test_what_ffmpeg_says_is_passed_on(tmp_path):
     writer = VideoFile(tmp_path / "v.mp4", 30)
     writer._partial = tmp_path / "missing" / "v.mp4"
     writer.write(np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(OSError, match=r"could not be written; ffmpeg says: \S"):
+    with pytest.raises(OSError, match=r"could not be written; ffmpeg: \S"):
         writer.close()
     assert os.listdir(tmp_path) == []
 
@@ -272,7 +272,7 @@ def test_environment_that_cannot_render_is_an_error(tmp_path):
 
     gym.register("Dark-v0", lambda: Dark())
     try:
-        with pytest.raises(ValueError, match=r"Dark-v0 cannot be drawn.*'ansi'.*lack 'rgb_array'"):
+        with pytest.raises(ValueError, match=r"Dark-v0 cannot be rendered to arrays.*'ansi'.*expected 'rgb_array'"):
             record_video(Still(), tmp_path / "v.mp4", "Dark-v0")
     finally:
         del gym.registry["Dark-v0"]
@@ -280,7 +280,7 @@ def test_environment_that_cannot_render_is_an_error(tmp_path):
 
 def test_render_that_gives_no_picture_is_an_error(lamp, tmp_path):
     lamp.render = lambda: None
-    with pytest.raises(ValueError, match=r"render\(\) gave NoneType, expected an array"):
+    with pytest.raises(ValueError, match=r"render\(\) returned NoneType, expected an array"):
         record_video(Still(), tmp_path / "v.mp4", lamp)
 
 
@@ -358,7 +358,7 @@ def test_show_videos_escapes_names(tmp_path):
 
 def test_show_videos_says_when_there_is_none(tmp_path):
     text = show_videos(tmp_path, prefix="sac").data
-    assert "No mp4 file whose name begins with sac" in text
+    assert "No mp4 file whose name starts with sac" in text
     assert "<video" not in text
 
 

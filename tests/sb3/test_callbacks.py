@@ -123,7 +123,7 @@ def test_a_logger_of_one_s_own_takes_the_rows(tmp_path, capsys):
     agent.logger.close()
     with pytest.raises(ValueError, match="'stdout', 'csv' and 'tensorboard'"):
         configure(tmp_path, ["log"])
-    with pytest.raises(TypeError, match=r"record\('mine/text'\) takes a number, got str"):
+    with pytest.raises(TypeError, match=r"record\('mine/text'\) expected a number, got str"):
         Logger().record("mine/text", "words")
 
 

@@ -23,7 +23,7 @@ from rejeu.cli.importing import find_id, find_wrapper, imports
 from rejeu.envs.make import VectorEnv, make_vector
 from rejeu.envs.registry import are_plain, maker, register
 from rejeu.errors import CheckpointError
-from rejeu.reporting.video import make_drawing
+from rejeu.reporting.video import make_rendering_env
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Environment:
         Raises:
             ValueError: if it cannot.
         """
-        return make_drawing(self.make, self.env_id)
+        return make_rendering_env(self.make, self.env_id)
 
     @property
     def is_plain(self) -> bool:

@@ -1,7 +1,7 @@
-"""Environments played by hand, and agents watched at play, in a window.
+"""Play environments by hand, or watch agents, in a window.
 
-``keys.py`` says which action the keys held stand for, ``game.py`` what happens step by step, ``window.py`` shows it and
-listens, ``recording.py`` keeps it.
+``keys.py`` maps keys to actions, ``game.py`` holds the state of a game, ``window.py`` draws it and reads the keyboard,
+``recording.py`` writes a dataset and a video.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for
 from rejeu.play.recording import Recording
 from rejeu.play.window import Window
-from rejeu.reporting.video import DEFAULT_FPS, make_drawing
+from rejeu.reporting.video import DEFAULT_FPS, make_rendering_env
 from rejeu.validation import number, whole
 
 __all__ = ["Game", "Player", "play", "watch"]
 
 REST_SECONDS = 1.5
-"""How long the end of a round stays to be seen."""
+"""How long the end of a round is shown."""
 
 
 def play(
@@ -44,35 +44,35 @@ def play(
     record: str | Path | None = None,
     against: Any = None,
 ) -> Game:
-    """Opens a window in which a person plays, and returns the game as it stood when the window was closed.
+    """Opens a window to play an environment by hand, and returns the game when the window is closed.
 
     Args:
-        env: an id, or Car, Mountain or Lunar; or a function that takes ``render_mode`` and makes an environment.
-        keys: actions by keys, on top of those known for the environment; see :mod:`rejeu.play.keys`.
-        seed: of the first start; each further one has the next seed. None draws one.
-        fps: steps a second; None: the environment's own, 30 if it declares none.
-        episodes: close after so many; None leaves that to the player.
-        record: folder, new or empty, for a Minari dataset and a video of what is played.
-        against: an agent, anything with ``predict(obs, state, deterministic=True)``, that plays the same starts beside.
+        env: an id, or Car, Mountain or Lunar, or a function that takes ``render_mode`` and makes an environment.
+        keys: actions by keys, in addition to the environment's defaults; see :mod:`rejeu.play.keys`.
+        seed: seed of the first round; each further round adds one. None draws a seed.
+        fps: steps per second; None uses the environment's ``render_fps``, or 30.
+        episodes: close after this number of episodes; None never closes.
+        record: new or empty folder for a Minari dataset and a video.
+        against: an opponent with ``predict(obs, state, deterministic=True)`` that plays with the same seeds.
 
     Raises:
-        MissingExtra: if pygame-ce, or what a recording needs, is not installed.
-        ValueError: for an unknown environment, one without pictures, or actions that cannot be played by hand.
-        OSError: if there is no screen.
+        MissingExtra: if pygame-ce, or a package for recording, is not installed.
+        ValueError: for an unknown environment, one that does not render, or an action space without keys.
+        OSError: if there is no display.
     """
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing = drawing(env)
-        stack.callback(playing.close)
-        env_id = id_of(playing)
-        keys_of_env = keys_for(env_id, playing.action_space, keys)
-        fps = natural_fps(playing) if fps is None else fps
-        by_hand = Player("you", playing, lambda obs, held, step: keys_of_env.action(held, step))
+        playing_env = rendering(env)
+        stack.callback(playing_env.close)
+        env_id = id_of(playing_env)
+        keys_of_env = keys_for(env_id, playing_env.action_space, keys)
+        fps = natural_fps(playing_env) if fps is None else fps
+        by_hand = Player("you", playing_env, lambda obs, held, step: keys_of_env.action(held, step))
         players = [by_hand]
         if against is not None:
-            rival = shown_to(against, drawing(env))
-            stack.callback(rival.close)
-            players.append(Player(_name(against), rival, _policy(against)))
+            opponent_env = shown_to(against, rendering(env))
+            stack.callback(opponent_env.close)
+            players.append(Player(_name(against), opponent_env, _policy(against)))
         if record is not None:
             by_hand.recording = Recording(record, env_id, fps)
             stack.callback(by_hand.recording.close)
@@ -89,33 +89,33 @@ def watch(
     fps: float | None = None,
     episodes: int | None = None,
 ) -> Game:
-    """Opens a window in which an agent plays, and returns the game as it stood when the window was closed.
+    """Opens a window in which an agent plays, and returns the game when the window is closed.
 
     Args:
         agent: anything with ``predict(obs, state, deterministic=True)``.
-        env: an id, or Car, Mountain or Lunar; or a function that takes ``render_mode`` and makes an environment.
-        seed: of the first episode; each further one has the next seed. None draws one.
-        fps: steps a second; None: the environment's own, 30 if it declares none.
-        episodes: close after so many; None leaves that to who watches.
+        env: an id, or Car, Mountain or Lunar, or a function that takes ``render_mode`` and makes an environment.
+        seed: seed of the first episode; each further episode adds one. None draws a seed.
+        fps: steps per second; None uses the environment's ``render_fps``, or 30.
+        episodes: close after this number of episodes; None never closes.
 
     Raises:
         MissingExtra: if pygame-ce is not installed.
-        ValueError: for an unknown environment or one without pictures.
-        OSError: if there is no screen.
+        ValueError: for an unknown environment or one that does not render.
+        OSError: if there is no display.
     """
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing = shown_to(agent, drawing(env))
-        stack.callback(playing.close)
-        fps = natural_fps(playing) if fps is None else fps
-        player = Player(_name(agent), playing, _policy(agent))
+        playing_env = shown_to(agent, rendering(env))
+        stack.callback(playing_env.close)
+        fps = natural_fps(playing_env) if fps is None else fps
+        player = Player(_name(agent), playing_env, _policy(agent))
         game = Game([player], seed, episodes=episodes, rest=round(REST_SECONDS * fps))
-        _run(Window(f"rejeu watch {id_of(playing)}"), game, None, fps)
+        _run(Window(f"rejeu watch {id_of(playing_env)}"), game, None, fps)
     return game
 
 
 def turn(window: Window, game: Game) -> None:
-    """Does what the events since the last call ask for, lets one step's time go by, and shows the game."""
+    """Processes the events since the last call, advances the game by one step and draws it."""
     for event in window.events():
         if event.kind == "press":
             game.press(event.key)
@@ -129,21 +129,21 @@ def turn(window: Window, game: Game) -> None:
     window.draw(game)
 
 
-def drawing(env: str | Callable[..., gym.Env]) -> gym.Env:
-    """Returns an environment that draws to arrays, of an id or a short name, or made by a function.
+def rendering(env: str | Callable[..., gym.Env]) -> gym.Env:
+    """Makes an environment that renders to arrays, from an id, a short name or a function.
 
     Raises:
-        ValueError: if none is called so, or it cannot draw.
-        MissingExtra: if a package that it needs is not installed.
+        ValueError: if the name is unknown, or the environment does not render.
+        MissingExtra: if a package of the environment is not installed.
     """
     if not isinstance(env, str):
-        return make_drawing(env, "the environment")
+        return make_rendering_env(env, "the environment")
     env_id = full_name(env)
-    return make_drawing(partial(make_env, env_id), env_id)
+    return make_rendering_env(partial(make_env, env_id), env_id)
 
 
 def natural_fps(env: gym.Env) -> float:
-    """Returns the steps a second that an environment declares, or 30."""
+    """Returns the environment's ``render_fps``, or 30."""
     return float(env.metadata.get("render_fps") or DEFAULT_FPS)
 
 
@@ -151,7 +151,7 @@ def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:
     with window, Interrupt() as stop:
         game.begin()
         for player in game.players:
-            player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action; not while somebody plays
+            player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action, which would delay the game
         window.open(game, keys)
         pace = Pace(fps)
         while not game.closed:
@@ -161,10 +161,10 @@ def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:
 
 
 def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[int, int | None]:
-    """Returns the seed, drawn if there is none, and the number of episodes.
+    """Returns the seed, drawn if it is None, and the number of episodes.
 
     Raises:
-        ValueError: for a bad number.
+        ValueError: for an invalid number.
     """
     if fps is not None:
         number("fps", fps, above=0)
@@ -176,11 +176,11 @@ def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[i
 
 
 def _policy(agent: Any) -> Act:
-    memory: Any = None
+    state: Any = None
 
     def act(obs: Any, held: Any, step: int) -> Any:
-        nonlocal memory
-        action, memory = agent.predict(obs, None if step == 0 else memory, deterministic=True)
+        nonlocal state
+        action, state = agent.predict(obs, None if step == 0 else state, deterministic=True)
         return action
 
     return act

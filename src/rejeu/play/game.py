@@ -1,4 +1,4 @@
-"""The course of a game: players who begin at the same start, the keys they hold, pauses, scores. No window, no clock."""
+"""The state of a game: players with the same seeds, held keys, pauses, scores. Without a window or a clock."""
 
 from __future__ import annotations
 
@@ -17,47 +17,47 @@ from rejeu.play.recording import Recording
 from rejeu.reporting.video import rgb_frame
 
 Act = Callable[[Any, frozenset[str], int], Any]
-"""Takes the observation, the keys held and the step of the episode, from 0; returns the action, or None to wait."""
+"""Maps observation, held keys and step of the episode (from 0) to an action, or None to wait."""
 
-PATIENCE = 0.25
-"""Seconds of delay after which lost time is given up rather than made up for."""
+MAX_DELAY = 0.25
+"""Seconds of delay up to which the following steps are faster, to catch up."""
 
 
 @dataclass
 class Player:
-    """Who plays, and how it went so far. Mutable."""
+    """A player with its environment and scores. Mutable."""
 
     name: str
     env: gym.Env
     """Made with ``render_mode="rgb_array"``."""
     act: Act
     recording: Recording | None = None
-    """What keeps a copy of everything played."""
+    """Recorder of the episodes, None for none."""
     obs: Any = None
     frame: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
-    """What the environment looks like, ``uint8 (height, width, 3)``."""
+    """The latest frame, ``uint8 (height, width, 3)``."""
     score: float = 0.0
     """Sum of the rewards of this episode."""
     steps: int = 0
     """Steps of this episode."""
     over: bool = True
     success: float = math.nan
-    """1 or 0 once the episode is over, NaN where the environment does not say."""
+    """1 or 0 at the end of the episode, NaN if the environment does not report it."""
     scores: list[float] = field(default_factory=list)
-    """Of the episodes that were played to their end."""
+    """Scores of the completed episodes."""
 
     @property
     def best(self) -> float:
-        """Best score of an episode played to its end, NaN before there is one."""
+        """Best score of a completed episode, NaN before the first."""
         return max(self.scores, default=math.nan)
 
     @property
     def mean(self) -> float:
-        """Mean score of the episodes played to their end, NaN before there is one."""
+        """Mean score of the completed episodes, NaN before the first."""
         return float(np.mean(self.scores)) if self.scores else math.nan
 
     def begin(self, seed: int) -> None:
-        """Begins an episode; one that is under way is given up."""
+        """Starts an episode, and aborts a running one."""
         self.obs, _ = self.env.reset(seed=seed)
         self.frame = rgb_frame(self.env)
         self.score, self.steps, self.over, self.success = 0.0, 0, False, math.nan
@@ -65,7 +65,7 @@ class Player:
             self.recording.begin(self.obs, seed, self.frame)
 
     def step(self, action: Any) -> None:
-        """Takes a step."""
+        """Steps the environment."""
         self.obs, reward, terminated, truncated, info = self.env.step(action)
         self.frame = rgb_frame(self.env)
         self.score += float(reward)
@@ -80,42 +80,42 @@ class Player:
 
 @dataclass
 class Game:
-    """One or several players of the same starts. Mutable; every method returns at once.
+    """One or several players whose rounds have the same seeds. Mutable; no method waits.
 
-    A round begins with the same seed for all; the next one has the next seed. It waits for a bound key, unless
-    ``bound`` is empty, and is over when everybody's episode is.
+    Each round uses the next seed, the same for all players. It waits for the first bound key, unless ``bound`` is empty, and
+    is over when the episodes of all players are.
     """
 
     players: list[Player]
     seed: int
-    """Of the present round."""
+    """Seed of the current round."""
     bound: frozenset[str] = frozenset()
-    """Keys that mean actions; empty where nobody plays by hand."""
+    """Keys with actions; empty if nobody plays by hand."""
     episodes: int | None = None
-    """Rounds after which the game closes, None for no end."""
+    """Rounds after which the game closes, None for no limit."""
     rest: int = 45
-    """Ticks for which the end of a round stays to be seen."""
+    """Ticks for which the end of a round is shown."""
     phase: Literal["ready", "running", "over"] = "ready"
     paused: bool = False
     closed: bool = False
     held: set[str] = field(default_factory=set)
-    """Keys held down."""
+    """Keys that are held."""
     rounds: int = 0
-    """Rounds played to their end."""
+    """Number of completed rounds."""
     tapped: set[str] = field(default_factory=set)
-    """Keys pressed since the last tick: one that was let go again already counts for one step."""
+    """Keys pressed since the last tick. A key that was released since then still counts for one step."""
     resting: int = 0
-    """Ticks until the next round, while one is over."""
+    """Ticks until the next round."""
 
     def begin(self) -> None:
-        """Begins the present round, anew if it is under way."""
+        """Starts the current round, or restarts it."""
         for player in self.players:
             player.begin(self.seed)
         self.phase = "ready" if self.bound else "running"
         self.paused = False
 
     def press(self, key: str) -> None:
-        """Takes note of a key that went down."""
+        """Handles a key press."""
         command = None if key in self.bound else CONTROLS.get(key)
         if command == "close":
             self.closed = True
@@ -130,15 +130,15 @@ class Game:
             self.tapped.add(key)
 
     def release(self, key: str) -> None:
-        """Takes note of a key that went up."""
+        """Handles a key release."""
         self.held.discard(key)
 
     def release_all(self) -> None:
-        """Takes note that keys are no longer heard of: another window has the keyboard."""
+        """Releases all keys, when the window loses the keyboard focus."""
         self.held.clear()
 
     def tick(self) -> None:
-        """Lets the time of one step go by."""
+        """Advances the game by one step."""
         keys = frozenset(self.held | self.tapped)
         self.tapped.clear()
         if self.closed or self.paused:
@@ -174,12 +174,12 @@ class Game:
 
 
 class Pace:
-    """Keeps a rate: waits until the next multiple of a period, whatever was done in between.
+    """Keeps a constant rate.
 
     Args:
-        rate: per second.
-        clock: the seconds gone by since some moment.
-        sleep: waits for so many seconds.
+        rate: calls per second.
+        clock: returns the time in seconds.
+        sleep: waits for a number of seconds.
     """
 
     def __init__(
@@ -193,10 +193,10 @@ class Pace:
         self._due = clock()
 
     def wait(self) -> None:
-        """Waits for the next moment; one that has passed is not waited for, and of long delays nothing is made up."""
+        """Waits until the next call is due. Delays longer than ``MAX_DELAY`` are not caught up."""
         self._due += self.period
         left = self._due - self._clock()
         if left > 0:
             self._sleep(left)
-        elif left < -PATIENCE:
+        elif left < -MAX_DELAY:
             self._due -= left

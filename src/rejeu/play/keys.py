@@ -1,9 +1,8 @@
-"""Which action the keys held down stand for: pure maps, for Discrete and for Box actions.
+"""Key maps from held keys to Discrete or Box actions.
 
 A map is written as ``{keys: action}``: ``{"a": 0, "d": 2, "none": 1}`` for Discrete actions, ``{"w": [1, 0], "a": [0,
--1]}`` for Box actions. ``a+w`` is the two keys together, ``none`` stands for nothing held. Keys are named as SDL names
-them: ``a``, ``7``, ``left``, ``space``, ``left shift``. The arrows do what a, d, w and s do unless they are bound
-themselves.
+-1]}`` for Box actions. ``a+w`` is both keys together, ``none`` is no key. Keys have SDL's names: ``a``, ``7``, ``left``,
+``space``, ``left shift``. Arrow keys are equivalent to a, d, w and s unless they are bound themselves.
 """
 
 from __future__ import annotations
@@ -19,56 +18,55 @@ import gymnasium as gym
 import numpy as np
 
 ARROWS = {"left": "a", "right": "d", "up": "w", "down": "s"}
-"""What an arrow stands for where it is not bound itself."""
+"""The key that an arrow key is equivalent to, unless it is bound."""
 OPPOSITES = (("a", "d"), ("s", "w"), ("left", "right"), ("down", "up"))
-"""Pairs of keys that cancel where each is a Discrete action."""
+"""Pairs of keys that cancel in Discrete action spaces."""
 AXIS_KEYS = (("a", "d"), ("s", "w"), ("j", "l"), ("k", "i"))
-"""Keys of the first, second, ... number of a Box action: its low end and its high end."""
+"""Keys for the low and high end of the first, second, ... component of a Box action."""
 CONTROLS = {"r": "restart", "p": "pause", "space": "pause", "escape": "close", "q": "close"}
-"""What the window itself understands. Of these only the space bar can be bound, and then it no longer pauses."""
+"""Keys of the window. Only the space bar can be bound to an action, and then it no longer pauses."""
 NONE = "none"
-"""Stands for no key in a map."""
+"""No key, in a map."""
 WAIT = "wait"
-"""In place of an action for ``none``: the environment stands still until a key is held."""
+"""In place of an action for ``none``: the environment waits until a key is held."""
 NAMES = frozenset(
     [
         *(string.ascii_lowercase + string.digits + ",.;'-=[]\\/`"),
         *(*ARROWS, "space", "return", "tab", "backspace", "left shift", "right shift", "left ctrl", "right ctrl"),
     ]
 )
-"""Keys that may be bound, and those of the window."""
+"""Names of all keys that can be bound, and of those of the window."""
 
 
 class Binding(NamedTuple):
-    """What some keys held together do."""
+    """The action of a key, or of several keys held together."""
 
     keys: frozenset[str]
-    """One key, or several that count only together."""
+    """One key, or several that are held together."""
     action: Any
-    """An integer for Discrete actions; the numbers of a Box action, flattened, as a tuple."""
+    """An integer for Discrete actions, a flat tuple of numbers for Box actions."""
     label: str
-    """For the window: what it does, in a word or two."""
+    """Description for the window."""
 
 
 @dataclass(frozen=True)
 class DiscreteKeys:
     """Keys for Discrete actions.
 
-    Opposite keys cancel. Of several actions whose keys are held each has its turn, a step at a time, so that two engines
-    that cannot fire in one step fire in alternation.
+    Opposite keys cancel. If keys of several actions are held, the actions alternate step by step.
     """
 
     bindings: tuple[Binding, ...]
     idle: tuple[int, ...]
-    """Actions while nothing is held, taken in turn; empty: the environment waits for a key."""
+    """Actions without a key, which alternate; empty to wait for a key."""
 
     @property
     def names(self) -> frozenset[str]:
-        """Every key that means something, arrows included."""
-        return frozenset().union(*(spellings(binding, self.bindings) for binding in self.bindings))
+        """All keys with an action, arrow keys included."""
+        return frozenset().union(*(equivalent_keys(binding, self.bindings) for binding in self.bindings))
 
     def action(self, held: Iterable[str], step: int) -> np.int64 | None:
-        """Returns the action in a step of an episode, counted from 0; None to wait.
+        """Returns the action at a step of the episode (from 0), None to wait.
 
         >>> keys = bind(gym.spaces.Discrete(4), {"a": 1, "w": 2, "d": 3, "none": 0})
         >>> [int(keys.action(held, step=0)) for held in (["left"], ["a", "d"], [])]
@@ -86,20 +84,20 @@ class DiscreteKeys:
 
 @dataclass(frozen=True)
 class BoxKeys:
-    """Keys for Box actions: what the keys held add to the action at rest is summed, and kept within the bounds."""
+    """Keys for Box actions. The contributions of the held keys are added and clipped to the bounds."""
 
     bindings: tuple[Binding, ...]
     rest: tuple[float, ...]
-    """The action while nothing is held."""
+    """The action without a key."""
     space: gym.spaces.Box
 
     @property
     def names(self) -> frozenset[str]:
-        """Every key that means something, arrows included."""
-        return frozenset().union(*(spellings(binding, self.bindings) for binding in self.bindings))
+        """All keys with an action, arrow keys included."""
+        return frozenset().union(*(equivalent_keys(binding, self.bindings) for binding in self.bindings))
 
     def action(self, held: Iterable[str], step: int) -> np.ndarray:
-        """Returns the action, of the space's shape and dtype; ``step`` is of no account.
+        """Returns the action in the space's shape and dtype; ``step`` has no effect.
 
         >>> keys = bind(gym.spaces.Box(-1, 1, (2,)), {"w": [1, 0], "a": [0, -1], "d": [0, 1]})
         >>> keys.action(["up", "left"], step=0).tolist(), keys.action(["w", "a", "d"], step=0).tolist()
@@ -117,29 +115,29 @@ KeyMap = DiscreteKeys | BoxKeys
 
 
 def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[Any, str]] = ()) -> KeyMap:
-    """Returns the map for a space that ``actions`` describes; see the module.
+    """Returns the key map of an action space.
 
     Args:
-        space: of one action.
-        actions: by keys. Of a Box action with one number that number will do. ``none`` may hold several Discrete actions
-            to be taken in turn, or ``"wait"``; without it Discrete actions wait, and Box actions are 0, or in the middle
-            of bounds that leave 0 out.
-        labels: ``(action, label)`` pairs that say what some actions do; of others the action itself is shown.
+        space: the action space.
+        actions: actions by keys. A Box action with one component may be a number. ``none`` may be a list of Discrete actions
+            that alternate, or ``"wait"``. The default is to wait for Discrete actions, and for Box actions 0, or the middle
+            of bounds that exclude 0.
+        labels: ``(action, label)`` pairs with descriptions. The default description is the action itself.
 
     Raises:
         ValueError: for unknown keys, actions outside the space, and spaces that are neither Discrete nor Box.
     """
     if not isinstance(space, gym.spaces.Discrete | gym.spaces.Box):
-        raise ValueError(f"the actions {space} cannot be played by hand; Discrete and Box actions can")
+        raise ValueError(f"the action space {space} cannot be played by hand; expected Discrete or Box")
     is_discrete = isinstance(space, gym.spaces.Discrete)
     convert: Callable[[Any, str, Any], Any] = _discrete if is_discrete else _box
-    said = {convert(space, label, action): label for action, label in labels}
+    descriptions = {convert(space, label, action): label for action, label in labels}
     by_keys: dict[frozenset[str], Binding] = {}
     for name, action in actions.items():
         if name != NONE:
             held = _keys(name)
             converted = convert(space, name, action)
-            label = said.get(converted, f"action {converted}" if is_discrete else _text(action))
+            label = descriptions.get(converted, f"action {converted}" if is_discrete else _text(action))
             by_keys[held] = Binding(held, converted, label)
     bindings = tuple(by_keys.values())
     if isinstance(space, gym.spaces.Box):
@@ -151,14 +149,13 @@ def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[An
 
 
 def default_actions(space: gym.Space) -> dict[str, Any]:
-    """Returns a map for a space of which nothing else is known.
+    """Returns the default key map of an action space.
 
-    Box: a/d for the first number, s/w for the second, j/l and k/i for the third and fourth; to -1 and 1 where there is no
-    bound. Discrete: the number keys, and a/d for two actions, a/d and the middle one for nothing with three, a, s, d, w
-    for the first four of more.
+    Box: a/d for the first component, s/w for the second, j/l and k/i for the third and fourth, to -1 and 1 without bounds.
+    Discrete: the number keys; a/d for two actions; a/d and no key for three actions; a, s, d, w for the first four of more.
 
     Raises:
-        ValueError: for more than four numbers, which need a map of their own.
+        ValueError: for a Box space with more than four components.
 
     >>> default_actions(gym.spaces.Discrete(3))
     {'0': 0, '1': 1, '2': 2, 'a': 0, 'd': 2, 'none': 1}
@@ -177,8 +174,8 @@ def default_actions(space: gym.Space) -> dict[str, Any]:
     if len(rest) > len(AXIS_KEYS):
         example = ",".join(["1"] + ["0"] * (len(rest) - 1))
         raise ValueError(
-            f"an action of {len(rest)} numbers is more than the keys by default reach ({len(AXIS_KEYS)}); bind keys "
-            f"yourself: --keys a=[{example}] ..."
+            f"there are default keys for {len(AXIS_KEYS)} components, but the actions have {len(rest)}; bind keys with --keys "
+            f"a=[{example}] ..."
         )
     actions: dict[str, Any] = {}
     for i, keys in enumerate(AXIS_KEYS[: len(rest)]):
@@ -189,7 +186,7 @@ def default_actions(space: gym.Space) -> dict[str, Any]:
 
 
 def default_labels(space: gym.Space) -> list[tuple[Any, str]]:
-    """Returns what is shown of those of :func:`default_actions` that are not numbers of a Discrete space.
+    """Returns the descriptions of :func:`default_actions`, for Box spaces.
 
     >>> default_labels(gym.spaces.Discrete(2)), default_labels(gym.spaces.Box(-2, 2, (1,)))
     ([], [([-2.0], 'number 1 down'), ([2.0], 'number 1 up')])
@@ -200,20 +197,20 @@ def default_labels(space: gym.Space) -> list[tuple[Any, str]]:
     return [(action, f"number {sides[key][0] + 1} {sides[key][1]}") for key, action in default_actions(space).items()]
 
 
-def spellings(binding: Binding, bindings: tuple[Binding, ...]) -> frozenset[str]:
-    """Returns the keys that a binding is reached by: its own, and the arrows that stand for them."""
+def equivalent_keys(binding: Binding, bindings: tuple[Binding, ...]) -> frozenset[str]:
+    """Returns the keys of a binding and the equivalent arrow keys."""
     bound = {key for other in bindings for key in other.keys}
     return binding.keys | {arrow for arrow, key in ARROWS.items() if key in binding.keys and arrow not in bound}
 
 
 def _canonical(held: Iterable[str], bindings: tuple[Binding, ...]) -> set[str]:
-    """Returns the keys held, the arrows as the letters they stand for unless they are bound."""
+    """Returns the held keys, with unbound arrow keys replaced by the equivalent letters."""
     bound = {key for binding in bindings for key in binding.keys}
     return {key if key in bound else ARROWS.get(key, key) for key in held}
 
 
 def _active(pressed: set[str], bindings: tuple[Binding, ...]) -> list[Binding]:
-    """Returns the bindings in force; one of several keys takes the place of those of some of its keys."""
+    """Returns the active bindings. A binding of several keys overrides those of some of its keys."""
     fitting = [binding for binding in bindings if binding.keys <= pressed]
     return [one for one in fitting if not any(one.keys < other.keys for other in fitting)]
 
@@ -223,17 +220,21 @@ def _keys(name: str) -> frozenset[str]:
     for key in keys:
         if key not in NAMES:
             near = difflib.get_close_matches(key, sorted(NAMES), n=1, cutoff=0.6)
-            hint = f"did you mean {near[0]}?" if near else "letters, digits, left, right, up, down, space, ... are keys"
-            raise ValueError(f"no key is called {key!r}; {hint}")
+            hint = (
+                f"did you mean {near[0]}?"
+                if near
+                else "valid keys are letters, digits, left, right, up, down, space, ..."
+            )
+            raise ValueError(f"unknown key {key!r}; {hint}")
         if key in CONTROLS and key != "space":
-            raise ValueError(f"the key {key!r} cannot be bound: it is the window's own ({CONTROLS[key]})")
+            raise ValueError(f"the key {key!r} cannot be bound: it is reserved for the window ({CONTROLS[key]})")
     return frozenset(keys)
 
 
 def _discrete(space: gym.spaces.Discrete, name: str, action: Any) -> int:
     if isinstance(action, bool) or not isinstance(action, int | np.integer) or not space.contains(np.int64(action)):
         last = int(space.start + space.n - 1)
-        raise ValueError(f"{name}={_text(action)} must be a whole number from {int(space.start)} to {last}")
+        raise ValueError(f"{name}={_text(action)} must be an integer from {int(space.start)} to {last}")
     return int(action)
 
 
@@ -244,7 +245,7 @@ def _box(space: gym.spaces.Box, name: str, action: Any) -> tuple[float, ...]:
         raise ValueError(f"{name}={_text(action)} must be {len(low)} number{'s' if len(low) > 1 else ''}, as in [0.5]")
     for x, least, most in zip(numbers, low, high, strict=True):
         if not (math.isfinite(x) and least <= x <= most):
-            raise ValueError(f"{name}={_text(action)} is outside the actions, which are from {low} to {high}")
+            raise ValueError(f"{name}={_text(action)} is outside the action space, which is from {low} to {high}")
     return tuple(map(float, numbers))
 
 

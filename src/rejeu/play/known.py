@@ -1,4 +1,4 @@
-"""Environments whose keys are known, and short names for some of them."""
+"""Default keys of known environments, and short names for some of them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from rejeu.play import keys
 from rejeu.play.keys import KeyMap
 
 SHORT_NAMES = {"car": "CarRacing-v3", "mountain": "MountainCar-v0", "lunar": "LunarLander-v3"}
-"""What else may be said for an id, in any case of letters."""
+"""Short names of ids; their case is ignored."""
 
 KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
     "CartPole-v1": {
         "a": (0, "left"),
         "d": (1, "right"),
-        # There is no action that does nothing: in turn, the two pushes cancel within 0.04 seconds.
+        # There is no action that does nothing. Alternating pushes cancel within 0.04 seconds.
         "none": ([0, 1], ""),
     },
     "MountainCar-v0": {"a": (0, "left"), "d": (2, "right"), "none": (1, "")},
     "MountainCarContinuous-v0": {"a": ([-1.0], "left"), "d": ([1.0], "right")},
-    # Positive torques turn against the clock.
-    "Pendulum-v1": {"a": ([2.0], "anticlockwise"), "d": ([-2.0], "clockwise")},
-    # Gymnasium names the side engines by the side they are on; the keys by where they push the lander.
+    # Positive torques turn counterclockwise.
+    "Pendulum-v1": {"a": ([2.0], "counterclockwise"), "d": ([-2.0], "clockwise")},
+    # Gymnasium names the side engines by their position, the keys by the direction of the push.
     "LunarLander-v3": {"a": (1, "left"), "d": (3, "right"), "w": (2, "main engine"), "none": (0, "")},
     "LunarLanderContinuous-v3": {
         "a": ([0.0, -1.0], "left"),
@@ -39,7 +39,7 @@ KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
         "w": ([0.0, 1.0, 0.0], "gas"),
         "s": ([0.0, 0.0, 0.8], "brake"),
     },
-    # Acceleration and steering; y points down on the screen, so that a positive angle is to the driver's right.
+    # Acceleration and steering. y points down on the screen, so a positive angle is to the right.
     "parking-v0": {
         "a": ([0.0, -1.0], "left"),
         "d": ([0.0, 1.0], "right"),
@@ -53,14 +53,14 @@ KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
         "s": ([0.0, -2.0], "down"),
     },
 }
-"""By id: the action of each key, and what it does."""
+"""Actions and descriptions of the keys, by id."""
 
 
 def full_name(name: str) -> str:
-    """Returns the id that a short name stands for, or what was given.
+    """Returns the id of a short name, and other names unchanged.
 
     Raises:
-        ValueError: if it is neither an id nor a short name, but nearly a short name.
+        ValueError: if it is similar to a short name, but neither a short name nor an id.
 
     >>> full_name("Mountain"), full_name("CartPole-v1")
     ('MountainCar-v0', 'CartPole-v1')
@@ -68,15 +68,15 @@ def full_name(name: str) -> str:
     if name.lower() not in SHORT_NAMES and name not in gym.registry:
         near = difflib.get_close_matches(name.lower(), SHORT_NAMES, n=1, cutoff=0.7)
         if near:
-            raise ValueError(f"no environment is called {name!r}; did you mean {near[0].capitalize()}?")
+            raise ValueError(f"unknown environment {name!r}; did you mean {near[0].capitalize()}?")
     return SHORT_NAMES.get(name.lower(), name)
 
 
 def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None) -> KeyMap:
-    """Returns the keys of an environment: those known for it, else some by its action space, changed by ``own``.
+    """Returns the key map of an environment: its default keys, or those of its action space, updated by ``own``.
 
     Raises:
-        ValueError: if the actions cannot be played by hand or ``own`` does not fit them.
+        ValueError: if the action space has no keys, or ``own`` does not match it.
 
     >>> [binding.label for binding in keys_for("MountainCar-v0", gym.spaces.Discrete(3)).bindings]
     ['left', 'right']

@@ -1,4 +1,4 @@
-"""What was played, kept: a Minari dataset and a video in one folder."""
+"""Recording of games as a Minari dataset and a video."""
 
 from __future__ import annotations
 
@@ -23,21 +23,20 @@ VIDEO_NAME = "video.mp4"
 
 
 class Recording:
-    """A folder that is itself a Minari path, with one dataset, and the video of the same episodes. Mutable.
+    """A folder with a Minari dataset and a video of the same episodes. Mutable.
 
-    The dataset is complete after every episode, and says how the environment is made unless it was registered by a class
-    rather than by its name. An episode that was given up ends in a truncation; one without a single
-    step is left out. In the video every episode gives the frame after its reset and one frame a step, and its last frame
-    stays for half a second.
+    The folder is a Minari path. The dataset is complete after every episode. It contains the environment's spec, if the spec
+    can be written as JSON. An aborted episode ends in a truncation; an episode without steps is left out. The video has one
+    frame after each reset and one for each step. The last frame of an episode is shown for half a second.
 
     Args:
-        folder: new or empty; made with the first episode.
-        env_id: of the environment; the dataset is called after it.
+        folder: new or empty; created with the first episode.
+        env_id: id of the environment, from which the dataset is named.
         fps: frames per second of the video.
 
     Raises:
         MissingExtra: if Minari or imageio-ffmpeg is not installed.
-        FileExistsError: if the folder holds something.
+        FileExistsError: if the folder is not empty.
     """
 
     def __init__(self, folder: str | Path, env_id: str, fps: float) -> None:
@@ -46,16 +45,16 @@ class Recording:
             import minari
             from minari.data_collector.episode_buffer import EpisodeBuffer
         except ImportError:
-            raise MissingExtra("recording what is played", "minari[hdf5]", "play") from None
+            raise MissingExtra("recording", "minari[hdf5]", "play") from None
         ffmpeg()
         self._minari, self._buffer_type = minari, EpisodeBuffer
         self.folder = Path(folder).absolute()
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise FileExistsError(f"{folder} exists and is not an empty folder; name another, or remove it first")
+            raise FileExistsError(f"{folder} exists and is not an empty folder; choose another one")
         self.dataset_id = re.sub(r"[^\w/-]", "-", env_id) + "/human-v0"
         self.episodes = 0
-        """Episodes kept."""
-        # Made without a render mode: the dataset says how the environment is made again.
+        """Number of recorded episodes."""
+        # Made without a render mode, which would become part of the spec in the dataset.
         self._env = make_env(env_id)
         self._dataset: Any = None
         self._video = VideoFile(self.folder / VIDEO_NAME, fps)
@@ -96,7 +95,7 @@ class Recording:
             self._end()
 
     def close(self) -> None:
-        """Completes dataset and video; what was never played leaves nothing behind."""
+        """Completes dataset and video. Nothing is written if nothing was played."""
         try:
             self._end()
         except BaseException:
@@ -122,9 +121,9 @@ class Recording:
             self._video.write(self._frame)
 
     def _create(self, buffer: Any) -> Any:
-        described = self._env if can_be_written(self._env) else None
+        described = self._env if has_json_spec(self._env) else None
         with minari_path(self.folder), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that nobody is named as the author, and the like
+            warnings.simplefilter("ignore")  # about the missing author and so on
             return self._minari.create_dataset_from_buffers(
                 self.dataset_id,
                 [buffer],
@@ -135,12 +134,12 @@ class Recording:
                 algorithm_name="human",
                 description="Played by hand with rejeu play",
                 data_format="hdf5",
-                jpeg_encoding=False,  # observations as they were, to the last bit
+                jpeg_encoding=False,  # lossless images
             )
 
 
-def can_be_written(env: gym.Env) -> bool:
-    """Returns whether a dataset can say how the environment is made: not if it was registered with a class itself."""
+def has_json_spec(env: gym.Env) -> bool:
+    """Returns whether the environment's spec can be written as JSON: not if it was registered with a class."""
     if env.spec is None:
         return False
     try:
@@ -152,7 +151,7 @@ def can_be_written(env: gym.Env) -> bool:
 
 @contextmanager
 def minari_path(folder: Path) -> Iterator[None]:
-    """Lets Minari look for its datasets in a folder rather than in the user's home; the setting is put back."""
+    """Sets Minari's dataset path to a folder, and restores it at the end."""
     before = os.environ.get("MINARI_DATASETS_PATH")
     os.environ["MINARI_DATASETS_PATH"] = str(folder)
     try:

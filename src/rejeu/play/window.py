@@ -1,4 +1,4 @@
-"""The window of a game: what the environments look like, side by side, with scores above and keys below."""
+"""The window of a game: the environments side by side, with scores above and keys below."""
 
 from __future__ import annotations
 
@@ -10,53 +10,53 @@ import numpy as np
 
 from rejeu.errors import MissingExtra
 from rejeu.play.game import Game, Player
-from rejeu.play.keys import KeyMap, spellings
+from rejeu.play.keys import KeyMap, equivalent_keys
 from rejeu.reporting.text import counted
 
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 Keycap = tuple[str, frozenset[str]]
-"""What stands on a key of the legend, and the names of the keys that press it."""
+"""Text of a key in the legend, and the names of the equivalent keys."""
 
 PAPER, INK, FAINT, LINE = (246, 246, 243), (52, 58, 70), (128, 134, 145), (214, 217, 222)
 BLUE, GREEN, WHITE = (40, 104, 190), (38, 150, 96), (255, 255, 255)
 MARGIN, HEADER, MESSAGE_ROW, LEGEND_ROW = 14, 62, 38, 26
-"""Pixels around and between the pictures, above each, below each for its message, and of a row of the legend."""
-LEAST_HEIGHT, MOST_WIDTH = 360, 720
-"""Pictures much lower than this are enlarged, by a whole number, until they are as high or would get too wide."""
+"""Pixels: margin, header and message row of each picture, and row of the legend."""
+MIN_HEIGHT, MAX_WIDTH = 360, 720
+"""Smaller pictures are enlarged by an integer factor up to this height, unless they would exceed this width."""
 SHARE_OF_SCREEN = 0.9
-"""Of the screen, at most, that the window opens on."""
-UNSEEN = ("dummy", "offscreen")
-"""SDL's drivers without a screen; they are used where they are asked for by SDL_VIDEODRIVER, as by the tests."""
+"""Maximum share of the screen that the window uses."""
+OFFSCREEN_DRIVERS = ("dummy", "offscreen")
+"""SDL's drivers without a screen. They are used only if SDL_VIDEODRIVER selects them, as in the tests."""
 HELP = (("r", "restart"), ("p", "pause"), ("q", "quit"))
 
 
 class Event(NamedTuple):
-    """Something that a person did."""
+    """An event of the keyboard or the window."""
 
     kind: str
-    """``press``, ``release``, ``leave`` (the keyboard went to another window) or ``close``."""
+    """``press``, ``release``, ``leave`` (the window lost the keyboard focus) or ``close``."""
     key: str = ""
-    """SDL's name of the key, in lower case."""
+    """SDL's name of the key in lower case."""
 
 
 class Entry(NamedTuple):
     """An action in the legend."""
 
     keys: list[Keycap]
-    """Each does it."""
+    """Alternative keys of the action."""
     label: str
-    """What it does."""
+    """Description of the action."""
 
 
 class Window:
-    """One window on the screen. Mutable; as a context manager it is closed at the end.
+    """A window on the screen. Mutable; as a context manager it is closed at the end.
 
-    It opens in two steps, because environments draw with the same library: where there is no screen, that must be found
-    out before the first of them draws, and how large the window is depends on what they draw.
+    It opens in two steps, because environments render with the same library. Whether there is a screen is checked before an
+    environment renders, and the size of the window depends on the rendered frames.
 
     Raises:
         MissingExtra: if pygame-ce is not installed.
-        OSError: if there is no screen.
+        OSError: if there is no display.
     """
 
     def __init__(self, title: str) -> None:
@@ -71,21 +71,23 @@ class Window:
             driver = pygame.display.get_driver()
         except pygame.error as error:
             driver = str(error)
-        # SDL falls back on drivers that draw into memory, where nobody would ever close the window.
-        if not pygame.display.get_init() or (driver in UNSEEN and os.environ.get("SDL_VIDEODRIVER") != driver):
+        # SDL falls back to offscreen drivers, where nobody could close the window.
+        if not pygame.display.get_init() or (
+            driver in OFFSCREEN_DRIVERS and os.environ.get("SDL_VIDEODRIVER") != driver
+        ):
             pygame.display.quit()
             raise OSError(
-                f"no window can be opened here: SDL finds no screen ({driver}); rejeu record RUN films without a screen"
+                f"cannot open a window: SDL finds no display ({driver}); rejeu record RUN writes a video without a display"
             )
         pygame.font.init()
         self.canvas: Any = None
-        """What is shown, at its natural size."""
+        """The surface at its natural size."""
         self._screen: Any = None
         self._legend: list[Entry] = []
         self._sizes: list[tuple[int, int]] = []
 
     def open(self, game: Game, keys: KeyMap | None) -> None:
-        """Opens the window at a size that holds the game's pictures, with the keys' meanings if there are any."""
+        """Opens the window at the size of the game's frames, with a legend if there are keys."""
         pygame = self.pygame
         self._fonts = {size: pygame.font.Font(None, size) for size in (20, 22, 24)}
         self._legend = [] if keys is None else legend(keys)
@@ -98,10 +100,10 @@ class Window:
         fit = min(1.0, SHARE_OF_SCREEN * screen_width / width, SHARE_OF_SCREEN * screen_height / height)
         self._screen = pygame.display.set_mode((round(width * fit), round(height * fit)), pygame.RESIZABLE)
         pygame.display.set_caption(self.title)
-        pygame.key.stop_text_input()  # else an input method may keep letters to itself
+        pygame.key.stop_text_input()  # otherwise an input method may swallow letters
 
     def events(self) -> list[Event]:
-        """Returns what happened since the last call, oldest first."""
+        """Returns the events since the last call, oldest first."""
         pygame = self.pygame
         found = []
         for event in pygame.event.get():
@@ -115,7 +117,7 @@ class Window:
         return found
 
     def draw(self, game: Game) -> None:
-        """Shows the game as it stands."""
+        """Draws the game."""
         self.canvas.fill(PAPER)
         left = MARGIN
         for player, size in zip(game.players, self._sizes, strict=True):
@@ -154,7 +156,7 @@ class Window:
 
     def _draw_header(self, player: Player, left: int, width: int, by_hand: bool) -> None:
         self._write(player.name, (left, 12), 24, INK)
-        self._write(so_far(player, by_hand), (left + width, 14), 22, FAINT, right=True)
+        self._write(score_summary(player, by_hand), (left + width, 14), 22, FAINT, right=True)
         self._write(f"score {number(player.score)}", (left, 37), 24, BLUE)
         self._write(f"step {player.steps}", (left + width, 38), 22, FAINT, right=True)
 
@@ -166,16 +168,16 @@ class Window:
         self.canvas.blit(picture, corner)
         self.pygame.draw.rect(self.canvas, LINE, (corner[0] - 1, corner[1] - 1, size[0] + 2, size[1] + 2), 1)
 
-    def _draw_message(self, text: str, middle: tuple[float, float], colour: Colour) -> None:
-        """Writes on a plate beside the picture, never on it, where it would cover a goal."""
+    def _draw_message(self, text: str, middle: tuple[float, float], color: Color) -> None:
+        """Writes a message below the picture, where it covers nothing."""
         drawn = self._fonts[24].render(text, True, WHITE)
         plate = drawn.get_rect().inflate(28, 10)
         plate.center = round(middle[0]), round(middle[1])
-        self.pygame.draw.rect(self.canvas, colour, plate, border_radius=8)
+        self.pygame.draw.rect(self.canvas, color, plate, border_radius=8)
         self.canvas.blit(drawn, (plate.x + 14, plate.y + 6))
 
     def _arrange(self, width: int) -> list[list[tuple[Entry, int]]]:
-        """Returns the legend in rows that fit, each entry with its left edge; the window's own keys come last."""
+        """Returns the rows of the legend, each entry with its left edge; the window's keys come last."""
         entries = [*self._legend, *(Entry([(key, frozenset())], label) for key, label in HELP)]
         rows: list[list[tuple[Entry, int]]] = [[]]
         left = MARGIN
@@ -205,22 +207,22 @@ class Window:
                     left += self._key_width(text) + 4
                 self._write(entry.label, (left + 2, y + 4), 20, FAINT)
 
-    def _write(self, text: str, corner: tuple[int, int], size: int, colour: Colour, right: bool = False) -> None:
-        drawn = self._fonts[size].render(text, True, colour)
+    def _write(self, text: str, corner: tuple[int, int], size: int, color: Color, right: bool = False) -> None:
+        drawn = self._fonts[size].render(text, True, color)
         self.canvas.blit(drawn, (corner[0] - drawn.get_width() if right else corner[0], corner[1]))
 
 
 def legend(keys: KeyMap) -> list[Entry]:
-    """Returns what is shown of each action, in the order of the bindings: all keys that do it, and what it does."""
+    """Returns the entries of the legend in the order of the bindings: all keys of each action, and its description."""
     entries: dict[Any, Entry] = {}
     for binding in keys.bindings:
         entry = entries.setdefault(binding.action, Entry([], binding.label))
-        entry.keys.append(("+".join(sorted(binding.keys)), spellings(binding, keys.bindings)))
+        entry.keys.append(("+".join(sorted(binding.keys)), equivalent_keys(binding, keys.bindings)))
     return list(entries.values())
 
 
 def message(game: Game, player: Player) -> str:
-    """Returns what is written below a player's picture, empty for nothing."""
+    """Returns the message below a player's picture, empty for none."""
     if player.over and player.steps:
         outcome = {1.0: "success", 0.0: "failed"}.get(player.success, "over")
         return f"{outcome}: {number(player.score)}"
@@ -229,8 +231,8 @@ def message(game: Game, player: Player) -> str:
     return "press a key to begin" if game.phase == "ready" else ""
 
 
-def so_far(player: Player, by_hand: bool) -> str:
-    """Returns what is written of the episodes played to their end, empty before there is one; by hand without the mean."""
+def score_summary(player: Player, by_hand: bool) -> str:
+    """Returns a summary of the completed episodes, empty before the first; without the mean if played by hand."""
     if not player.scores:
         return ""
     best = f"best {number(player.best)}"
@@ -238,18 +240,18 @@ def so_far(player: Player, by_hand: bool) -> str:
 
 
 def picture_size(frame: np.ndarray) -> tuple[int, int]:
-    """Returns the width and height at which a picture is shown: its own, or whole times that if it is small.
+    """Returns the width and height at which a picture is shown: its own, or an integer multiple if it is small.
 
     >>> [picture_size(np.zeros((*size, 3), np.uint8)) for size in ((400, 600), (100, 80), (150, 600))]
     [(600, 400), (320, 400), (600, 150)]
     """
     height, width = frame.shape[:2]
-    times = max(min(math.ceil(LEAST_HEIGHT / height), MOST_WIDTH // width), 1) if height < 0.75 * LEAST_HEIGHT else 1
+    times = max(min(math.ceil(MIN_HEIGHT / height), MAX_WIDTH // width), 1) if height < 0.75 * MIN_HEIGHT else 1
     return width * times, height * times
 
 
 def number(value: float) -> str:
-    """Returns a score as it is shown: whole, or with one digit; a dash if there is none.
+    """Returns a score as text: an integer, or with one decimal; a dash for NaN.
 
     >>> number(200.0), number(-13.27), number(float("nan"))
     ('200', '-13.3', '-')

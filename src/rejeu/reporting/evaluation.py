@@ -1,4 +1,4 @@
-"""Measuring a policy: episodes played to their end, their mean, and how sure it is."""
+"""Evaluation of policies: complete episodes, means and confidence intervals."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation:
-    """What a number of whole episodes came to."""
+    """Results of evaluating a policy for several complete episodes."""
 
     returns: np.ndarray
     """Sum of rewards of each episode, ``(n,)``."""
     lengths: np.ndarray
     """Steps of each episode, ``(n,)``."""
     successes: np.ndarray
-    """1 or 0 for each episode, ``(n,)``: what the environment says, else whether the return reached the threshold; NaN
-    where there is neither."""
+    """1 or 0 for each episode, ``(n,)``: as reported by the environment, else whether the return reached the threshold, else
+    NaN."""
 
     @property
     def mean_return(self) -> float:
@@ -41,7 +41,7 @@ class Evaluation:
 
     @property
     def std_return(self) -> float:
-        """Standard deviation of the returns over episodes (dividing by n)."""
+        """Standard deviation of the returns over episodes (divided by n)."""
         return float(np.std(self.returns))
 
     @property
@@ -51,7 +51,7 @@ class Evaluation:
 
     @property
     def return_interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the mean return, by Student's t; NaN for a single episode."""
+        """95 % confidence interval of the mean return (Student's t), NaN for a single episode."""
         n = len(self.returns)
         if n < 2:
             return math.nan, math.nan
@@ -62,12 +62,12 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float:
-        """Share of the episodes that succeeded, NaN where it is unknown."""
+        """Share of successful episodes, NaN if unknown."""
         return float(np.mean(self.successes))
 
     @property
     def success_interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the success rate, by Wilson's score; NaN where it is unknown."""
+        """95 % confidence interval of the success rate (Wilson score), NaN if unknown."""
         if math.isnan(self.success_rate):
             return math.nan, math.nan
         from scipy import stats
@@ -76,10 +76,10 @@ class Evaluation:
         return float(bounds.low), float(bounds.high)
 
     def plot(self, path: str | Path | None = None) -> Picture:
-        """Returns a matplotlib figure of the episodes' returns and their mean; a notebook shows it by itself.
+        """Returns a matplotlib figure of the returns and their mean, which notebooks display.
 
         Args:
-            path: of a file to write, whose suffix says the format; None for none.
+            path: file to write, in the format of its suffix; None for none.
 
         Raises:
             MissingExtra: if matplotlib is not installed.
@@ -91,19 +91,19 @@ class Evaluation:
     def __str__(self) -> str:
         low, high = self.return_interval
         text = (
-            f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % interval of the mean {low:.2f} to {high:.2f}), "
+            f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % CI of the mean {low:.2f} to {high:.2f}), "
             f"length {self.mean_length:.1f}, {counted(len(self.returns), 'episode')}"
         )
         if not math.isnan(self.success_rate):
             low, high = self.success_interval
-            text = f"success {self.success_rate:.1%} (95 % interval {low:.1%} to {high:.1%}), {text}"
+            text = f"success {self.success_rate:.1%} (95 % CI {low:.1%} to {high:.1%}), {text}"
         return text
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
 
     def _repr_html_(self) -> str:
-        """Returns a table, which a notebook shows for the last expression of a cell."""
+        """Returns a table for notebooks."""
         (low, high), rows = self.return_interval, []
         if not math.isnan(self.success_rate):
             least, most = self.success_interval
@@ -112,7 +112,7 @@ class Evaluation:
             ("return", f"{self.mean_return:,.2f}", f"{low:,.2f} to {high:,.2f}", f"{self.std_return:,.2f}"),
             ("length", f"{self.mean_length:,.1f}", "", f"{np.std(self.lengths):,.1f}"),
         ]
-        head = (counted(len(self.returns), "episode"), "mean", "95 % interval of the mean", "standard deviation")
+        head = (counted(len(self.returns), "episode"), "mean", "95 % CI of the mean", "standard deviation")
         lines = ["".join(f"<th>{cell}</th>" for cell in head)]
         lines += [f"<th>{row[0]}</th>" + "".join(f"<td>{cell}</td>" for cell in row[1:]) for row in rows]
         return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
@@ -126,25 +126,24 @@ def evaluate(
     seed: int | None = None,
     seconds: float | None = None,
 ) -> Evaluation:
-    """Plays whole episodes and returns what they came to.
+    """Evaluates a policy for complete episodes.
 
-    Every environment plays its own fixed share of the episodes, so that short ones are not counted more often. When the time
-    is over, no further episode begins, and those under way are played to their end and count: to leave them out would leave
-    out the long ones.
+    Every environment plays a fixed share of the episodes, because otherwise short episodes would be counted more often. After
+    ``seconds`` no episode is started, but running episodes are completed and counted, because otherwise long episodes would
+    be left out.
 
     Args:
-        policy: maps observations ``(n_envs, ...)``, and where an episode begins with one, ``bool (n_envs,)``, to actions in
-            the algorithm's range.
-        env: reset at the beginning; left wherever the last episode ended.
-        episodes: at most so many, at least 1; None with ``seconds`` for as many as there is time for.
-        success_threshold: return from which on an episode counts as a success where the environment does not say; None
-            takes the environment's reward threshold.
-        seed: of the environments' reset; None lets their random numbers go on.
-        seconds: of wall time in which episodes begin; None for no limit. Every environment that has a share of the episodes
-            plays at least one.
+        policy: maps observations ``(n_envs, ...)`` and episode starts ``bool (n_envs,)`` to actions in the algorithm's range.
+        env: the environments, which are reset first.
+        episodes: number of episodes, at least 1; None for as many as ``seconds`` allows.
+        success_threshold: return of a successful episode, if the environment does not report success; None for the
+            environment's reward threshold.
+        seed: seed of the environments; None continues their random state.
+        seconds: wall time after which no episode is started, None for no limit. Every environment with a share of the
+            episodes plays at least one.
     """
     if episodes is None and seconds is None:
-        raise ValueError("evaluate needs a number of episodes or a time")
+        raise ValueError("evaluate needs episodes or seconds")
     if episodes is not None and episodes < 1:
         raise ValueError(f"episodes={episodes} must be at least 1")
     n_envs, most = env.n_envs, np.iinfo(np.int64).max

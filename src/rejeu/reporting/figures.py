@@ -1,4 +1,4 @@
-"""A matplotlib figure that a notebook shows without ``%matplotlib inline``; imports matplotlib."""
+"""A matplotlib figure that notebooks display without ``%matplotlib inline``. Imports matplotlib."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 
 
 class Picture(Figure):
-    """A figure outside of pyplot that is its own image in a notebook.
+    """A figure that a notebook displays as a PNG.
 
-    ``pyplot`` would draw into whatever backend is set, and keep every figure alive until it is closed.
+    It does not use ``pyplot``, which depends on a global backend and keeps every figure until it is closed.
     """
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        """Returns the figure as a PNG file with its width in a page, 100 pixels an inch, as IPython asks for it."""
+        """Returns the figure as PNG and its display width, for IPython."""
         buffer = io.BytesIO()
         self.savefig(buffer, format="png")
         return buffer.getvalue(), {"width": round(100 * self.get_figwidth())}

@@ -34,7 +34,7 @@ class History:
         self._records = array("q")
         """Rows of the episodes with a higher return than all before them."""
         self.best_return = -math.inf
-        """The highest return of an episode; minus infinity before the first."""
+        """The highest return of an episode, minus infinity before the first."""
         for episode in episodes:
             self.append(episode)
 
@@ -42,7 +42,7 @@ class History:
         return len(self._values) // len(COLUMNS)
 
     def __getitem__(self, column: str) -> np.ndarray:
-        """Returns one column, ``(n_episodes,)``: step, env, return, length, success or seconds.
+        """Returns a column, ``(n_episodes,)``: step, env, return, length, success or seconds.
 
         Raises:
             KeyError: for another name.
@@ -106,17 +106,17 @@ class History:
         self._values.extend(episode)
 
     def table(self) -> np.ndarray:
-        """Returns everything as one array, ``float64 (n_episodes, 6)``, its columns in the order of ``COLUMNS``."""
+        """Returns the table as an array, ``float64 (n_episodes, 6)``, with the columns ``COLUMNS``."""
         return np.array(self._values, np.float64).reshape(-1, len(COLUMNS))
 
     def replace(self, table: np.ndarray) -> None:
         """Replaces all episodes by those of a table, as :meth:`table` returns it.
 
         Raises:
-            ValueError: if it is no such table.
+            ValueError: if the table is invalid.
         """
         if table.dtype != np.float64 or table.shape[1:] != (len(COLUMNS),):
-            raise ValueError(f"a history is float64[n, {len(COLUMNS)}], got {table.dtype}{list(table.shape)}")
+            raise ValueError(f"a history must be float64[n, {len(COLUMNS)}], got {table.dtype}{list(table.shape)}")
         for column in ("step", "env", "length"):
             if not np.isfinite(table[:, COLUMNS.index(column)]).all():
                 raise ValueError(f"the column {column!r} of a history must be finite")
@@ -148,9 +148,9 @@ class History:
         """Returns a matplotlib figure of returns and, if known, success; notebooks display it.
 
         Args:
-            path: of a file to write, whose suffix says the format; None for none.
+            path: file to write, in the format of its suffix; None for none.
             against: ``"step"`` or ``"seconds"``.
-            window: episodes in the moving average; None: a fifth of the run, at least 3 and at most 50.
+            window: episodes in the moving average; None for a fifth of the run, at least 3 and at most 50.
 
         Raises:
             MissingExtra: if matplotlib is not installed.
@@ -172,9 +172,9 @@ class Averages:
     """Number of episodes."""
     mean_return: float
     std_return: float
-    """Standard deviation over episodes, dividing by n."""
+    """Standard deviation over episodes (divided by n)."""
     mean_length: float
-    """In steps."""
+    """Mean length in steps."""
     std_length: float
     success_rate: float
     """Share of successes among the episodes where success is known."""
@@ -201,11 +201,11 @@ class Summary:
     """Summary of a run; ``print`` and notebooks show it as a table."""
 
     steps: int
-    """Environment steps taken when the last episode ended."""
+    """Environment steps at the end of the last episode."""
     seconds: float
-    """Wall time of training when the last episode ended."""
+    """Training time in seconds at the end of the last episode."""
     all: Averages
-    """Over all episodes."""
+    """Means over all episodes."""
     last: Averages
     """Over the last ``window`` episodes, or all if there are fewer."""
     records: int

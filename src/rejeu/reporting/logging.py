@@ -1,4 +1,4 @@
-"""Where numbers go while training: one ``write(step, metrics)`` for console, CSV and TensorBoard."""
+"""Logging of metrics to console, CSV and TensorBoard."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from rejeu.reporting.notebook import Display
 
 
 class Sink(Protocol):
-    """Something that takes metrics."""
+    """An output of metrics."""
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Takes the metrics of environment step ``step``; names are ``group/name``."""
+        """Writes the metrics of environment step ``step``. Names are ``group/name``."""
 
     def close(self) -> None:
-        """Finishes."""
+        """Closes the output."""
 
 
 class Console:
-    """Shows metrics as a table, grouped by the part of the name before the slash.
+    """Prints metrics as a table, grouped by the part of the name before the slash.
 
-    In a notebook one table is kept up to date; elsewhere each is printed. Tables that come faster than ``seconds`` are left
-    out, except for the last, which :meth:`close` shows.
+    In a notebook one table is updated. Tables within ``seconds`` of the previous one are skipped, except for the last one,
+    which :meth:`close` prints.
 
     Args:
-        seconds: least time between two tables; 0 shows all.
+        seconds: minimum time between two tables; 0 prints all.
     """
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
         self._display: Display | None = None
         self._due = -math.inf
-        self._left_out: tuple[int, Mapping[str, float]] | None = None
+        self._skipped: tuple[int, Mapping[str, float]] | None = None
 
     def __str__(self) -> str:
         return "the console"
@@ -52,15 +52,15 @@ class Console:
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         now = time.monotonic()
         if now < self._due:
-            self._left_out = step, metrics
+            self._skipped = step, metrics
             return
-        self._due, self._left_out = now + self.seconds, None
+        self._due, self._skipped = now + self.seconds, None
         self._show(step, metrics)
 
     def close(self) -> None:
-        if self._left_out is not None:
-            self._show(*self._left_out)
-            self._left_out = None
+        if self._skipped is not None:
+            self._show(*self._skipped)
+            self._skipped = None
 
     def _show(self, step: int, metrics: Mapping[str, float]) -> None:
         from rich import box
@@ -88,14 +88,13 @@ class Console:
 
 
 class CsvFile:
-    """Appends rows to a CSV file; a row may bring new columns, which are then empty in those before it.
+    """Appends rows to a CSV file. A row may add columns, which are empty in the rows before it.
 
-    Each row is there entirely or not at all. Where rows or columns that are already written change, a new file takes the
-    place of the old one once it is complete.
+    Rows are written atomically. If existing rows or columns change, the file is replaced when the new one is complete.
 
     Args:
-        path: of the file.
-        up_to: of a file that is there already, keep the rows up to this step; None starts an empty one.
+        path: path of the file.
+        up_to: step up to which the rows of an existing file are kept; None starts an empty file.
     """
 
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
@@ -118,7 +117,7 @@ class CsvFile:
         """Adds a row.
 
         Raises:
-            OSError: if that is impossible; the file is then as it was.
+            OSError: if writing fails; the file is not changed.
         """
         row = {"step": step, **metrics}
         if new := [name for name in row if name not in self._columns]:
@@ -133,7 +132,7 @@ class CsvFile:
             atomic.append(self.path, self._lines([row]))
 
     def close(self) -> None:
-        """Does nothing: rows are in the file as soon as they are written."""
+        """Does nothing, because rows are not buffered."""
 
     def _read(self) -> list[dict[str, str]]:
         with self.path.open(newline="", encoding="utf-8") as file:
@@ -155,8 +154,7 @@ class CsvFile:
 class TensorBoard:
     """Writes scalars for TensorBoard into a folder.
 
-    Each row is appended at once, where TensorBoard's own writer does so in a thread, which ends when a write fails and takes
-    the rows that wait with it.
+    Rows are not buffered. TensorBoard's own writer uses a thread, which ends when a write fails and loses the buffered rows.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -179,7 +177,7 @@ class TensorBoard:
         """Adds a row.
 
         Raises:
-            OSError: if that is impossible; the file is then as it was.
+            OSError: if writing fails; the file is not changed.
         """
         event = self._event(wall_time=time.time(), step=step)
         for name, value in metrics.items():
@@ -187,7 +185,7 @@ class TensorBoard:
         self._append(event)
 
     def close(self) -> None:
-        """Does nothing: rows are in the file as soon as they are written."""
+        """Does nothing, because rows are not buffered."""
 
     def _append(self, event: Any) -> None:
         record = io.BytesIO()
@@ -196,11 +194,11 @@ class TensorBoard:
 
 
 class Logger:
-    """Collects numbers by name until they are written: what callbacks add to the rows of a run.
+    """Collects metrics of callbacks until they are written.
 
     Args:
-        folder: where its files lie, None for nowhere.
-        output_formats: sinks that take the rows, in place of console and TensorBoard.
+        folder: folder of its files, None for none.
+        output_formats: sinks that replace console and TensorBoard.
 
     >>> logger = Logger()
     >>> logger.record("game/score", 3)
@@ -212,25 +210,25 @@ class Logger:
         self.dir = None if folder is None else str(folder)
         self.outputs = list(output_formats)
         self.name_to_value: dict[str, float] = {}
-        """What was recorded since the last row."""
+        """Metrics recorded since the last row."""
         self.name_to_count: dict[str, int] = {}
-        """How many numbers the means among them are of."""
+        """Number of values in each mean since the last row."""
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
-        """Adds a number to the next row, in place of one of that name.
+        """Records a metric for the next row, and replaces an earlier value.
 
         Args:
-            key: its name, ``group/name``.
+            key: name of the metric, ``group/name``.
             value: a number.
-            exclude: accepted and without effect: every place gets every number.
+            exclude: accepted without effect; every output gets every metric.
 
         Raises:
-            TypeError: if it is no number.
+            TypeError: if the value is not a number.
         """
         self.name_to_value[key] = _number(key, value)
 
     def record_mean(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
-        """Does the same with the mean of what was given under that name since the last row; None is passed over."""
+        """Records the mean of the values since the last row; None is ignored."""
         if value is None:
             return
         n = self.name_to_count[key] = self.name_to_count.get(key, 0) + 1
@@ -238,22 +236,22 @@ class Logger:
         self.name_to_value[key] = mean + (_number(key, value) - mean) / n
 
     def take(self) -> dict[str, float]:
-        """Returns what was recorded, and forgets it."""
+        """Returns and clears the recorded metrics."""
         taken, self.name_to_value, self.name_to_count = self.name_to_value, {}, {}
         return taken
 
     def dump(self, step: int = 0) -> None:
-        """Writes what was recorded as a row of its own, and forgets it."""
+        """Writes the recorded metrics as a row, and clears them."""
         row = self.take()
         for output in self.outputs if row else ():
             output.write(step, row)
 
     def get_dir(self) -> str | None:
-        """Returns where its files lie."""
+        """Returns the folder of its files."""
         return self.dir
 
     def close(self) -> None:
-        """Finishes the outputs."""
+        """Closes the outputs."""
         for output in self.outputs:
             output.close()
 
@@ -262,8 +260,8 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
     """Returns a logger for ``agent.set_logger``.
 
     Args:
-        folder: where the files go; None is the working folder.
-        format_strings: of ``"stdout"``, ``"csv"`` (``progress.csv``) and ``"tensorboard"``; None: ``"stdout"``.
+        folder: folder of the files, None for the current folder.
+        format_strings: any of ``"stdout"``, ``"csv"`` (``progress.csv``) and ``"tensorboard"``; None for ``"stdout"``.
 
     Raises:
         ValueError: for another format.
@@ -278,21 +276,19 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
         elif kind == "tensorboard":
             outputs.append(TensorBoard(folder))
         else:
-            raise ValueError(f"format_strings has {kind!r}; there are 'stdout', 'csv' and 'tensorboard'")
+            raise ValueError(f"format_strings contains {kind!r}, expected 'stdout', 'csv' or 'tensorboard'")
     return Logger(folder, outputs)
 
 
 def _number(key: str, value: Any) -> float:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf" or array.size != 1:
-        raise TypeError(
-            f"record({key!r}) takes a number, got {type(value).__name__}; write other things to files of yours"
-        )
+        raise TypeError(f"record({key!r}) expected a number, got {type(value).__name__}")
     return array.item()
 
 
 def next_folder(root: str | Path, name: str) -> Path:
-    """Returns ``root/name_k`` with the first k from 1 that is free, as Stable-Baselines3 names its log folders."""
+    """Returns the first ``root/name_k`` (k from 1) that does not exist, as Stable-Baselines3 names its log folders."""
     root = Path(root)
     k = 1
     while (root / f"{name}_{k}").exists():

@@ -1,4 +1,4 @@
-"""Output that changes while a cell of a notebook runs, and stays in the notebook and in files exported from it."""
+"""Notebook output that is updated while a cell runs and is saved with the notebook."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import Any
 
 
 class Display:
-    """One place in a cell's output, whose text can be replaced. Mutable; for a notebook only.
+    """An output of a cell whose text can be replaced. Mutable; for notebooks only.
 
-    Unlike a widget it is part of the saved notebook as it stood last, and needs no package but IPython.
+    Unlike a widget it is saved with the notebook, and needs no package but IPython.
     """
 
     def __init__(self) -> None:
         self._handle: Any = None
 
     def show(self, text: str) -> None:
-        """Puts text, which is shown in a font of fixed width, in place of what was shown before."""
+        """Replaces the text, which is shown in a monospaced font."""
         from IPython.display import display
 
         data = {"text/plain": text}

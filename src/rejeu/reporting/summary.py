@@ -1,7 +1,7 @@
 r"""A text drawing of an agent's networks.
 
-A plain actor of two hidden layers reads ``state -64-64- 2``: what goes in, the widths of the hidden layers, what comes
-out. Critics of which observation and action go through branches of their own are drawn as branches::
+An actor with two hidden layers is drawn as ``state -64-64- 2``: the input, the sizes of the hidden layers, the number of
+outputs. Critics with separate branches for state and action are drawn as branches::
 
     action -16-32-
                    \
@@ -10,7 +10,7 @@ out. Critics of which observation and action go through branches of their own ar
                     /
     state -17-33-  /
 
-Targets are not drawn: they are copies. Each network's number of parameters stands beside its name.
+Target networks are left out. Each network has its number of parameters next to its name.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ ARROW = " -> "
 
 
 def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
-    """Returns the drawing of every network of an algorithm's state, and what ``state`` is made of.
+    """Returns the drawings of all networks of an algorithm's state, and the parts of the observation.
 
     Args:
-        state: the algorithm's state, of arrays or of their shapes; its averaged fields (target networks) are left out.
-        leaves: those of the observations.
+        state: the algorithm's state, of arrays or shapes. Its averaged fields (target networks) are left out.
+        leaves: leaves of the observation space.
     """
     if isinstance(state, normalization.State):
         state = state.learner
@@ -53,19 +53,19 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
 
 
 def n_parameters(network: Any) -> int:
-    """Returns how many numbers a network learns, all members of an ensemble together."""
+    """Returns the number of parameters of a network, over all members of an ensemble."""
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(network))
 
 
 def n_members(network: Any) -> int | None:
-    """Returns how many networks are stacked in one; None if it is a single one."""
+    """Returns the number of members of an ensemble, None for a single network."""
     if isinstance(network, Actor | Critic) and len(network.head.bias.shape) == 2:
         return network.head.bias.shape[0]
     return None
 
 
 def count(network: Any) -> str:
-    """Returns the number of parameters in words: ``2 x 4,801 = 9,602 parameters``."""
+    """Returns the number of parameters as text: ``2 x 4,801 = 9,602 parameters``."""
     total, members = n_parameters(network), n_members(network)
     return f"{total:,} parameters" if members is None else f"{members} x {total // members:,} = {total:,} parameters"
 
@@ -74,8 +74,8 @@ def draw(network: Any, reach: int = 0) -> str:
     """Returns the drawing of one network.
 
     Args:
-        network: an actor or a critic, single or stacked, or policy and value in one; of others only the class is named.
-        reach: least width of the branches, so that actor and critic line up.
+        network: an actor, a critic, an ensemble, or policy and value. Of other modules the class name is shown.
+        reach: minimum width of the branches, which aligns actor and critic.
     """
     if isinstance(network, ActorCritic):
         return draw_policy_and_value(network, "state", "state")
@@ -91,7 +91,7 @@ def draw(network: Any, reach: int = 0) -> str:
 
 
 def draw_policy_and_value(network: ActorCritic, policy_entrance: str, value_entrance: str) -> str:
-    """Returns policy and value, a line each; where they share layers the value's line shows them again."""
+    """Returns the lines of policy and value. Shared layers appear in both."""
     torso = network.torso if network.value_torso is None else network.value_torso
     policy = draw_torso(policy_entrance, network.torso, network.head.bias.shape[-1])
     value = draw_torso(value_entrance, torso, 1) + (" (shared layers)" if network.value_torso is None else "")
@@ -99,7 +99,7 @@ def draw_policy_and_value(network: ActorCritic, policy_entrance: str, value_entr
 
 
 def draw_torso(entrance: str, torso: Any, output: int) -> str:
-    """Returns on one line what goes in, the hidden layers and what comes out."""
+    """Returns input, hidden layers and output on one line."""
     if isinstance(torso, Branches):
         layers = [*widths(torso.state), *widths(torso.common), *widths(torso.last)]
         return f"{entrance} {'-'.join(['', *layers, ''])} {output}"
@@ -112,17 +112,17 @@ def draw_torso(entrance: str, torso: Any, output: int) -> str:
 
 
 def widths(mlp: MLP) -> list[str]:
-    """Returns the widths of the layers of a perceptron."""
+    """Returns the sizes of the hidden layers of an MLP."""
     return [str(layer.bias.shape[-1]) for layer in mlp.layers]
 
 
 def chain(mlp: MLP) -> str:
-    """Returns hidden layers as ``-64-64-``, no layers as ``-``."""
+    """Returns hidden layers as ``-64-64-``, or ``-`` without layers."""
     return "-".join(["", *widths(mlp), ""])
 
 
 def draw_branches(torso: Branches, output: int, reach: int) -> str:
-    """Returns the branches, where they meet, and the way on from there."""
+    """Returns the drawing of branches and the layers after them."""
     state = f"state {chain(torso.state)}"
     trunk = f"{chain(torso.common)} {'-'.join([*widths(torso.last), str(output)])}"
     reach = max(reach, branches_width(torso))
@@ -133,26 +133,26 @@ def draw_branches(torso: Branches, output: int, reach: int) -> str:
 
 
 def branches_width(torso: Branches) -> int:
-    """Returns how many characters the longer branch takes."""
+    """Returns the width of the longer branch in characters."""
     action = 0 if torso.action is None else len(f"action {chain(torso.action)}")
     return max(action, len(f"state {chain(torso.state)}"))
 
 
 def branch_width(network: Any) -> int:
-    """Returns how many characters the branches of a network take, 0 if it has none."""
+    """Returns the width of a network's branches in characters, 0 without branches."""
     is_branched = isinstance(network, Actor | Critic) and isinstance(network.torso, Branches)
     return branches_width(network.torso) if is_branched else 0
 
 
 def inputs(leaves: tuple[Leaf, ...]) -> list[str]:
-    """Returns lines that say what ``state`` consists of, one a leaf; none for one plain vector."""
+    """Returns the parts of the observation, one line for each leaf."""
     if len(leaves) == 1 and leaves[0].kind == "continuous" and len(leaves[0].shape) == 1:
         return [f"state: {leaves[0].shape[0]}"]
     return ["state:\n" + "\n".join(f"  {leaf.path or 'observation'} {entrance(leaf)}" for leaf in leaves)]
 
 
 def entrance(leaf: Leaf) -> str:
-    """Returns an observation leaf's shape and what becomes of it: ``(84, 84, 4) -> 32x8x8/4 ... -> 512``."""
+    """Returns the encoding of an observation leaf: ``(84, 84, 4) -> 32 x 8x8/4 ... -> 512``."""
     kind = convolutions(leaf)
     steps = [str(leaf.shape)]
     if kind is not None:

@@ -1,10 +1,10 @@
-"""Words for numbers."""
+"""Formatting of counts."""
 
 from __future__ import annotations
 
 
 def counted(n: int, noun: str) -> str:
-    """Returns a number with its noun in the singular or the plural.
+    """Returns a count with its noun in singular or plural.
 
     >>> counted(1, "episode"), counted(1200, "episode")
     ('1 episode', '1,200 episodes')

@@ -1,4 +1,4 @@
-"""Videos of a policy at work: H.264 in mp4 files, recorded without a display, shown in a notebook."""
+"""Videos of a policy: H.264 in mp4 files, recorded without a display, shown in a notebook."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from rejeu.validation import number, whole
 
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
-PLEASANT_FPS = {"parking-v0": 15.0}
-"""Environments whose own figure is too slow to watch: 5 decisions a second, declared as 10 frames per second."""
+PLAYBACK_FPS = {"parking-v0": 15.0}
+"""Frames per second of environments whose ``render_fps`` is too slow for a video."""
 RECORDER = "gymnasium.wrappers.rendering:RecordVideo"
 """Entry point of the wrapper that records training episodes."""
 HOLD_SECONDS = 0.5
-"""How long the last frame of an episode stays before the next episode begins, so that its outcome can be seen."""
+"""How long the last frame of an episode is shown."""
 
 
 def record_video(
@@ -48,27 +48,27 @@ def record_video(
     seed: int | None = None,
     fps: float | None = None,
 ) -> Path:
-    """Plays the agent's deterministic policy, writes what it looks like to an mp4 file, and returns the file's path.
+    """Records the agent's deterministic policy to an mp4 file, and returns the path of the file.
 
-    Every episode gives the frame after its reset and one frame a step; its last frame stays for half a second. A file
-    that is already there is replaced only once the new one is complete.
+    The video has one frame after each reset and one for each step. The last frame of an episode is shown for half a second.
+    An existing file is replaced when the new one is complete.
 
     Args:
         agent: anything with ``predict(obs, state, deterministic=True) -> (action, state)``.
-        path: of the file; ``.mp4`` is added to a path without a suffix, missing folders are made.
-        env: an id; an environment made with ``render_mode="rgb_array"``, which is left open; a function that makes one;
-            or None: a new environment like the agent's own.
-        episodes: how many.
-        max_steps: environment steps after which recording ends, over all episodes together.
-        seed: of the environment's first reset; None draws one.
-        fps: frames per second of the file; None: as the environment declares, 15 for parking-v0 (three times real
-            time), 30 where nothing is declared.
+        path: path of the file. ``.mp4`` is added to a path without a suffix, missing folders are created.
+        env: an id, an environment made with ``render_mode="rgb_array"`` (which is not closed), a function that makes one,
+            or None for a new environment like the agent's own.
+        episodes: number of episodes.
+        max_steps: maximum number of environment steps, over all episodes.
+        seed: seed of the first reset; None draws a seed.
+        fps: frames per second of the file; None for the environment's ``render_fps``, 15 for parking-v0 (three times real
+            time), 30 if it declares none.
 
     Raises:
         MissingExtra: if imageio-ffmpeg is not installed.
-        ValueError: if the environment does not give pictures.
-        TypeError: if ``env`` is none of the above.
-        KeyboardInterrupt: after Ctrl-C or SIGTERM; nothing is left of the new file.
+        ValueError: if the environment does not render to arrays.
+        TypeError: if ``env`` has another type.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM; the new file is removed.
 
     >>> import rejeu, tempfile
     >>> from rejeu.reporting.video import record_video
@@ -81,19 +81,19 @@ def record_video(
     fps = None if fps is None else number("fps", fps, above=0)
     ffmpeg()
     given = isinstance(env, gym.Env)
-    playing = shown_to(agent, env if given else rendering_env(agent, env))
+    playing_env = shown_to(agent, env if given else rendering_env(agent, env))
     try:
-        check_renders(playing)
-        with Interrupt() as stop, VideoFile(path, natural_fps(playing) if fps is None else fps) as video:
+        check_renders(playing_env)
+        with Interrupt() as stop, VideoFile(path, natural_fps(playing_env) if fps is None else fps) as video:
             for _ in range(episodes):
-                obs, _ = playing.reset(seed=seed)
-                seed, done, memory = None, False, None
-                video.write(rgb_frame(playing))
+                obs, _ = playing_env.reset(seed=seed)
+                seed, done, state = None, False, None
+                video.write(rgb_frame(playing_env))
                 while not done and steps_left:
                     stop.check()
-                    action, memory = agent.predict(obs, memory, deterministic=True)
-                    obs, _, terminated, truncated, _ = playing.step(action)
-                    frame = rgb_frame(playing)
+                    action, state = agent.predict(obs, state, deterministic=True)
+                    obs, _, terminated, truncated, _ = playing_env.step(action)
+                    frame = rgb_frame(playing_env)
                     video.write(frame)
                     steps_left -= 1
                     done = terminated or truncated
@@ -103,14 +103,14 @@ def record_video(
                     video.write(frame)
     finally:
         if not given:
-            playing.close()
+            playing_env.close()
     return video.path
 
 
 def rendering_env(agent: Any, env: Any) -> gym.Env:
-    """Returns a new environment that renders to arrays, of an id, of a function, or like the agent's own if None."""
+    """Makes an environment that renders to arrays: from an id, from a function, or like the agent's own if None."""
     if isinstance(env, str):
-        return _make_rendering(env)
+        return _make_from_spec(env)
     if env is not None:
         made = env() if callable(env) else env
         if not isinstance(made, gym.Env):
@@ -121,37 +121,37 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
         return made
     vector = agent.env
     if vector is None:
-        raise ValueError("this agent has no environment; give one: record_video(agent, path, env='parking-v0')")
+        raise ValueError("this agent has no environment; pass one: record_video(agent, path, env='parking-v0')")
     if vector.wrapped_by is not None:
         raise ValueError(
-            f"the agent's own environments are wrapped in {vector.wrapped_by}, which a new one would lack; step "
-            "them in a VecVideoRecorder, or give env="
+            f"the agent's own environments are wrapped in {vector.wrapped_by}, which a new one would not have; "
+            "use a VecVideoRecorder, or pass env="
         )
     spec = vector.envs[0].spec if isinstance(vector, InProcess) else None
     if spec is None and provider(vector.env_id) is None and not register(vector.env_id):
         raise ValueError(
-            f"the agent's own environment {vector.env_id} is not registered, so no second one can be made; give "
+            f"the agent's own environment {vector.env_id} is not registered, so it cannot be made again; pass "
             "env=, made with render_mode='rgb_array'"
         )
     try:
-        return _make_rendering(vector.env_id if spec is None else _without_recorder(spec))
+        return _make_from_spec(vector.env_id if spec is None else _without_recorder(spec))
     except ValueError as error:
         if "RecordConstructorArgs" not in str(error):
             raise
         raise ValueError(
-            f"the wrappers of the agent's own environment {vector.env_id} cannot be made a second time ({error}); give "
-            "env=, made with render_mode='rgb_array' and wrapped alike"
+            f"the wrappers of the agent's own environment {vector.env_id} cannot be made again ({error}); pass "
+            "env=, made with render_mode='rgb_array' and the same wrappers"
         ) from None
 
 
 def _without_recorder(spec: gym.envs.registration.EnvSpec) -> gym.envs.registration.EnvSpec:
-    """Returns a spec without ``RecordVideo``, which would write its own videos again, over those of the first environment."""
+    """Returns a spec without ``RecordVideo``, which would overwrite the videos of the first environment."""
     wrappers = tuple(one for one in spec.additional_wrappers if one.entry_point != RECORDER)
     return dataclasses.replace(spec, additional_wrappers=wrappers)
 
 
-def _make_rendering(source: str | gym.envs.registration.EnvSpec) -> gym.Env:
-    """Makes the environment twice: first plainly, since ``gymnasium.make`` only warns of a render mode it lacks."""
+def _make_from_spec(source: str | gym.envs.registration.EnvSpec) -> gym.Env:
+    """Makes an environment from an id or a spec; see :func:`make_rendering_env`."""
 
     def make(**kwargs: Any) -> gym.Env:
         if isinstance(source, str):
@@ -159,29 +159,31 @@ def _make_rendering(source: str | gym.envs.registration.EnvSpec) -> gym.Env:
         return gym.make(source, disable_env_checker=True, **kwargs)
 
     pinned = not isinstance(source, str) and "render_mode" in source.kwargs
-    return make_drawing(make, source if isinstance(source, str) else source.id, {"render_mode": None} if pinned else {})
+    return make_rendering_env(
+        make, source if isinstance(source, str) else source.id, {"render_mode": None} if pinned else {}
+    )
 
 
-def make_drawing(
-    make: Callable[..., gym.Env], env_id: str, plainly: Mapping[str, Any] = MappingProxyType({})
+def make_rendering_env(
+    make: Callable[..., gym.Env], env_id: str, plain_kwargs: Mapping[str, Any] = MappingProxyType({})
 ) -> gym.Env:
-    """Returns what ``make(render_mode="rgb_array")`` makes: an environment that draws to arrays.
+    """Returns ``make(render_mode="rgb_array")``, an environment that renders to arrays.
 
     Args:
         make: makes environments.
-        env_id: for messages.
-        plainly: keyword arguments with which ``make`` makes one that draws nothing.
+        env_id: id for messages.
+        plain_kwargs: keyword arguments with which ``make`` makes an environment that does not render.
 
     Raises:
-        ValueError: if it has no such render mode, of which ``gymnasium.make`` would only warn.
+        ValueError: if the environment lacks this render mode, about which ``gymnasium.make`` only warns.
     """
-    plain = make(**plainly)
+    plain = make(**plain_kwargs)
     modes = plain.metadata.get("render_modes") or []
     plain.close()
     if "rgb_array" not in modes:
         raise ValueError(
-            f"{env_id} cannot be drawn: it has the render modes {list(modes)}, which lack 'rgb_array'; give env= with an "
-            "environment that has it"
+            f"{env_id} cannot be rendered to arrays: its render modes are {list(modes)}, expected 'rgb_array' among them; "
+            "pass another environment as env="
         )
     return make(render_mode="rgb_array")
 
@@ -196,24 +198,24 @@ def check_renders(env: Any) -> None:
 
 
 def natural_fps(env: gym.Env) -> float:
-    """Returns the frames per second at which an environment is to be watched."""
-    if env.spec is not None and env.spec.id in PLEASANT_FPS:
-        return PLEASANT_FPS[env.spec.id]
+    """Returns the frames per second of a video of an environment."""
+    if env.spec is not None and env.spec.id in PLAYBACK_FPS:
+        return PLAYBACK_FPS[env.spec.id]
     return float(env.metadata.get("render_fps") or DEFAULT_FPS)
 
 
 def rgb_frame(env: gym.Env) -> np.ndarray:
-    """Returns what an environment renders, ``uint8 (height, width, 3)``; needs no display.
+    """Returns a rendered frame, ``uint8 (height, width, 3)``; needs no display.
 
     Raises:
-        ValueError: if it renders anything else, or if MuJoCo finds nothing to draw with.
+        ValueError: if it renders anything else, or if MuJoCo has no OpenGL context.
     """
-    with display_for_pygame(), said_of_mujoco(env):
+    with display_for_pygame(), explain_mujoco_errors(env):
         frame = env.render()
     if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3:
         got = f"an array of shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
         raise ValueError(
-            f"{env} cannot be recorded: render() gave {got}, expected an array (height, width, 3); make it with "
+            f"{env} cannot be recorded: render() returned {got}, expected an array (height, width, 3); make it with "
             "render_mode='rgb_array'"
         )
     return frame
@@ -221,10 +223,10 @@ def rgb_frame(env: gym.Env) -> np.ndarray:
 
 @contextmanager
 def display_for_pygame() -> Iterator[None]:
-    """Lets pygame draw where there is no display, by SDL's ``dummy`` driver; the process's environment is put back.
+    """Lets pygame render without a display, by SDL's ``dummy`` driver; restores the environment variable at the end.
 
-    highway-env draws nothing, and so gives black frames, while ``SDL_VIDEODRIVER=dummy`` is set: pygame's display is
-    therefore opened under that setting, and the setting hidden from whoever draws on it.
+    While ``SDL_VIDEODRIVER=dummy`` is set, highway-env renders black frames. Therefore the variable is set only while pygame's
+    display is opened.
     """
     before = os.environ.get("SDL_VIDEODRIVER")
     driver = "dummy" if before is None and is_headless() else before
@@ -245,8 +247,8 @@ def display_for_pygame() -> Iterator[None]:
 
 
 @contextmanager
-def mujoco_without_screen() -> Iterator[None]:
-    """Lets MuJoCo draw where there is no display, by EGL or else OSMesa, unless ``MUJOCO_GL`` is set; it is put back."""
+def headless_mujoco() -> Iterator[None]:
+    """Lets MuJoCo render without a display, by EGL or OSMesa, unless ``MUJOCO_GL`` is set; restores it at the end."""
     if "mujoco" not in sys.modules or "MUJOCO_GL" in os.environ or not is_headless():
         yield
         return
@@ -261,16 +263,16 @@ def mujoco_without_screen() -> Iterator[None]:
 
 
 def is_headless() -> bool:
-    """Returns whether this is a Linux without a display."""
+    """Returns whether this is Linux without a display."""
     return sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
 
 
 @contextmanager
-def said_of_mujoco(env: gym.Env) -> Iterator[None]:
-    """Raises ``ValueError``, which names the fix, where MuJoCo cannot draw for want of a screen."""
+def explain_mujoco_errors(env: gym.Env) -> Iterator[None]:
+    """Raises ``ValueError`` with the fix if MuJoCo cannot render without a display."""
     try:
-        with mujoco_without_screen(), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", r"\(\d+\) b'")  # GLFW's, of which the error below tells
+        with headless_mujoco(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"\(\d+\) b'")  # GLFW's, which the error below explains
             yield
     except Exception as error:
         kind = type(error)
@@ -281,8 +283,8 @@ def said_of_mujoco(env: gym.Env) -> Iterator[None]:
         if chosen is None:
             fix = f"install EGL (on Debian and Ubuntu libegl1) or OSMesa (libosmesa6), or {fix}"
         raise ValueError(
-            f"{env} cannot be drawn: MuJoCo got no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a screen or "
-            f"drawing without one; {fix}"
+            f"{env} cannot be rendered: MuJoCo has no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a display "
+            f"or an offscreen renderer; {fix}"
         ) from error
 
 
@@ -290,7 +292,7 @@ def ffmpeg() -> str:
     """Returns the path of the ffmpeg program.
 
     Raises:
-        MissingExtra: if imageio-ffmpeg, which brings it, is not installed.
+        MissingExtra: if imageio-ffmpeg, which contains it, is not installed.
     """
     try:
         import imageio_ffmpeg
@@ -300,21 +302,21 @@ def ffmpeg() -> str:
 
 
 class VideoFile:
-    """An mp4 file that grows by a frame at a time and stands at its path once it is closed.
+    """An mp4 file that is written frame by frame and appears at its path when it is closed.
 
-    H.264, yuv420p; odd heights and widths get a black line. As a context manager it is closed at the end, or given up
-    if an error ends the block. ffmpeg is spoken to directly because ``imageio_ffmpeg.write_frames`` forks in a way
-    that JAX warns of (``preexec_fn``) and leaves a half-written file behind after an error.
+    H.264, yuv420p; odd heights and widths are padded by a black line. As a context manager it is closed at the end, or
+    discarded after an exception. ffmpeg is started directly: ``imageio_ffmpeg.write_frames`` uses ``preexec_fn``, about
+    which JAX warns, and leaves an incomplete file after an error.
 
     Args:
-        path: of the file; ``.mp4`` is added to a path without a suffix.
+        path: path of the file. ``.mp4`` is added to a path without a suffix.
         fps: frames per second.
     """
 
     def __init__(self, path: str | Path, fps: float) -> None:
         path = Path(path)
         if path.suffix not in ("", ".mp4"):
-            raise ValueError(f"path={str(path)!r} must end in .mp4, the one format that is written")
+            raise ValueError(f"path={str(path)!r} must end in .mp4, the only supported format")
         self.path = (path if path.suffix else path.with_name(path.name + ".mp4")).absolute()
         self.fps = fps
         self.n_frames = 0
@@ -324,7 +326,7 @@ class VideoFile:
         self._shape: tuple[int, ...] = ()
 
     def write(self, frame: np.ndarray) -> None:
-        """Adds one frame, ``uint8 (height, width, 3)``; all must have one shape."""
+        """Adds a frame, ``uint8 (height, width, 3)``. All frames must have the same shape."""
         if self._process is None:
             self._start(frame.shape)
         if frame.shape != self._shape or frame.dtype != np.uint8:
@@ -340,14 +342,14 @@ class VideoFile:
         self.n_frames += 1
 
     def close(self) -> Path:
-        """Completes the file, puts it in place and returns its path.
+        """Completes the file, moves it to its path and returns the path.
 
         Raises:
-            OSError: if it could not be written; what stood there before is then untouched.
+            OSError: if it could not be written; an existing file is not changed.
             ValueError: if no frame was written.
         """
         if self._process is None:
-            raise ValueError(f"{self.path} was given no frame")
+            raise ValueError(f"{self.path} has no frames")
         assert self._process.stdin is not None
         try:
             self._process.stdin.close()
@@ -360,13 +362,13 @@ class VideoFile:
         return self.path
 
     def discard(self) -> None:
-        """Gives the file up."""
+        """Discards the file."""
         if self._process is None:
             return
         self._process.kill()
         self._process.wait()
         assert self._process.stdin is not None
-        with suppress(OSError):  # what was still to be written has no reader any more
+        with suppress(OSError):  # the process that reads has ended
             self._process.stdin.close()
         self._errors.close()
         self._partial.unlink(missing_ok=True)
@@ -397,7 +399,7 @@ class VideoFile:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
-            # Ctrl-C is for us: whoever catches it still closes the file
+            # Ctrl-C must not reach ffmpeg, so that the file can still be closed
             process_group=0 if os.name == "posix" else None,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
@@ -408,12 +410,12 @@ class VideoFile:
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         self.discard()
-        raise OSError(f"{self.path} could not be written; ffmpeg says: {lines[-1] if lines else 'nothing'}")
+        raise OSError(f"{self.path} could not be written; ffmpeg: {lines[-1] if lines else 'no message'}")
 
 
 @dataclass(frozen=True)
 class Html:
-    """HTML text for where IPython, whose class this stands for, is not installed."""
+    """HTML text, in place of IPython's class if IPython is not installed."""
 
     data: str
 
@@ -422,14 +424,14 @@ class Html:
 
 
 def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
-    """Returns the mp4 files of a folder as one piece of HTML that a notebook shows; it prints nothing.
+    """Returns the mp4 files of a folder as HTML that a notebook shows.
 
-    They are in the order of the numbers in their names. The videos themselves are in the text, so they stay in the
-    notebook when the files are gone. If there is none, the text says so. Outside a notebook the text is in ``.data``.
+    They are sorted by the numbers in their names. The videos are embedded, so they remain in the notebook when the files are
+    deleted. Outside a notebook the HTML is in ``.data``.
 
     Args:
-        folder: where to look, not below it.
-        prefix: only files whose name begins so.
+        folder: folder with the videos, without its subfolders.
+        prefix: only files whose name starts with it.
 
     >>> show_videos("no-such-folder").data
     '<p>No mp4 file in no-such-folder.</p>'
@@ -438,7 +440,7 @@ def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
     files.sort(key=lambda path: by_number(path.name))
     text = "\n".join(_player(path) for path in files)
     if not files:
-        named = f" whose name begins with {prefix}" if prefix else ""
+        named = f" whose name starts with {prefix}" if prefix else ""
         text = f"<p>No mp4 file{html.escape(named)} in {html.escape(str(folder))}.</p>"
     try:
         from IPython.display import HTML
@@ -448,7 +450,7 @@ def show_videos(folder: str | Path = "videos", prefix: str = "") -> Any:
 
 
 def by_number(name: str) -> list[tuple[int, int, str]]:
-    """Returns a key that sorts the numbers in names by their values.
+    """Returns a sort key that orders the numbers in names by their values.
 
     >>> sorted(["episode-10.mp4", "episode-9.mp4", "a.mp4"], key=by_number)
     ['a.mp4', 'episode-9.mp4', 'episode-10.mp4']

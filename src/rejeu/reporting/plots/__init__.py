@@ -1,7 +1,6 @@
-"""Pictures, each a matplotlib figure that a notebook shows by itself.
+"""Matplotlib figures, drawn without a display and without pyplot.
 
-They are drawn without a display and without matplotlib's global state. Every function takes ``path``, of a file to write,
-and returns the figure.
+Every function returns a figure, which notebooks display, and writes it to ``path`` if one is given.
 """
 
 from rejeu.reporting.plots.evaluations import evaluation

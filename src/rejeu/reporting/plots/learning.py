@@ -1,51 +1,62 @@
-"""The learning curve: returns and successes of a run against steps or seconds."""
+"""Learning curve: returns and success rates of a run against steps or seconds."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.plots import style
+from rejeu.reporting.plots.evaluations import Evaluated
 from rejeu.validation import whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from rejeu.reporting.figures import Picture
-    from rejeu.reporting.history import History
 
 EPISODES = "episodes"
 AXIS_LABELS = {"step": "environment steps", "seconds": "seconds of training"}
-MOST_WINDOW = 50
-"""Most episodes in the moving average that is drawn by default."""
-ROOM_AT_THE_RIGHT = 0.02
-"""Of the horizontal axis, beyond the last episode, so that its dot is drawn whole."""
+MAX_WINDOW = 50
+"""Maximum default number of episodes in the moving average."""
+RIGHT_MARGIN = 0.02
+"""Share of the horizontal axis beyond the last episode."""
+
+
+class Episodes(Protocol):
+    """The attributes of an ``agent.history`` that are drawn."""
+
+    best_return: float
+
+    @property
+    def record_rows(self) -> np.ndarray: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, column: str) -> np.ndarray: ...
+    def moving_average(self, column: str = ..., window: int = ...) -> np.ndarray: ...
 
 
 def learning_curve(
-    history: History,
+    history: Episodes,
     path: str | Path | None = None,
     against: str = "step",
     window: int | None = None,
-    evaluations: Iterable[tuple[int, Evaluation]] = (),
+    evaluations: Iterable[tuple[int, Evaluated]] = (),
     title: str = "",
 ) -> Picture:
-    """Draws the return of every episode, its moving average, the records and, where known, the success rate below.
+    """Draws the return of every episode, the moving average, the records and, if known, the success rate below.
 
-    A record is an episode that returned more than all before it.
+    A record is an episode with a higher return than all before it.
 
     Args:
-        history: the episodes; may be empty.
-        path: of a file to write, whose suffix says the format (``.png``, ``.svg``, ``.pdf``); None for none.
+        history: the episodes, such as ``agent.history``; may be empty.
+        path: file to write, in the format of its suffix (``.png``, ``.svg``, ``.pdf``); None for none.
         against: ``"step"`` or ``"seconds"``.
-        window: episodes in the moving average; None: a fifth of the run, at least 3 and at most 50. The legend says it.
-        evaluations: ``(step, Evaluation)`` pairs, such as ``Evaluate.results``, drawn as points with 95 % intervals.
-        title: over the picture; long ones are wrapped. Empty for none.
+        window: episodes in the moving average; None for a fifth of the run, at least 3 and at most 50.
+        evaluations: ``(step, Evaluation)`` pairs, such as ``Evaluate.results``, drawn as points with error bars.
+        title: title of the figure, which is wrapped; empty for none.
 
     Raises:
         MissingExtra: if matplotlib is not installed.
@@ -60,7 +71,7 @@ def learning_curve(
     at = steps if against == "step" or not len(x) else np.interp(steps, history["step"], x)
     has_success = bool(np.isfinite(successes).any())
 
-    figure = style.blank("drawing a learning curve", height=6.4 if has_success else 4.2)
+    figure = style.make_figure("drawing a learning curve", height=6.4 if has_success else 4.2)
     panels = figure.subplots(1 + has_success, sharex=True, squeeze=False, height_ratios=[3, 2][: 1 + has_success])[:, 0]
     means = [evaluation.mean_return for _, evaluation in evaluations]
     _episodes(panels[0], x, returns)
@@ -78,26 +89,26 @@ def learning_curve(
         panels[1].set_ylabel("success rate")
         panels[1].yaxis.set_major_formatter(lambda share, _: f"{share:.0%}")
     for panel in panels:
-        style.dress(panel)
+        style.format_axes(panel)
     panels[-1].set_xlabel(AXIS_LABELS[against])
     panels[-1].xaxis.set_major_formatter(style.thousands)
-    panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]) * (1 + ROOM_AT_THE_RIGHT))
-    style.head(panels[0], title)
+    panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]) * (1 + RIGHT_MARGIN))
+    style.add_title_and_legend(panels[0], title)
     _enlarge_dots(panels[0])
-    return style.write(figure, path)
+    return style.save(figure, path)
 
 
 def default_window(n_episodes: int) -> int:
-    """Returns the episodes in the moving average of a run: few in a short one, whose line would lag behind otherwise.
+    """Returns the default number of episodes in the moving average.
 
     >>> [default_window(n) for n in (4, 30, 100, 1000)]
     [3, 6, 20, 50]
     """
-    return min(max(n_episodes // 5, 3), MOST_WINDOW)
+    return min(max(n_episodes // 5, 3), MAX_WINDOW)
 
 
 def _enlarge_dots(panel: Axes) -> None:
-    """Draws the dot of the legend in one size, whatever that of the episodes is."""
+    """Sets the size of the dot in the legend, independent of the number of episodes."""
     legend = panel.get_legend()
     for line in legend.get_lines() if legend is not None else ():
         if line.get_label() == EPISODES:
@@ -105,7 +116,7 @@ def _enlarge_dots(panel: Axes) -> None:
 
 
 def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
-    """Draws each episode as a dot, smaller and lighter the more there are."""
+    """Draws each episode as a dot. More episodes have smaller and lighter dots."""
     if not len(x):
         return
     size = float(np.clip(60 / math.sqrt(len(x)), 2.4, 5.0))
@@ -114,7 +125,7 @@ def _episodes(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def _records(panel: Axes, x: np.ndarray, returns: np.ndarray, rows: np.ndarray) -> None:
-    """Marks the episodes that returned more than all before them."""
+    """Marks the episodes with a higher return than all before them."""
     if len(rows):
         panel.plot(x[rows], returns[rows], "^", markersize=4.5, color=style.GOOD_COLOR, label="records", zorder=3)
 
@@ -125,7 +136,7 @@ def _line(panel: Axes, x: np.ndarray, y: np.ndarray, window: int) -> None:
 
 
 def _points(panel: Axes, x: np.ndarray, y: list[float], intervals: list[tuple[float, float]]) -> None:
-    """Draws evaluations as points with their intervals as bars; an unknown interval has no bar."""
+    """Draws evaluations as points with error bars, if the intervals are known."""
     if not len(x) or not np.isfinite(y).any():
         return
     low, high = np.array(intervals).T
@@ -137,11 +148,11 @@ def _points(panel: Axes, x: np.ndarray, y: list[float], intervals: list[tuple[fl
         "markeredgewidth": 0.8,
         "zorder": 4,
     }
-    panel.plot(x, y, "o", markersize=5, label="evaluation, 95 % interval", clip_on=False, **form)
+    panel.plot(x, y, "o", markersize=5, label="evaluation, 95 % CI", clip_on=False, **form)
 
 
 def _fit(panel: Axes, returns: np.ndarray, further: list[float]) -> None:
-    """Fits the height to all but the lowest half percent of returns, and to what else is to be seen."""
+    """Fits the vertical axis to all but the extreme half percent of returns, and to other values."""
     shown = np.concatenate([np.quantile(returns, [0.005, 0.995]) if len(returns) else [], further])
     shown = shown[np.isfinite(shown)]
     if len(shown):

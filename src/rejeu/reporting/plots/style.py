@@ -1,4 +1,4 @@
-"""What all pictures have in common: colors, fonts, grid, the place of title and legend."""
+"""Common style of all figures: colors, fonts, grid, title and legend."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
 DOT_COLOR, LINE_COLOR, ACCENT_COLOR, GOOD_COLOR, BAD_COLOR = "#63a4e0", "#1d4f91", "#dd6b20", "#26966a", "#cd3e34"
 LINE: dict[str, Any] = {"color": LINE_COLOR, "linewidth": 1.8, "solid_capstyle": "round", "solid_joinstyle": "round"}
 TITLE_WIDTH = 72
-"""Characters of a title's line: what fits the width of the picture in the title's font."""
+"""Characters in a line of the title."""
 
 
-def blank(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
-    """Returns an empty figure of so many inches, which a notebook shows by itself.
+def make_figure(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
+    """Returns an empty figure with a size in inches.
 
     Raises:
-        MissingExtra: if matplotlib is not installed; ``what`` says for what it is needed.
+        MissingExtra: if matplotlib is not installed. The message says that ``what`` needs it.
     """
     try:
         import matplotlib.figure  # noqa: F401 - also where our own module was imported before
@@ -35,16 +35,16 @@ def blank(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
     return Picture(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
 
 
-def write(figure: Picture, path: str | Path | None) -> Picture:
-    """Writes the figure to ``path`` if there is one, whose suffix says the format, and returns the figure."""
+def save(figure: Picture, path: str | Path | None) -> Picture:
+    """Writes the figure to ``path``, if there is one, and returns the figure."""
     if path is not None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)
     return figure
 
 
-def dress(panel: Axes) -> None:
-    """Gives a panel its grid, spines and font sizes."""
+def format_axes(panel: Axes) -> None:
+    """Sets grid, spines and font sizes of a panel."""
     panel.grid(color=GRID, linewidth=0.8)
     panel.set_axisbelow(True)
     panel.spines[["top", "right", "left"]].set_visible(False)
@@ -54,8 +54,8 @@ def dress(panel: Axes) -> None:
     panel.yaxis.label.set(color=INK, fontsize=10)
 
 
-def head(panel: Axes, title: str) -> None:
-    """Writes the legend above a panel and the title above the legend, so that neither limits the other's length."""
+def add_title_and_legend(panel: Axes, title: str) -> None:
+    """Writes the legend above a panel and the title above the legend."""
     has_legend = bool(panel.get_legend_handles_labels()[0])
     if title:
         text = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
@@ -66,7 +66,7 @@ def head(panel: Axes, title: str) -> None:
 
 
 def thousands(value: float, _: float | None = None) -> str:
-    """Returns a number with thousands separators and a true minus sign.
+    """Formats a number with thousands separators and a typographic minus sign.
 
     >>> thousands(12500.0)
     '12,500'

@@ -1,4 +1,4 @@
-"""The course of one episode: a coordinate against time, the plane, or the plane beside every coordinate."""
+"""Trajectory of an episode: coordinates against time, and the plane of the first two."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
     from rejeu.reporting.figures import Picture
 
-MOST_COORDINATES = 10
-"""Most coordinates that are drawn against time beside the plane."""
+MAX_COORDINATES = 10
+"""Maximum number of coordinates that are drawn against time next to the plane."""
 MARGIN = 0.08
-"""What is seen beyond the bounds, as a share of their distance."""
+"""Margin beyond the bounds, as a share of their distance."""
 
 
 def trajectory(
@@ -31,22 +31,22 @@ def trajectory(
     names: Sequence[str] | None = None,
     title: str = "",
 ) -> Picture:
-    """Draws the course of one episode.
+    """Draws the trajectory of an episode.
 
-    One coordinate is drawn against steps, two as a plane, more as the plane of the first two beside every coordinate
-    against steps (the first ten).
+    One coordinate is drawn against steps, two as a plane, more as the plane of the first two and each coordinate (at most
+    ten) against steps.
 
     Args:
         positions: positions or observations, oldest first, ``(n, dimension)``, or ``(n,)`` for one coordinate.
-        path: of a file to write, whose suffix says the format (``.png``, ``.svg``, ``.pdf``); None for none.
-        low: lower bound of each coordinate, a number or ``(dimension,)``, drawn as a wall where it is finite; None: none.
-        high: upper bounds, likewise.
-        names: of the coordinates; None: x1, x2 and so on.
-        title: over the picture; empty for none.
+        path: file to write, in the format of its suffix (``.png``, ``.svg``, ``.pdf``); None for none.
+        low: lower bound, a number or ``(dimension,)``, drawn as a wall where it is finite; None for none.
+        high: upper bound, the same.
+        names: names of the coordinates; None for x1, x2 and so on.
+        title: title of the figure, empty for none.
 
     Raises:
         MissingExtra: if matplotlib is not installed.
-        ValueError: if the positions are not ``(n, dimension)`` with at least one row, or names are missing.
+        ValueError: if the positions are not ``(n, dimension)`` with at least one row, or the number of names differs.
     """
     points = np.asarray(positions, np.float64)
     points = points[:, None] if points.ndim == 1 else points
@@ -61,30 +61,30 @@ def trajectory(
 
     what = "drawing a trajectory"
     if dimension == 1:
-        figure = style.blank(what)
+        figure = style.make_figure(what)
         panel = figure.subplots()
-        _course(panel, points[:, 0], lows[0], highs[0], names[0])
+        _coordinate(panel, points[:, 0], lows[0], highs[0], names[0])
         panel.set_xlabel("step")
-        style.head(panel, title)
+        style.add_title_and_legend(panel, title)
     elif dimension == 2:
-        figure = style.blank(what, 5.6, 5.6)
+        figure = style.make_figure(what, 5.6, 5.6)
         _plane(figure.subplots(), points, lows, highs, names, title)
     else:
-        figure = style.blank(what, 10.0, 5.6)
+        figure = style.make_figure(what, 10.0, 5.6)
         left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[5.6, 4.4])[0]
         _plane(left.subplots(), points, lows, highs, names, title)
-        shown = min(dimension, MOST_COORDINATES)
+        shown = min(dimension, MAX_COORDINATES)
         panels = right.subplots(shown, 1, sharex=True)
         for i, panel in enumerate(panels):
-            _course(panel, points[:, i], lows[i], highs[i], names[i])
+            _coordinate(panel, points[:, i], lows[i], highs[i], names[i])
         panels[-1].set_xlabel("step" if shown == dimension else f"step (the first {shown} of {dimension} coordinates)")
-    return style.write(figure, path)
+    return style.save(figure, path)
 
 
 def _plane(
     panel: Axes, points: np.ndarray, lows: np.ndarray, highs: np.ndarray, names: Sequence[str], title: str
 ) -> None:
-    """Draws the first two coordinates against each other, the box, the start and the end."""
+    """Draws the first two coordinates, the box, the start and the end."""
     x, y = points[:, 0], points[:, 1]
     if np.isfinite([lows[:2], highs[:2]]).all():
         corners = (lows[0], lows[1]), highs[0] - lows[0], highs[1] - lows[1]
@@ -98,11 +98,11 @@ def _plane(
     panel.set_box_aspect(1)
     panel.set_xlabel(names[0])
     panel.set_ylabel(names[1])
-    style.dress(panel)
-    style.head(panel, title)
+    style.format_axes(panel)
+    style.add_title_and_legend(panel, title)
 
 
-def _course(panel: Axes, values: np.ndarray, low: float, high: float, name: str) -> None:
+def _coordinate(panel: Axes, values: np.ndarray, low: float, high: float, name: str) -> None:
     """Draws one coordinate against steps, its bounds, the start and the end."""
     for wall in (low, high):
         if np.isfinite(wall):
@@ -113,7 +113,7 @@ def _course(panel: Axes, values: np.ndarray, low: float, high: float, name: str)
     panel.xaxis.set_major_formatter(style.thousands)
     panel.set_ylim(*_limits(values, low, high))
     panel.set_ylabel(name)
-    style.dress(panel)
+    style.format_axes(panel)
 
 
 def _ends(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
@@ -122,7 +122,7 @@ def _ends(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def _limits(values: np.ndarray, low: float, high: float) -> tuple[float, float]:
-    """Returns what is to be seen of a coordinate: its bounds and all its values, with a margin."""
+    """Returns the axis limits of a coordinate: its bounds and all its values, with a margin."""
     finite = values[np.isfinite(values)]
     shown = np.array([*finite, *(wall for wall in (low, high) if np.isfinite(wall))])
     if not len(shown):
