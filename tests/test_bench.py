@@ -142,7 +142,7 @@ def test_the_page_of_some_cases_alone_leaves_the_others_out(results, tmp_path):
     report.write(results, tmp_path / "page.md")
     text = (tmp_path / "page.md").read_text(encoding="utf-8")
     assert row_of(text, "SAC")[1:4] == ["0.15 (0.1 to 0.2)", "", ""]
-    assert "## The parking job" not in text
+    assert "## Parking" not in text
     assert not (tmp_path / "images" / "speed-replay.png").exists()
 
 

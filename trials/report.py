@@ -2,8 +2,9 @@
 
 python trials/report.py
 
-Every section names the commit, the date and the command that its figures come from. Results that do not say their commit are
-older; then the commit that recorded them stands in its place. Trials without results are left out.
+Every section names the commit, the date and the command of its figures. Older results do not contain their commit;
+then the commit
+that recorded them is shown. Trials without results are left out.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ COMMANDS = {
     "fuzz": "python trials/fuzz.py --seconds 300 (600 for run and rows)",
 }
 """Commands of older results, which do not say them."""
-NOT_TESTED = """- **Other systems.** All trials were run on Linux, on local disks: not on macOS or Windows,
-on no network file system (NFS, SMB)
-  and on no GPU.
-- **Other power cuts.** The power cuts are those of one file system, ext4, and of a model of POSIX. A disk that reports data as
-  written which it holds in a volatile cache loses them whatever a program does. Log tables (CSV,
-  TensorBoard) are not brought to
-  disk row by row: a power cut may cost their last seconds, and a resumed run cuts them back to its checkpoint.
-- **Damage on purpose.** Checksums are no signatures. Who changes a file and its checksums can make an agent act badly; what is
-  tested is that no code of theirs runs and that no time or memory is spent on arrays that the model does not have.
-- **Runs of days.** The longest trial took an hour. No run was killed more often than stands above.
-- **Environments' own faults.** Environments that leak memory, or end the process that learns (`os._exit`), were not tried.
-- **Other machines.** Equal results are promised, and were compared, on one machine with the same versions and number of
-  threads."""
+NOT_TESTED = """- **Other systems.** All trials were run on Linux with local disks: not on macOS or Windows, on
+network file
+  systems or on a GPU.
+- **Other power cuts.** Power cuts were tested on ext4 and on a model of POSIX. A disk that reports data as written
+while it is in a
+  volatile cache loses it. Rows of log tables (CSV, TensorBoard) are not synced: a power cut may lose the last
+  seconds of them.
+- **Deliberate changes.** Checksums are not signatures. Someone who changes a file and its checksums can make an
+agent act badly.
+  Tested is that loading executes no code and needs bounded time and memory.
+- **Runs of days.** The longest trial took an hour.
+- **Faults of environments.** Environments that leak memory or end the main process (`os._exit`) were not tested.
+- **Other machines.** Equal results were compared on one machine, with the same versions and number of threads."""
 
 
 def read(name: str) -> Any:
@@ -46,7 +47,7 @@ def read(name: str) -> Any:
 
 
 def origins(name: str) -> list[tuple[str, str, str]]:
-    """Returns commit, date and command of results, several if their parts were recorded apart."""
+    """Returns commit, date and command of results, several if parts were recorded separately."""
     found = read(name)
     parts = [found] if "command" in found or "date" in found else [p for p in found.values() if isinstance(p, dict)]
     recorded, day = git("log", "-1", "--format=%h %as", "--", f"trials/results/{name}.json").split() or ("", "")
@@ -59,7 +60,7 @@ def origins(name: str) -> list[tuple[str, str, str]]:
 
 
 def origin(name: str) -> str:
-    """Returns the same as a line of text."""
+    """Returns the same as text."""
     return "; ".join(f"Commit {commit}, {date}, {command}" for commit, date, command in origins(name)) + "."
 
 
@@ -68,7 +69,7 @@ def table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
-def yes(value: bool) -> str:
+def yes_or_no(value: bool) -> str:
     return "yes" if value else "NO"
 
 
@@ -77,20 +78,21 @@ def kills() -> str:
     own = found["rejeu"]
     rows = [
         ("kills (SIGKILL)", f"{own['kills']:,}"),
-        ("of these with a file half written", f"{own['while_a_file_was_written']:,}"),
-        ("checkpoints that did not load afterwards", own["checkpoints_that_did_not_load"]),
-        ("environment steps between two checkpoints", own["interval"]),
-        ("most steps lost by a kill", own["most_steps_lost"]),
-        ("steps lost on average", f"{own['mean_steps_lost']:.0f}"),
+        ("of these during a write", f"{own['while_a_file_was_written']:,}"),
+        ("checkpoints that could not be loaded", own["checkpoints_that_did_not_load"]),
+        ("environment steps between checkpoints", own["interval"]),
+        ("maximum number of lost steps", own["most_steps_lost"]),
+        ("mean number of lost steps", f"{own['mean_steps_lost']:.0f}"),
         (
-            f"after {own['steps_in_all']:,} steps equal, bit for bit, to a run without kills",
-            yes(own["equal_to_a_run_without_kills"]),
+            f"after {own['steps_in_all']:,} steps bit-equal to a run without kills",
+            yes_or_no(own["equal_to_a_run_without_kills"]),
         ),
     ]
-    return f"""## Killed at random moments
+    return f"""## SIGKILL at random moments
 
-SAC on the ball, a checkpoint every {own["interval"]} steps. Each life of the run is a process that resumes from the newest
-checkpoint, until `SIGKILL` ends it at a random moment; two lives of three are ended as soon as a file is being written.
+SAC on Ball-v0, a checkpoint every {own["interval"]} steps. Each process resumes from the newest checkpoint until
+`SIGKILL` ends it at
+a random moment. Two of three processes are killed while a file is being written.
 
 {table(("", "rejeu"), rows)}
 
@@ -99,25 +101,26 @@ checkpoint, until `SIGKILL` ends it at a random moment; two lives of three are e
 
 
 def peers(found: dict[str, Any]) -> str:
-    """Returns what became of the same with Stable-Baselines3, as it is used."""
+    """Returns the results of the same trial with Stable-Baselines3."""
     text = ""
     if used := found.get("stable_baselines3_callback"):
-        text += f"""Stable-Baselines3 2.9.2 as most people save: SAC on Pendulum with
+        text += f"""Stable-Baselines3 2.9.2 as it is usually used: SAC on Pendulum with
 `CheckpointCallback(save_replay_buffer=True)` every
-{used["interval"]} steps, which gives every checkpoint new names and keeps them all. Killed {used["kills"]}
-times in the same way:
+{used["interval"]} steps, which keeps all checkpoints. Killed {used["kills"]}
+times:
 after {used["newest_checkpoint_not_whole"]} kills the newest checkpoint could not be loaded, after
 {used["no_checkpoint_whole"]} none
-could; with the newest that could, at most {used["most_steps_lost"]} steps were lost. Which one that is has to be found out by
-loading, and what it continues is another run: optimizers and buffer are there, running episodes and random numbers are not.
+could; with the newest that could, at most {used["most_steps_lost"]} steps were lost. The resumed run differs:
+checkpoints contain
+optimizers and buffer, but neither running episodes nor random state.
 
 """
     if peer := found.get("stable_baselines3"):
-        text += f"""The same saving model and replay buffer over and over under the same names, as a run does
-that keeps only its newest
-model, and without a pause, so that kills often hit a write. Killed {peer["kills"]} times: {peer["models_lost"]} models and
+        text += f"""The same with Stable-Baselines3 2.9.2, by a program that saves model and replay buffer
+repeatedly under the same names, without a pause, so that kills often hit a write.
+Killed {peer["kills"]} times: {peer["models_lost"]} models and
 {peer["replay_buffers_lost"]} replay buffers could not be loaded afterwards
-({"; ".join(f"`{error}`" for error in peer["errors"]) or "no errors"}). Only a file that is being overwritten can be lost so.
+({"; ".join(f"`{error}`" for error in peer["errors"]) or "no errors"}). Only a file that is being overwritten can be lost.
 
 """
     return text
@@ -138,11 +141,13 @@ def processes() -> str:
         for name, one in found.items()
     ]
     head = ("run", "environments", "kills", "resumed after step 0", "arrays equal", "training", "longest replay")
-    return f"""## Killed, and resumed in a new process
+    return f"""## SIGKILL, and resuming in a new process
 
-Runs of many kinds, each life of them a process of its own as `rejeu resume` is, killed at random moments. At the end
-everything learned, buffers, history, random numbers and best weights are compared bit for bit with a run without kills. The
-last two columns say how long the run trains without kills, and how long a resume took at most to replay EnvPool's actions.
+Runs of many kinds are killed at random moments and resumed in a new process, as by `rejeu resume`. At the end
+learned state,
+buffers, history, random state and best weights are compared bit for bit with a run without kills. The last two
+columns are the
+training time without kills and the longest time to replay EnvPool's actions.
 
 {table(head, rows)}
 
@@ -167,22 +172,23 @@ def power() -> str:
         if name != "interval"
     ]
     head = (
-        "run", "file operations", "states in which more than an interval is lost", "most steps lost",
+        "run", "file operations", "states that lose more than an interval", "maximum of lost steps",
         "without fsync of files", "without fsync of folders",
     )  # fmt: skip
     text = f"""## Power cuts
 
-On paper: the file operations of a run with a checkpoint every {paper["interval"]} steps are recorded, and every state is made
-that POSIX allows a power cut to leave between any two of them: contents as of the last `fsync`, with nothing, a part, zeros or
-all of what was written since, and names as of the folder's last `fsync`, with any of the changes since made
-or not. In each the
-run is resumed. The last two columns are samples in which the calls of `fsync` are taken not to have happened; they show that
-the trial sees a loss where there is one.
+**Simulated.** The file operations of a run with a checkpoint every {paper["interval"]} steps are recorded. From them
+every state is
+generated that POSIX allows after a power cut: file contents as of the last `fsync` with nothing, a part, zeros or
+all of the later
+writes, and names as of the last `fsync` of the folder with any of the later changes. The run is resumed from each
+state. The last two
+columns ignore calls of `fsync`, and show that the trial detects losses.
 
 {table(head, rows)}
 """
     if "ext4" in found:
-        kinds = [("with fsync", found["ext4"]), ("without, for comparison", found["ext4 without fsync"])]
+        kinds = [("with `fsync`", found["ext4"]), ("without, for comparison", found["ext4 without fsync"])]
         rows = [
             (
                 title,
@@ -190,7 +196,7 @@ the trial sees a loss where there is one.
                 one["while_a_file_was_written"],
                 one["runs_that_could_not_be_resumed"],
                 max(one["most_steps_lost"], 0) or "",
-                f"{yes(one['equal_to_a_run_without_cuts'])}, after {one['steps_in_all']:,} steps"
+                f"{yes_or_no(one['equal_to_a_run_without_cuts'])}, after {one['steps_in_all']:,} steps"
                 if "steps_in_all" in one
                 else "",
             )
@@ -199,15 +205,15 @@ the trial sees a loss where there is one.
         head = (
             "",
             "cuts",
-            "while a file was written",
-            "could not be resumed",
-            "most steps lost",
-            "equal to a run without",
+            "during a write",
+            "not resumable",
+            "maximum of lost steps",
+            "bit-equal to a run without cuts",
         )
         text += f"""
-For real: SAC on the ball with a checkpoint every {found["ext4"]["interval"]} steps on an ext4 file system
-that is shut down under
-the process at a random moment, its journal not flushed, then mounted again.
+**Real.** SAC on Ball-v0 with a checkpoint every {found["ext4"]["interval"]} steps on an ext4 file system that is
+shut down at a
+random moment without flushing its journal, and mounted again.
 
 {table(head, rows)}
 """
@@ -220,13 +226,13 @@ def signals() -> str:
     left = ", ".join(f"{what} {n}" for what, n in found["left"].items())
     return f"""## Ctrl-C and SIGTERM
 
-`rejeu train` got a signal, or two in a row, at {found["signals"]} random moments of its whole life: {
+`rejeu train` received one or two signals at {found["signals"]} random moments: {
         ", ".join(f"{phase} {n}" for phase, n in found["by_phase"].items())
-    }. Of the {counted} after Python had begun to import rejeu,
+    }. Of the {counted} runs in which the import of rejeu had begun,
 {found["right_status"]} ended with the right exit status (130, 143) and {
         found["one_line_at_most"]
-    } said one line at most. What was left:
-{left}. The longest end took {found["most_seconds_until_the_end"]:.1f} s.
+    } printed at most one line. Result:
+{left}. The longest shutdown took {found["most_seconds_until_the_end"]:.1f} s.
 
 {origin("signals")}
 """
@@ -244,17 +250,19 @@ def resumed() -> str:
     equal = sum(c["equal_at_the_end"] for c in exact)
     kept = sum(c["equal_at_the_break"] for c in others)
     where = ", ".join(f"{c['env']} ({c['backend']}, {c['algorithm']})" for c in others)
-    text = f"""## Resumed
+    text = f"""## Resuming
 
-{found["steps"]:,} steps, stopped at a random one and resumed, against the same without a break: parameters, optimizers,
-replay buffer or rollout, episodes, counters and rows of statistics. {equal} of {len(exact)} are equal, bit
-for bit. Both halves run
-in one process, with one or two environments and networks of 32-32.
+Runs of {found["steps"]:,} steps are stopped at a random step and resumed, and compared with uninterrupted ones:
+parameters,
+optimizers, replay buffer or rollout, episodes, counters and metrics. {equal} of {len(exact)} are bit-equal. Both
+parts run in one
+process, with one or two environments and 32-32 networks.
 
 {table(("", *env_ids), rows)}
 
-Where the state of the environment cannot be saved, what was learned and the buffer must be those of the moment of the break,
-and new episodes begin: {kept} of {len(others)} are so ({where}).
+If the state of the environment cannot be saved, learned state and buffer must be those of the interruption, and new
+episodes begin.
+This holds for {kept} of {len(others)} ({where}).
 """
     if peer := found.get("stable_baselines3"):
         rows = [
@@ -266,10 +274,16 @@ and new episodes begin: {kept} of {len(others)} are so ({where}).
             )
             for one in peer
         ]
-        head = ("Stable-Baselines3", "environment", "two unbroken runs differ by", "the resumed run differs by")
+        head = (
+            "Stable-Baselines3",
+            "environment",
+            "difference of two uninterrupted runs",
+            "difference of the resumed run",
+        )
         text += f"""
-The same with what Stable-Baselines3 2.9.2 offers (model and replay buffer saved and loaded; largest difference of a weight at
-the end). It does not promise exact resumption.
+The same with Stable-Baselines3 2.9.2, which does not promise exact resume (model and replay buffer saved and loaded;
+largest
+difference of a weight at the end).
 
 {table(head, rows)}
 """
@@ -297,16 +311,19 @@ def hostile() -> str:
     code = [(key, value) for key, value in found.items() if "code" in key]
     text = f"""## Hostile and damaged files
 
-What is refused, by our own error alone, within bounded time and memory: files cut short at every byte; files with one bit
-flipped, for every bit; the corpus of `tests/hostile_files.py` (headers that lie about sizes, overlapping and out-of-range
-places, names given twice, nesting without end, hyper-parameters that are not numbers, unknown classes, spaces of another
-agent, values of checkpoints ...); and sparse files that claim 6 GiB (the longest took {longest:.2f} s). What
-is not refused was read:
-files of schema 1 have no checksums, and some values of a checkpoint may be others; such a run was then trained for
-some steps. Cuts and flips go through the reader that
-all loaders share; the corpus goes through the loaders.
+Number of files that are refused by a `CheckpointError` within bounded time and memory: files truncated at every
+byte; files with one
+bit flipped, for every bit; the corpus of `tests/hostile_files.py` (wrong sizes, overlapping and out-of-range
+offsets, duplicate names,
+deep nesting, invalid hyperparameters, unknown classes, other spaces, invalid values of checkpoints); and sparse
+files that claim 6 GiB
+(at most {longest:.2f} s). The other files were read:
+files of schema 1 have no checksums, and some changed values of a checkpoint are
+valid; such a run was trained for some steps. Truncated and flipped files go through the reader that all loaders
+share, the corpus
+through the loaders.
 
-{table(("file", "cut short", "one bit flipped", "corpus", "sparse"), rows)}
+{table(("file", "truncated", "one bit flipped", "corpus", "sparse"), rows)}
 """
     for key, value in code:
         text += f"\n{key}: {said(value)}.\n"
@@ -314,7 +331,7 @@ all loaders share; the corpus goes through the loaders.
 
 
 def refused_of(counts: list[dict[str, Any]]) -> str:
-    """Returns how many of how many files were refused, and what was raised instead, if anything was."""
+    """Returns how many files were refused, and other outcomes."""
     outcomes: dict[str, int] = {}
     for count in counts:
         for outcome, n in count.items():
@@ -342,16 +359,16 @@ def fuzzed() -> str:
     executions = sum(one["executions"] for one in found.values())
     most = max(found, key=lambda target: found[target]["executions"])
     share = found[most]["executions"] / executions
-    return f"""## Fuzzed
+    return f"""## Fuzzing
 
-The loaders under a coverage-guided fuzzer (atheris) whose mutations keep lengths and checksums right part of the time:
-{executions:,} executions in {hours:.1f} hours, {share:.0%} of them of the quickest loader, `{most}`. A
-finding is anything but our own
-error, a load of more than a bounded time, or one that changes what it should not. `run` and `rows` are the two kinds of file
-that a checkpoint of a whole run has: what is resumed from them must train on and save checkpoints, and these must be read
-again, or that is a finding as well.
+The loaders were run by a coverage-guided fuzzer (atheris), whose mutations sometimes keep lengths and checksums valid:
+{executions:,} executions in {hours:.1f} hours, {share:.0%} of them of the fastest loader, `{most}`. A finding is
+another exception than
+`CheckpointError`, a load that takes too long, or one that changes an existing object. For `run` and `rows`, the
+files of a checkpoint,
+the resumed run must also train and save checkpoints that can be read.
 
-{table(("loader", "executions", "minutes", "branches reached", "findings"), rows)}
+{table(("loader", "executions", "minutes", "branches", "findings"), rows)}
 
 {origin("fuzz")}
 """
@@ -374,17 +391,21 @@ def environments() -> str:
     wrong = [one for where in parts for one in found[where]["not as they must be"]]
     faults = "".join(f"- {one['kind']} ({one.get('algorithm', 'SAC')}): {'; '.join(one['wrong'])}\n" for one in wrong)
     again = found["restarted workers"]
-    return f"""## Environments of every kind
+    return f"""## Environments
 
-PPO and SAC trained for 240 steps in environments of every kind of `trials/environment_kinds.py`: spaces of all kinds, episodes
-that end in all ways, one fault each in what they answer, and such as raise, exit, hang or are killed. What must come of a run
-is known beforehand: all its steps and finite weights; our own error, which names the environment; the environment's own; or
-a refusal when the agent is made. After an error there must be a checkpoint of that step, which loads with finite weights
-(not after `sys.exit`, Ctrl-C and `NonFiniteError`, which leave the last one on schedule), and no worker process may be left.
+PPO and SAC are trained for 240 steps in the environments of `trials/environment_kinds.py`: all kinds of spaces and
+episode ends,
+invalid return values, and environments that raise, exit, hang or are killed. The expected outcome of each is known:
+all steps and
+finite weights, an error of rejeu that names the environment, an error of the environment, or a refusal when the
+agent is made. After
+an error there must be a checkpoint of that step with finite weights (after `sys.exit`, Ctrl-C and `NonFiniteError`
+the last scheduled
+one), and no worker process.
 
-{table(("where", "kinds", "runs", "as they must be", "outcomes", "longest, seconds"), rows)}
+{table(("where", "kinds", "runs", "as expected", "outcomes", "longest, seconds"), rows)}
 
-{faults}{again["workers started again"]} workers that killed themselves were started again: {again["steps taken"]} of
+{faults}{again["workers started again"]} workers that killed themselves were restarted: {again["steps taken"]} of
 {again["steps asked for"]} steps were taken.
 
 {origin("environments")}
@@ -401,21 +422,21 @@ def soaked() -> str:
         ("threads", f"{found['threads_after_warm_up']:.1f}", f"{found['threads_at_the_end']:.1f}"),
     ]
     before, after = found["files_before_and_after"]
-    return f"""## An hour with everything on
+    return f"""## One hour with all features
 
-{found["minutes"]:.0f} minutes{suspended}: {found["steps"]:,} steps of SAC with hindsight on parking-v0, {
+{found["minutes"]:.0f} minutes{suspended}: {found["steps"]:,} steps of SAC with HER on parking-v0, {
         found["evaluations"]
     }
-evaluations, {found["films"]} films, checkpoints every minute, {
+evaluations, {found["films"]} videos, checkpoints every minute, {
         found["episodes"]:,} episodes. Between the first tenth after the
 warm-up (a quarter of the time) and the last tenth:
 
 {table(("", "after the warm-up", "at the end"), rows)}
 
-Memory grew by {found["growth_percent"]:.2f} %, {
+Memory increased by {found["growth_percent"]:.2f} %, {
         found["mib_per_hour"]:.1f} MiB an hour. Open files before and after the run: {before} and {
         after
-    }; processes left: {found["processes_left"]}.
+    }; remaining processes: {found["processes_left"]}.
 
 ![Memory, files, threads and processes against time](images/soak.png)
 
@@ -424,7 +445,7 @@ Memory grew by {found["growth_percent"]:.2f} %, {
 
 
 def wrapped(page: str) -> str:
-    """Returns a page whose paragraphs and list items are filled; tables, headings and pictures stay."""
+    """Returns a page with filled paragraphs and list items."""
     blocks = []
     for block in re.split(r"\n{2,}", page.strip()):
         if block.startswith("- "):
@@ -459,14 +480,15 @@ def main() -> None:
     sections = "\n".join(SECTIONS[name]() for name in found)
     page = f"""# Reliability
 
-What was tried to break runs and files, how often, and what came out. This page is written by `trials/report.py` from the
-results under `trials/results`. Each trial was run on Linux, on the commit and with the command that stand below it; PATH is an
-interpreter that has Stable-Baselines3 2.9.2, for the comparisons. A figure says what was measured on that commit, not on later
-ones.
+Tests of crashes, power loss, invalid files and long runs, which are too slow for the test suite. This page is
+written by
+`trials/report.py` from the data in `trials/results`. Each trial names its commit and command, to which its figures
+apply; PATH is an
+interpreter with Stable-Baselines3 2.9.2 for comparisons. All were run on Linux.
 
 {table(("trial", "commit", "date", "command"), rows)}
 
-How runs resume is described under [resume](resume.md), the files under [file format](file-format.md).
+See also [resuming runs](resume.md) and [file format](file-format.md).
 
 {sections}
 ## What was not tested

@@ -13,66 +13,45 @@ from benchmarks.bench.summary import Sample, best, disturbed, drift, peak, step_
 from benchmarks.bench.text import table, with_spread
 
 DID_NOT_HELP = (
-    "**A scan around a single gradient step** costs 20 to 30 us, so a turn with one update calls it without one.",
-    "**Two threads for XLA** help only above batches of 256 through 256-256; a step of DDPG with batches of 128 through "
-    "128-128 took half as long again with two.",
-    "**Unrolled scans** compile much longer and run the same.",
-    "**bfloat16** is slower on a CPU.",
-    "**Both critics in one batched matrix product** were not faster than two products.",
-    "**An actor in NumPy** for tiny networks is not bit-equal to XLA's, and was dropped.",
-    "**Computing in the loop's own thread**, JAX's asynchronous dispatch switched off, made no difference that could be told.",
-    "**Transposing block by block** for the gradients of weights changed nothing.",
-    "**XLA's matrix products without its library YNN** take the same time at these sizes.",
-    "**Less optimisation** (level 1) compiles an update in half the time and runs it a third slower, as does XLA's older "
-    "way of writing kernels; only what runs once is compiled so.",
-    "**Adam with one division an element** instead of three saves 0 to 2 % of an update.",
-    "**One vector for PPO's weights, gradients and moments** leaves 99 kernels of 151 in a minibatch, and saves 5 % of it, "
-    "which is 1 % of a step; it was not worth another shape of the same state.",
+    "A scan around a single gradient step costs 20 to 30 us. An environment step with one update calls it without a scan.",
+    "Two threads for XLA help only above batches of 256 with 256-256 networks. DDPG with batches of 128 and 128-128 "
+    "networks was 1.5 times as slow with two.",
+    "Unrolled scans compile much longer and run at the same speed.",
+    "bfloat16 is slower on a CPU.",
+    "Both critics in one batched matrix product were not faster than two products.",
+    "An actor in NumPy is not bit-equal to XLA's.",
+    "Synchronous dispatch made no difference.",
+    "Blockwise transposition for weight gradients made no difference.",
+    "XLA's matrix products without its library YNN take the same time at these sizes.",
+    "Optimization level 1 compiles an update in half the time and runs it a third slower. It is used for what runs once.",
+    "Adam with one division per element instead of three saves 0 to 2 % of an update.",
+    "One vector for PPO's weights, gradients and moments saves 1 % of a step.",
 )
 HELPED = (
-    "**The state packed into few vectors** makes dispatch 2 to 3 times faster than a tree of arrays.",
-    "**Donating the packed state** saves a copy of it.",
-    "**One vector for all that the host sends**, and fewer NumPy calls in storing and drawing (numbers in place of arrays of "
-    "one element, kinds of rows read once), save 15 us of a step of SAC while caches are warm, and a sixth in the loop.",
-    "**Rows of the replay buffer sent whole**: a batch's columns are fields of the records that were drawn, and copying the "
-    "records is several times faster than picking each column out of them; a batch of 256 with hindsight is packed in half "
-    "the time, and drawn in five sixths of it with fewer NumPy calls.",
-    "**Gradients of weights without a transposed left side**: XLA's fast products take none, so the transposition is done "
-    "apart; at 128 by 128 such a product took 52 to 61 us where it had taken 78, and a whole update of SAC, DDPG, TD3, DQN, "
-    "TQC or CrossQ 0.5 to 15 % less. Patches of images gain nothing by it, and are left as they were.",
-    "**Random bits hashed once**: XLA repeats what is elementwise in every kernel that reads it, so the hash behind SAC's "
-    "noise stood nine times in its update. As a reduction it is computed once: the main job's update compiles in 10.5 s of "
-    "processor time instead of 23.",
-    "**What runs once compiled with no optimisation**: the first state of SAC with 64-64 takes 1.3 s of processor time "
-    "instead of 4.4.",
-    "**An update in one thread**: whenever more than eight kernels wait, XLA gives half of them to another thread, also where "
-    "it was asked for one, and the other core has none of the numbers in its caches. Targets and gradients as functions of "
-    "their own, and an optimizer's step, the targets' moves, packing and unpacking as one kernel each "
-    "(`compilation.outlined`, `compilation.one_kernel`), let an update of TD3 take 22 % less, DDPG 18, TQC 14, SAC 10 (with "
-    "parking's layers 16), DQN 9, CrossQ 5; PPO gained nothing. QR-DQN's gradient was a function of its own as this page was "
-    "measured, and slower by it by a fifth; without, and with its optimizer's step as one kernel, it takes a fifth less than "
-    "before.",
-    "**Quantile losses target by target**: XLA wrote the table of all pairs of quantiles and targets to memory several times "
-    "over. A scan over the targets takes 0.5 ms instead of 8 for QR-DQN (batches of 32, 200 quantiles), and 0.2 instead of "
-    "1.6 for TQC.",
+    "**Packing the state into few vectors** makes dispatch 2 to 3 times faster than a tree of arrays.",
+    "**Donating the state** saves a copy.",
+    "**Fewer NumPy calls** in storing and sampling, and one vector for the inputs of an update, save a sixth of a SAC step.",
+    "**Copying whole rows** of the replay buffer is several times faster than selecting each column.",
+    "**Weight gradients without a transposed left operand**, which XLA's fast products do not support: an update of "
+    "SAC, DDPG, TD3, DQN, TQC or CrossQ takes 0.5 to 15 % less.",
+    "**Random bits computed once**: XLA recomputes elementwise operations in every kernel that reads them. As a reduction the "
+    "hash is computed once, which halves the compilation time of SAC.",
+    "**No optimization of what runs once**: the initial state of SAC compiles in 1.3 s instead of 4.4 s.",
+    "**Updates on one thread**: if more than eight kernels are ready, XLA moves half of them to another thread, whose core "
+    "has cold caches. Separate functions and single kernels (`xla.py`) prevent this: an update of TD3 takes 22 % less, DDPG 18, "
+    "TQC 14, SAC 10, DQN 9, CrossQ 5.",
+    "**Quantile losses by a scan over targets** instead of a table of all pairs: 0.5 ms instead of 8 for QR-DQN, 0.2 instead "
+    "of 1.6 for TQC.",
 )
 IN_THE_WAY = (
-    "**Products of small matrices are most of what DDPG and TD3 do.** One of 128 by 128 by 128 took 44 to 60 us by itself, as "
-    "the machine's speed changed, and an update of DDPG has ten of them, one of TD3 eleven and a half: 60 to 65 % of its "
-    "time. In the loop XLA's thread worked 679 of 707 us of a step with DDPG and 997 of 1,022 with TD3, so whatever else is "
-    "made faster would not show. With SAC (64-64) it is the other way round: the loop's own thread worked 527 of 531 us, "
-    "XLA's 413.",
-    "**An environment empties the caches.** Sending a compiled function the observations of 16 environments takes 46 us where "
-    "nothing else runs, and 102 to 126 us after their step: XLA's, JAX's and Python's own work. On EnvPool such a step of PPO "
-    "took 64 us an environment: 35 in the environments, 9 in its share of the updates, 4 in storing, the rest in acting.",
-    "**The parking job on highway-env is the environment.** Of rejeu's 72 s in the run before this one, "
-    "5,000 steps of training at 10.1 ms were 50 and "
-    "the evaluation, nearly all of it steps, 5 to 9; a job 1.8 times as short as Stable-Baselines3's would leave 3 s for "
-    "imports, compiling and 4,000 updates.",
-    "**PPO on Gymnasium's environments waits for them**: its table says behind each ratio what a program that does nothing "
-    "else would reach, and with 16 environments that is less than 4.",
+    "**DDPG and TD3 are limited by products of small matrices.** They are 60 to 65 % of an update, at 44 to 60 us for each "
+    "128 by 128 by 128 product. XLA's thread is busy 96 % of the time. With SAC (64-64) the loop's thread is.",
+    "**Stepping environments empties the caches.** Passing the observations of 16 environments to compiled code takes 46 us "
+    "by itself, and 102 to 126 us after a step.",
+    "**Parking on highway-env is limited by the environment**, which takes 90 % of the training time.",
+    "**PPO on Gymnasium is limited by the environments.** The ratio at the limit is below 4 with 16 environments.",
 )
-"""What was found by profiles on the machine of the page."""
+"""Profiling results on the machine of the page."""
 
 
 def write(results: Mapping[str, Any], page: Path) -> None:
@@ -99,28 +78,27 @@ def write(results: Mapping[str, Any], page: Path) -> None:
 def head(results: Mapping[str, Any]) -> str:
     described = results["machine"]
     memory_text = "" if described["memory_gib"] is None else f", {described['memory_gib']:g} GiB of memory"
-    text = f"""# How fast it is
+    text = f"""# Performance
 
-Written by `scripts/bench`; every figure is from one run on one machine, and all samples are in
-`benchmarks/results/bench.json`.
+This page is written by `scripts/bench` from one run on one machine. All samples are in `benchmarks/results/bench.json`.
 
 **The machine:** {described["processor"]}, {described["cores"]} cores{memory_text}, {described["system"]}.
 
-To measure again, on a machine that does nothing else, from a clone of the repository:
+To repeat the measurements, on an idle machine, from a clone of the repository:
 
 ```
 pip install -c constraints.txt -e ".[all,box2d]"
 scripts/bench
 ```
 
-That makes a virtual environment for each peer first, with pip; `--sb3-python` and `--sbx-python` take ready ones, and
-`--help` tells the rest. This page is of the command
+This creates a virtual environment for each of the other libraries; `--sb3-python` and `--sbx-python` use existing ones.
+This page is the result of
 
 ```
 {results["command"]}
 ```"""
     if results["settings"]["quick"]:
-        text += "\n\n**This was a smoke run (`--quick`): its figures mean nothing.**"
+        text += "\n\n**This was a smoke test (`--quick`): its figures have no meaning.**"
     return text
 
 
@@ -129,26 +107,24 @@ def how_to_read(results: Mapping[str, Any]) -> str:
     for library, found in results["versions"].items():
         listed = ", ".join(f"{name} {version}" for name, version in found.items() if version is not None)
         versions.append(f"- {NAMES[library]}: {listed}")
-    return f"""## How to read it
+    return f"""## Method
 
-- Every measurement runs in a fresh process. The libraries take turns, {results["settings"]["rounds"]} round(s) of all cases;
-  a figure is the median over the rounds, in brackets the least and the greatest.
-- A ratio is taken in each round, between measurements minutes apart, and its median is shown. Above 1, rejeu is faster.
-  Read ratios rather than times: another processor has other times.
-- The clock starts once everything is compiled and warm, except where whole processes are timed.
-- Peers run with one thread and with all, in the first round; the faster setting is measured on and shown. rejeu chooses its
-  number of threads itself. Stable-Baselines3 and SBX step Gymnasium environments in the process (`DummyVecEnv`): neither
-  takes EnvPool's as they are.
-- All libraries get the same networks, batches, rollouts and numbers of updates, and compute on the CPU.
-- **The limit** is a bare step of the same environment (random actions, resets included, through the same vector of
-  environments) plus the floating-point operations of acting and updating at the rate of the fastest matrix product that
-  this machine computes with as many threads as rejeu uses. No program that does the two one after the other can be faster.
-  rejeu's off-policy loop does them at the same time, where there is a core to spare; and no real update is one large
-  product. "Of the limit" is the limit divided by the measured time: 100 % would be a loop and an update without any loss.
-  Behind a ratio, after "of", stands the ratio that a program at the limit would have, on the same environments.
-- Operations are counted by XLA (`cost_analysis` of the compiled update). XLA counts the body of a loop once and of a
-  conditional the costlier branch, so the count adds XLA's count of each body for its further runs, and takes of a
-  conditional its share: a delayed actor counts as often as it is updated.
+- Every measurement runs in a new process. The libraries alternate, {results["settings"]["rounds"]} round(s) of all cases.
+  A figure is the median over the rounds, with the minimum and maximum in brackets.
+- A ratio is computed in each round, and its median is shown. Above 1, rejeu is faster. Compare ratios rather than times.
+- Timing starts after compilation and warm-up, except for whole processes.
+- The other libraries run with one thread and with all threads in the first round, and with the faster setting from then
+  on. rejeu selects its number of threads. Stable-Baselines3 and SBX step Gymnasium environments in the process
+  (`DummyVecEnv`); neither supports EnvPool directly.
+- All libraries have the same networks, batch sizes, rollouts and numbers of updates, and use the CPU.
+- **The limit** is a bare step of the same environments (random actions, resets included) plus the floating-point
+  operations of acting and updating at the rate of the fastest matrix product on this machine, with rejeu's number of
+  threads. No program that does both in sequence can be faster. rejeu's off-policy loop does both at the same time if
+  there is a free core. "Of the limit" is the limit divided by the measured time. A ratio "x of y" is x, where a program
+  at the limit would have y.
+- Operations are counted by XLA (`cost_analysis` of the compiled update). XLA counts the body of a loop once, and the more
+  expensive branch of a conditional. The counts are corrected for the number of iterations and the frequency of delayed
+  actor updates.
 
 Versions:
 
@@ -177,11 +153,11 @@ def machine_limits(samples: Sequence[Sample]) -> str:
             rows.append((text, f"{number(flops / 1e6)} MFLOP"))
     if not rows:
         return ""
-    return f"""## What the limits are made of
+    return f"""## Components of the limits
 
-The products are of square matrices from 128 to 2,048, by NumPy and by XLA; the fastest counts. For SAC with 64-64 and batches
-of 64 the matrix products alone are {sac_by_hand() / 1e6:.2f} MFLOP by a formula on paper (`sac_by_hand` in
-`benchmarks/bench/work/flops.py`); what XLA counts on top is elementwise: activations, losses, Adam, targets.
+The matrix products are of square matrices from 128 to 2,048, by NumPy and XLA; the fastest is used. For SAC with 64-64
+networks and batches of 64 the matrix products are {sac_by_hand() / 1e6:.2f} MFLOP by a formula (`sac_by_hand` in
+`benchmarks/bench/work/flops.py`). The others are elementwise: activations, losses, Adam, target networks.
 
 {table(("", ""), rows)}"""
 
@@ -197,15 +173,15 @@ def tried() -> str:
     helped, not_helped, in_the_way = (
         "\n".join(f"- {fact}" for fact in facts) for facts in (HELPED, DID_NOT_HELP, IN_THE_WAY)
     )
-    return f"""## What was tried and did not help
+    return f"""## Optimizations that did not help
 
 {not_helped}
 
-What did help, measured on the way:
+Optimizations that helped:
 
 {helped}
 
-## What stands between this and the limit
+## Remaining gap to the limit
 
 {in_the_way}"""
 
@@ -216,15 +192,15 @@ def conditions(results: Mapping[str, Any]) -> str:
     lines = [f"- Load average before the run: {results['machine']['load_before']}."]
     if calibrated is not None:
         lines.append(
-            f"- A fixed matrix product around every measurement took {number(calibrated.median)} ms (least "
-            f"{number(calibrated.low)}, greatest {number(calibrated.high)}): if it differs, the machine's speed did."
+            f"- A fixed matrix product around every measurement took {number(calibrated.median)} ms ("
+            f"{number(calibrated.low)} to {number(calibrated.high)}), which shows changes of the machine's speed."
         )
     seconds = sum(sample["wall_seconds"] for sample in samples)
-    lines.append(f"- {len(samples)} measurements, {seconds / 60:.0f} minutes in all.")
+    lines.append(f"- {len(samples)} measurements, {seconds / 60:.0f} minutes in total.")
     if busy:
         lines.append(
-            f"- **Other programs used more than {machine.BUSY} cores before {len(busy)} of the measurements: figures of those "
-            "are not to be trusted.**"
+            f"- **Other programs used more than {machine.BUSY} cores before {len(busy)} of the measurements: "
+            "those figures are unreliable.**"
         )
     failed = sorted({sample["key"] for sample in samples if "error" in sample})
     if failed:
@@ -234,4 +210,4 @@ def conditions(results: Mapping[str, Any]) -> str:
         + ", ".join(f"`{name}={v}`" for name, v in plan.VARIANTS[plan.ONE].items())
         + "."
     )
-    return "## Under which conditions\n\n" + "\n".join(lines)
+    return "## Conditions\n\n" + "\n".join(lines)

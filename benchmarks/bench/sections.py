@@ -58,7 +58,7 @@ def parking(samples: Sequence[Sample]) -> str:
         )
     header = (
         "",
-        "whole job, s",
+        "whole process, s",
         "ratio",
         "training steps/s",
         "ratio",
@@ -66,12 +66,11 @@ def parking(samples: Sequence[Sample]) -> str:
         "ms outside it",
         "ratio",
     )
-    return f"""## The parking job
+    return f"""## Parking
 
-SAC with hindsight replay on parking-v0 from the start of the process to its end: import, train for 5,000 steps, save model
-and buffer, load both, evaluate 10 episodes. The compilation cache is empty. Training is timed from the first update on, when
-all is compiled; "in the environment" are its `step` and `reset`, by the same wrapper in either library. 64-64, batches of
-64, one update a step from step 1,000 on. Success after so few steps is that of a policy that has hardly learnt.
+SAC with HER on parking-v0 as a whole process: import, train for 5,000 steps, save model and buffer, load both, evaluate
+10 episodes. The compilation cache is empty. Training is timed from the first update on, after compilation. "In the
+environment" is the time of `step` and `reset`. 64-64 networks, batches of 64, one update for each step after step 1,000.
 
 {table((*header, "compiling, s", "success"), rows)}
 
@@ -79,7 +78,7 @@ all is compiled; "in the environment" are its `step` and `reset`, by the same wr
 
 
 def share_table(cases: Sequence[tuple[str, Sequence[Sample], Mapping[str, float] | None]]) -> str:
-    """Returns what rejeu's time went into, case by case, and by how much that is beyond the limit where there is one."""
+    """Returns rejeu's time by part, and its difference to the limit if there is one."""
     rows = []
     beyond = any(gaps is not None for *_, gaps in cases)
     for name, found, gaps in cases:
@@ -90,15 +89,15 @@ def share_table(cases: Sequence[tuple[str, Sequence[Sample], Mapping[str, float]
     if not rows:
         return ""
     text = (
-        "Where rejeu's time went while training (`agent.seconds`). `update` is the time that the loop waited for the device, "
-        "acting and\ndispatch included."
+        "rejeu's training time by part (`agent.seconds`). `update` is the time that the loop waits for the device, including "
+        "acting\nand dispatch."
     )
     header: tuple[str, ...] = ("", "environment", "replay", "update", "rest")
     if beyond:
         header += ("beyond the bare environment, us", "replay, us", "update beyond its arithmetic, us", "rest, us")
         text += (
-            " The right half is what stands between rejeu and the limit, in microseconds of a step; a number is\nnegative "
-            "where something is done while something else is waited for."
+            " The right half is the difference to the limit in microseconds per step, which is negative\n"
+            "where parts overlap."
         )
     return f"{text}\n\n{table(header, rows)}"
 
@@ -125,19 +124,19 @@ def per_step(samples: Sequence[Sample], page: Path) -> str:
         for name, (_, env, s) in plan.STEPS.items()
         if name in names
     )
-    return f"""## A step with one update
+    return f"""## Off-policy: a step with one update
 
-Milliseconds of an environment step with one gradient step, one Gymnasium environment; in the last row eight environments on
-EnvPool and eight updates a turn, which is again one a step. {settings}.
+Milliseconds per environment step with one gradient step, with one Gymnasium environment; in the last row with eight
+environments on EnvPool and eight updates at once. {settings}.
 
 {table(header, rows)}
 
-![Milliseconds of a step](images/{PICTURES["steps"]})
+![Milliseconds per step](images/{PICTURES["steps"]})
 
 {share_table(measured)}"""
 
 
-LIMIT_HEADER = ("limit", "of it environment", "of it arithmetic", "of the limit")
+LIMIT_HEADER = ("limit", "environment part", "arithmetic part", "of the limit")
 
 
 def compared(samples: Sequence[Sample], name: str, by: Mapping[str, ByRound], found: Limit | None) -> tuple[str, ...]:
@@ -203,25 +202,24 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
                     cells.append(times_of_most(numbers, own, found))
                 rows.append((*cells, *limit_cells(found, 1e6)))
         if rows:
-            header = ["environments", "rejeu's on", "rejeu", "Stable-Baselines3", "ratio"]
+            header = ["environments", "rejeu on", "rejeu", "Stable-Baselines3", "ratio"]
             header += ["SBX", "ratio"] if algorithm == "PPO" else []
-            limit_header = ("limit, us a step", "of it environment", "of it arithmetic", "of the limit")
+            limit_header = ("limit, us per step", "environment part", "arithmetic part", "of the limit")
             tables.append(f"### {algorithm}\n\n{table((*header, *limit_header), rows)}")
             drawn[algorithm], limits[algorithm] = lines, at
     if not tables:
         return ""
     picture = page.parent / "images" / PICTURES["rollouts"]
     pictures.draw_rollouts(drawn, limits, picture, f"{plan.LANDER}: steps a second")
-    return f"""## PPO and A2C against the number of environments
+    return f"""## On-policy: PPO and A2C by number of environments
 
-Environment steps a second on {plan.LANDER}, 64-64, updates included. PPO: rollouts of {plan.ROLLOUT:,} steps in all, batches
-of 64, 5 epochs; A2C: rollouts of 5 steps of each environment. Peers step Gymnasium environments in the process, and are the
-same in both rows of a number of environments. SBX has no A2C. Where rejeu's batch is an environment's single observation,
-what remains is the cost of calling compiled code once a step.
+Environment steps per second on {plan.LANDER}, 64-64 networks, updates included. PPO: rollouts of {plan.ROLLOUT:,} steps
+in total, batches of 64, 5 epochs. A2C: rollouts of 5 steps of each environment. The other libraries step Gymnasium
+environments in the process, so their figures are the same in both rows. SBX has no A2C.
 
 {(chr(10) * 2).join(tables)}
 
-![Steps a second against the number of environments](images/{PICTURES["rollouts"]})
+![Steps per second by number of environments](images/{PICTURES["rollouts"]})
 
 {share_table(measured)}"""
 
@@ -253,17 +251,17 @@ def replay(samples: Sequence[Sample], page: Path) -> str:
         rows.append((f"{size:,}", *row, cells("rejeu, priority", size)))
     drawn = {line: {size: spread(by[size]) for size in sizes if size in by} for line, by in lines.items()}
     pictures.draw_replay(drawn, page.parent / "images" / PICTURES["replay"], "Drawing a batch from a full buffer")
-    header = ("transitions", "rejeu, hindsight", "Stable-Baselines3, hindsight", "ratio", "rejeu, by priority")
-    return f"""## Drawing batches
+    header = ("transitions", "rejeu, HER", "Stable-Baselines3, HER", "ratio", "rejeu, prioritized")
+    return f"""## Sampling batches
 
-Microseconds of a batch of 256 from a buffer that is full of episodes of 100 steps. Hindsight: parking's observations, four
-goals in five by the strategy `future`, rewards by highway-env's own `compute_reward` in either library; rejeu's batch is of
-NumPy arrays, Stable-Baselines3's of tensors, as each hands them on. By priority: Pendulum's observations, the draw and the
-new priorities of the batch before; Stable-Baselines3 has no such buffer.
+Microseconds per batch of 256 from a full buffer with episodes of 100 steps. HER: parking's observations, strategy
+`future`, `n_sampled_goal=4`, highway-env's `compute_reward`; NumPy arrays in rejeu, tensors in Stable-Baselines3.
+Prioritized replay: Pendulum's observations, sampling and updating the priorities of the previous batch; Stable-Baselines3
+does not have it.
 
 {table(header, rows)}
 
-![Microseconds a batch against the size of the buffer](images/{PICTURES["replay"]})"""
+![Microseconds per batch by size of the buffer](images/{PICTURES["replay"]})"""
 
 
 def memory(samples: Sequence[Sample]) -> str:
@@ -288,14 +286,13 @@ def memory(samples: Sequence[Sample]) -> str:
                 )
     if not rows:
         return ""
-    header = ("observations", "", "necessary", "arrays", "times", "process grew by", "times")
+    header = ("observations", "", "necessary", "arrays", "times", "process growth", "times")
     return f"""## Memory of a full buffer
 
-Bytes a transition, of a million transitions, every byte of them written. A transition must take its observation once (the
-next observation is the next transition's own), its action, its reward and a flag for its end: `4 (observation + action + 1)
-+ 1` bytes with numbers of four bytes. For hindsight, rejeu adds how far off the end of the episode is, a number of four bytes;
-of its rows one for each episode holds the last observation (here one in 101; they count as transitions);
-highway-env declares its observations as float64, which Stable-Baselines3 keeps and rejeu halves.
+Bytes per transition, with a million transitions. The necessary bytes are one observation, the action, the reward and a
+flag: `4 (observation + action + 1) + 1` with 4-byte numbers. For HER rejeu adds 4 bytes for the distance to the end of
+the episode, and one row for the final observation of each episode (here one in 101). highway-env declares float64
+observations, which rejeu stores as float32.
 
 {table(header, rows)}"""
 
@@ -309,8 +306,8 @@ def startup(samples: Sequence[Sample]) -> str:
     labels = {
         "python": "`python -c pass`",
         "import": "import",
-        "first update, cold": "SAC on Pendulum-v1 to its first update, compilation cache empty",
-        "first update, warm": "the same, started a second time",
+        "first update, cold": "SAC on Pendulum-v1 until the first update, compilation cache empty",
+        "first update, warm": "the same with the compilation cache",
         "command line, --help": "`rejeu --help`",
     }
 
@@ -320,10 +317,10 @@ def startup(samples: Sequence[Sample]) -> str:
         )
 
     rows = [(labels[name], *(cell(of, name) for of in found.values())) for name in names]
-    return f"""## Starting
+    return f"""## Startup
 
-Seconds of whole processes, from the command to its end. SBX gets a compilation cache as well, which it does not turn on by
-itself; Stable-Baselines3 compiles nothing.
+Seconds of whole processes. SBX has a compilation cache too, which it does not enable by itself; Stable-Baselines3 does
+not compile.
 
 {table(("", *(NAMES[library] for library in found)), rows)}"""
 
@@ -348,7 +345,7 @@ def files(samples: Sequence[Sample]) -> str:
         rows.append((f"{name}, MB", *(number(size / 1e6) for size in sizes.values()), both))
     return f"""## Files
 
-A model of SAC (256-256) for parking's observations after some updates, and a full buffer of 100,000 of its transitions.
-Either library's model file holds networks, targets and optimizers. Loading a model makes an agent ready to act.
+A SAC model (256-256) for parking's observations, and a full buffer of 100,000 transitions. Model files of both libraries
+contain networks, target networks and optimizers.
 
 {table(("", *(NAMES[library] for library in found), "ratio"), rows)}"""
