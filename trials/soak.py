@@ -61,7 +61,7 @@ class Watch(threading.Thread):
 
 def train(minutes: float, folder: Path, watch: Watch) -> dict[str, object]:
     import rejeu
-    from rejeu.callbacks import Checkpoint, Evaluate, Film
+    from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
     from rejeu.reporting.logging import CsvFile
 
     env = rejeu.make_vector("parking-v0", 8, "envpool", seed=0)
@@ -77,7 +77,7 @@ def train(minutes: float, folder: Path, watch: Watch) -> dict[str, object]:
         policy_kwargs={"net_arch": [64, 64]},
     )
     evaluate = Evaluate("parking-v0", every=20_000, episodes=16, best_path=folder / "best", seed=1)
-    film = Film(folder / "films", every=100_000, max_steps=60, seed=0)
+    film = RecordVideo(folder / "films", every=100_000, max_steps=60, seed=0)
     metrics = CsvFile(folder / "metrics.csv")
 
     def note(agent: rejeu.SAC, turn: object) -> None:

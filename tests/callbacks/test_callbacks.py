@@ -10,7 +10,17 @@ import pytest
 from rich.console import Console
 
 import rejeu
-from rejeu.callbacks import Evaluate, Film, ProgressBar, better, crossed, progress_bar, stop_on_return, stop_on_success
+from rejeu.callbacks import (
+    Evaluate,
+    Film,
+    ProgressBar,
+    RecordVideo,
+    better,
+    crossed,
+    progress_bar,
+    stop_on_return,
+    stop_on_success,
+)
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops.run import Episode, Progress
 from rejeu.reporting.evaluation import Evaluation
@@ -283,28 +293,28 @@ def test_an_agent_that_improves_and_then_cracks_is_restored_to_its_best():
     assert agent.best.step == evaluate.best.step <= 700
 
 
-def test_films_fall_due_by_steps_and_training_goes_on_as_if_nothing_was_filmed(tmp_path):
+def test_videos_by_steps_do_not_change_training(tmp_path):
     env = lambda: Pictured(Counter((5,)))  # noqa: E731
-    film = Film(tmp_path / "films", 20, env=env)
+    video = RecordVideo(tmp_path / "videos", 20, env=env)
     filmed, other = small_sac(Counter((5,))), small_sac(Counter((5,)))
-    filmed.learn(45, film)
+    filmed.learn(45, video)
     other.learn(45)
-    assert [path.name for path in film.paths] == ["step_000000020.mp4", "step_000000040.mp4"]
-    assert all(path.stat().st_size > 0 for path in film.paths)
+    assert [path.name for path in video.paths] == ["step_000000020.mp4", "step_000000040.mp4"]
+    assert all(path.stat().st_size > 0 for path in video.paths)
     for name, array in other.get_parameters().items():
         np.testing.assert_array_equal(array, filmed.get_parameters()[name])
 
 
-def test_films_fall_due_by_episodes(tmp_path):
-    film = Film(tmp_path, every_episodes=3, env=lambda: Pictured(Counter((5,))))
-    small_sac(Counter((5,))).learn(40, film)  # 8 episodes of 5 steps
-    assert [path.name for path in film.paths] == ["step_000000015.mp4", "step_000000030.mp4"]
+def test_videos_by_episodes(tmp_path):
+    video = RecordVideo(tmp_path, every_episodes=3, env=lambda: Pictured(Counter((5,))))
+    small_sac(Counter((5,))).learn(40, video)  # 8 episodes of 5 steps
+    assert [path.name for path in video.paths] == ["step_000000015.mp4", "step_000000030.mp4"]
 
 
 @pytest.mark.parametrize("settings", [{}, {"every": 5, "every_episodes": 2}])
-def test_a_film_needs_one_frequency(settings, tmp_path):
+def test_videos_need_exactly_one_frequency(settings, tmp_path):
     with pytest.raises(ValueError, match="give one of every="):
-        Film(tmp_path, **settings)
+        RecordVideo(tmp_path, **settings)
 
 
 class Pictured(gym.Wrapper):
@@ -316,3 +326,7 @@ class Pictured(gym.Wrapper):
 
     def render(self):
         return np.zeros((32, 32, 3), np.uint8)
+
+
+def test_film_is_still_the_name_of_a_video_callback():
+    assert Film is RecordVideo

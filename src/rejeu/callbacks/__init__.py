@@ -9,7 +9,6 @@ from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.callbacks.checkpoint import Checkpoint
 from rejeu.callbacks.due import crossed, step_before
 from rejeu.callbacks.evaluate import EVALUATED, EVALUATION, Evaluate, Evaluated, better, merit
-from rejeu.callbacks.film import Film
 from rejeu.callbacks.progress_bar import (
     LINE_SECONDS,
     RATE_SECONDS,
@@ -19,6 +18,7 @@ from rejeu.callbacks.progress_bar import (
     status,
     time_spent,
 )
+from rejeu.callbacks.record_video import Film, RecordVideo
 from rejeu.callbacks.records import print_records
 from rejeu.callbacks.stopping import stop_on_return, stop_on_success
 
@@ -34,6 +34,7 @@ __all__ = [
     "Evaluated",
     "Film",
     "ProgressBar",
+    "RecordVideo",
     "TrainingCallback",
     "better",
     "crossed",

@@ -13,7 +13,7 @@ import numpy as np
 
 from rejeu import errors, xla
 from rejeu.agents import Agent, load
-from rejeu.callbacks import Checkpoint, Evaluate, Film
+from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo, reporter, summary
 from rejeu.cli.run_folder import RunConfig, RunFolder
@@ -138,7 +138,7 @@ class Session(NamedTuple):
         callbacks: list[Any] = [evaluate, finish]
         if config.video_every is not None:
             render = self.environment.rendering
-            callbacks.append(Film(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
+            callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
         if config.checkpoint_minutes is not None:
             callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
         return evaluate, callbacks
