@@ -1,4 +1,4 @@
-"""The agent: the methods of Stable-Baselines3, over what :class:`~rejeu.agents.base.BaseAgent` holds."""
+"""The methods of every agent that users call, under the names of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rejeu.reporting.logging import Sink
 
 
 class Agent(BaseAgent):
-    """What all agents share. Abstract: use SAC, PPO or another algorithm."""
+    """The base class of all agents. Abstract: use SAC, PPO or another algorithm."""
 
     def learn(
         self,
@@ -41,49 +41,49 @@ class Agent(BaseAgent):
         """Trains, and returns the agent.
 
         Args:
-            total_timesteps: environment steps to take, over all environments; exactly so many are taken. None with
+            total_timesteps: environment steps, over all environments; exactly this number is taken. None with
                 ``episodes`` or ``minutes``.
-            callback: called after every step as ``callback(agent, progress)``, or several; ``False`` stops training.
-                A :class:`rejeu.callbacks.TrainingCallback` is also told when training starts and ends; those of
-                :mod:`rejeu.sb3.common.callbacks` are such.
+            callback: one or several, called after every step as ``callback(agent, progress)``; ``False`` stops training.
+                A :class:`rejeu.callbacks.TrainingCallback` is also called when training starts and ends, as are those
+                of :mod:`rejeu.sb3.common.callbacks`.
             log_interval: episodes between two rows of statistics.
             tb_log_name: name of the run in ``tensorboard_log``; None: the algorithm's.
-            reset_num_timesteps: count steps from 0 and begin schedules (learning rate, exploration, clip range, beta)
-                again. With False both continue as in Stable-Baselines3: steps taken before count as done and as part of
-                the whole, so ``learn(300, reset_num_timesteps=False)`` after 100 steps moves schedules from 1/4 of their
-                way to the end. Learning itself continues in either case.
-            progress_bar: show one.
-            episodes: stop when so many episodes have ended, over all environments.
-            minutes: stop after so much wall time. Schedules follow whichever limit is nearest; episodes and training time
-                before this call count as steps do.
-            sinks: further places for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)``.
+            reset_num_timesteps: count steps from 0 and restart schedules (learning rate, exploration, clip range, beta).
+                With False both continue as in Stable-Baselines3: earlier steps count as done and as part of the total,
+                so ``learn(300, reset_num_timesteps=False)`` after 100 steps moves schedules from 1/4 to the end.
+                Weights and buffer are kept in either case.
+            progress_bar: show a progress bar.
+            episodes: stop after this number of episodes, over all environments.
+            minutes: stop after this wall time. Schedules follow the nearest limit; with ``reset_num_timesteps=False``
+                earlier episodes and training time count as earlier steps do.
+            sinks: further outputs for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)``.
 
-        Without any limit, an agent from :meth:`resume` goes on with the ``learn`` that was cut off, to its end; arguments
-        that count steps and rows are then those of that call.
+        Without any limit, an agent from :meth:`resume` completes the ``learn`` that was interrupted, with the limits and
+        the ``log_interval`` of that call.
 
-        Ctrl-C and SIGTERM end training after the step it is in, with everything consistent; ``interrupted`` is then True.
+        Ctrl-C and SIGTERM end training after the current step; ``interrupted`` is then True.
 
         Raises:
-            ValueError: without an environment, or if no limit is given.
+            ValueError: without an environment or a limit.
         """
         call = training.start_call(self, total_timesteps, episodes, minutes, log_interval, reset_num_timesteps)
         training.train(self, call, callback, tb_log_name, progress_bar, sinks)
         return self
 
     def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
-        """Keeps the present weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
+        """Keeps the current weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
 
-        ``learn`` calls it with the mean return of the last ``best_window`` training episodes (20, or 1 for the best single
-        episode), :class:`rejeu.callbacks.Evaluate` with success rate and mean return; once it was called with the score of
-        an evaluation, evaluations alone count. Scores of one kind must compare with each other.
+        ``learn`` calls it with the mean return of the last ``best_window`` training episodes, and
+        :class:`rejeu.callbacks.Evaluate` with success rate and mean return. After the first evaluation only evaluations
+        count. Scores of one kind must be comparable.
         """
         return training.remember_best(self, score, by)
 
     def restore_best(self) -> Self:
-        """Puts back the best weights so far: actor, critics, their targets and optimizers as they were together.
+        """Restores the best weights so far: networks, targets and optimizers of one moment.
 
         Raises:
-            ValueError: if none were kept yet, which takes ``best_window`` finished episodes or one evaluation.
+            ValueError: before ``best_window`` episodes have finished or one evaluation was made.
         """
         training.restore_best(self)
         return self
@@ -100,22 +100,21 @@ class Agent(BaseAgent):
         deterministic: bool = False,
         action_masks: Any = None,
     ) -> tuple[np.ndarray, Any]:
-        """Returns actions in the environment's own range, and what a policy with a memory remembers (without, ``state``).
+        """Returns actions in the environment's own range, and the next state of a recurrent policy (else ``state``).
 
         Args:
             observation: one observation of the environment's space, or a batch of them with a leading axis; the action
                 has a leading axis if and only if the observation has.
-            state: what the last call returned, for a policy with a memory; None where episodes begin.
-            episode_start: where an episode begins with this observation, ``bool (batch,)``, so that what was remembered
-                is forgotten there; None for nowhere.
-            deterministic: the policy's mode; False draws from the policy, which gives the same action again where the policy
-                is deterministic (DDPG, TD3). ``action_noise`` is never added: it belongs to training.
+            state: what the last call returned, for a recurrent policy; None at the start of episodes.
+            episode_start: whether an episode starts with this observation, ``bool (batch,)``; the state of a recurrent
+                policy is reset there. None for nowhere.
+            deterministic: return the mode of the policy; False samples from it, which gives the same action if the policy
+                is deterministic (DDPG, TD3). ``action_noise`` is used in training only.
             action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, for agents that take masks; None
                 allows all.
 
         Raises:
-            ValueError: if the observation or the mask does not have the space's structure or shape, or ``state`` that of
-                the policy's memory.
+            ValueError: if observation, mask or ``state`` have the wrong structure or shape.
         """
         if self.takes_masks:
             observation, action_masks = split(observation, action_masks)
@@ -140,33 +139,31 @@ class Agent(BaseAgent):
         """Plays whole episodes and returns their returns, lengths, successes and 95 % intervals.
 
         Args:
-            episodes: how many; None: 100, or with ``minutes`` as many as there is time for.
-            env: where, as for the constructor; None: new environments like the agent's own if it was given an id,
-                else the agent's own, whose running episodes are then given up.
-            deterministic: the policy's mode; False draws from the policy, as :meth:`predict` does.
-            seed: of the environments, the agent's own included; None draws one for new environments, and lets the
-                random numbers of others go on.
-            success_threshold: return from which on an episode counts as a success where the environment does not say;
-                None takes the agent's own.
-            minutes: of wall time; when they are over, no further episode begins. Episodes that have begun are played to
-                their end and count, so that long ones are not left out: it takes up to one episode longer, and every
-                environment plays at least one. None for no limit.
+            episodes: number of episodes; None: 100, or with ``minutes`` as many as there is time for.
+            env: the environments, as for the constructor. None: new ones like the training environments if these were
+                made from an id, else the training environments themselves, whose running episodes are then abandoned.
+            deterministic: use the mode of the policy; False samples from it, as :meth:`predict` does.
+            seed: of the environments; None draws one for new environments and does not seed others.
+            success_threshold: least return of a successful episode where the environment does not report success; None:
+                that of the agent.
+            minutes: of wall time, after which no further episode starts. Episodes that have started are completed and
+                count, so that long ones are not left out, and every environment plays at least one. None for no limit.
 
-        It may be called by a callback while the agent learns. Where it plays in the environments that the agent trains
-        on, be they given or not, training goes on in new episodes.
+        A callback may call it during ``learn``. If it uses the training environments, training continues in new
+        episodes.
         """
         return policy.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
 
     def save(self, path: str | Path) -> Path:
-        """Writes the model to one safetensors file and returns its path; the replay buffer is not part of it.
+        """Writes the model to one safetensors file, without the replay buffer, and returns its path.
 
-        ``.safetensors`` is added to a path without a suffix. The file holds everything learnt, the hyper-parameters, the
-        spaces and the counters. An older file at that path is replaced only once the new one is complete.
+        ``.safetensors`` is added to a path without a suffix. The file contains the parameters, optimizers,
+        hyperparameters, spaces and counters. An older file at that path is replaced only when the new one is complete.
         """
         return self.snapshot(path)()
 
     def snapshot(self, path: str | Path) -> Callable[[], Path]:
-        """Returns a function that does what :meth:`save` does, with the model as it is now, whenever it is called."""
+        """Returns a function that writes the model as it is now, as :meth:`save` does."""
         arrays, header = self.get_parameters(), model_files.header(self)
 
         def write() -> Path:
@@ -177,17 +174,17 @@ class Agent(BaseAgent):
 
     @classmethod
     def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:
-        """Returns the agent of a model file. Runs nothing that the file holds; it supplies numbers only.
+        """Returns the agent of a model file. No code from the file is run.
 
         Args:
-            path: as given to :meth:`save`, or a run folder, whose best model is taken.
-            env: where it continues to learn; None for an agent that only predicts. Such an agent still evaluates in
-                environments like those that it was trained on, where they were made from a registered id.
-            changes: constructor arguments or hyper-parameters to set otherwise than they were saved.
+            path: as given to :meth:`save`, or a run folder, whose best model is loaded.
+            env: environments to continue training in; None for an agent that only predicts and evaluates. It evaluates in
+                new environments like those it was trained on, if these were made from a registered id.
+            changes: constructor arguments and hyperparameters that replace the saved ones.
 
         Raises:
             FileNotFoundError: if there is no such file.
-            CheckpointError: if the file is damaged, of another algorithm, environment, schema or shape; it says which.
+            CheckpointError: if the file is damaged, or its algorithm, spaces, schema or shapes do not match.
         """
         with checkpoint.opened(model_files.find(path), "agent") as file:
             agent = model_files.load(
@@ -198,18 +195,17 @@ class Agent(BaseAgent):
 
     @classmethod
     def resume(cls, folder: str | Path, env: Any = None, **changes: Any) -> Self:
-        """Returns the agent of a run as its newest checkpoint holds it; ``learn()`` then goes on to the end that was set.
+        """Returns the agent of the newest checkpoint of a run; ``learn()`` then completes the run.
 
-        Everything stands as it stood: what was learnt, the replay buffer, running episodes, exploration, random numbers,
-        counters, statistics, callbacks' own memory (give ``learn`` the same callbacks). Where the environments
-        can be saved (see :mod:`rejeu.envs.snapshot`) or repeat their episodes (EnvPool), the run that follows is the same,
-        bit for bit, that would have followed without a break; elsewhere new episodes begin, and a warning says so.
-        ``resumed`` tells which.
+        Parameters, replay buffer, running episodes, exploration, random numbers, counters, statistics and the state of
+        callbacks are restored (give ``learn`` the same callbacks). If the environments can be saved (see
+        :mod:`rejeu.envs.snapshot`) or can repeat their episodes (EnvPool), the run continues bit for bit as it would have
+        without the interruption. Otherwise new episodes start, with a warning. See ``resumed``.
 
         Args:
             folder: as given to :class:`rejeu.callbacks.Checkpoint`.
-            env: as for the constructor; None makes environments of the id and number that the run had.
-            changes: hyper-parameters to set otherwise than they were.
+            env: as for the constructor; None makes as many environments of the same id.
+            changes: hyperparameters that replace the saved ones.
 
         Raises:
             FileNotFoundError: if there is no checkpoint.
@@ -218,11 +214,11 @@ class Agent(BaseAgent):
         return resume.resume(cls, Path(folder), env, changes)
 
     def run_folder(self, folder: str | Path) -> RunFolder:
-        """Returns the folder of checkpoints of its run, as :class:`rejeu.callbacks.Checkpoint` writes them."""
+        """Returns a folder for the checkpoints of its run, which :class:`rejeu.callbacks.Checkpoint` writes."""
         return run_folder(self, Path(folder))
 
     def summary(self) -> str:
-        """Returns a text drawing of the networks with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""
+        """Returns a drawing of the networks in text, with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""
         return summary.describe(self.learner.shapes, self.obs_leaves)
 
 

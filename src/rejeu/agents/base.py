@@ -1,7 +1,6 @@
-"""What all agents share: they own an environment and a learner, under Stable-Baselines3's names.
+"""The state of an agent: its configuration, learner, environments and run, and the methods that subclasses override.
 
-An agent holds what changes and calls what computes; it contains no mathematics. Its hyper-parameters are those of its
-algorithm's configuration.
+The functions of this package work on a :class:`BaseAgent`. :class:`rejeu.agents.agent.Agent` adds what users call.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from rejeu.reporting.history import History
 from rejeu.reporting.logging import Logger
 
 BEST_WINDOW = 20
-"""Training episodes over whose mean return the best weights are judged by default."""
+"""Default number of training episodes over whose mean return the best weights are chosen."""
 POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
 
 
@@ -46,42 +45,42 @@ class Best(NamedTuple):
     """The best weights of a run so far."""
 
     score: float | tuple[float, ...]
-    """Mean training return, or what evaluations are judged by: success rate and mean return."""
+    """Mean training return, or the success rate and mean return of an evaluation."""
     by: str
     """``"training"`` or ``"evaluation"``."""
     step: int
-    """Environment steps taken when they were kept."""
+    """Total environment steps at that time."""
     state: PackedState
-    """The algorithm's whole state at that moment, packed."""
+    """The complete state of the algorithm at that time, packed."""
 
 
 class Resumed(NamedTuple):
     """Where a run was resumed."""
 
     step: int
-    """Environment steps that had been taken."""
+    """Total environment steps at that time."""
     exact: bool
-    """Whether the run continues as it would have without the break, bit for bit."""
+    """Whether the run continues bit for bit as it would have without the interruption."""
     reason: str
-    """What differs otherwise; empty where it is exact."""
+    """What differs; empty if it is exact."""
     skipped: tuple[str, ...] = ()
-    """What was wrong with each newer checkpoint, which could not be read; newest first."""
+    """Errors of the newer checkpoints that could not be read, newest first."""
 
     def __str__(self) -> str:
         return f"resumed at step {self.step:,}, {'exactly where it stood' if self.exact else self.reason}"
 
 
 class BaseAgent(ABC):
-    """What all agents share. Abstract: use SAC, PPO and their kin."""
+    """What all agents have. Abstract: subclass :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`."""
 
     takes_masks: ClassVar[bool] = False
-    """Whether it asks the environment which actions are allowed."""
+    """Whether its policy takes masks of the allowed actions."""
     algorithm: ClassVar[Any]
     """What has ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
     is_learning: bool = False
-    """Whether ``learn`` is under way."""
+    """Whether ``learn`` is running."""
     report_folder: Path | None = None
-    """Where a batch that broke something is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
+    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
 
@@ -131,7 +130,7 @@ class BaseAgent(ABC):
         success_threshold: float | None,
         best_window: int,
     ) -> None:
-        """Sets everything that does not depend on the environment."""
+        """Sets the attributes that do not depend on the environment."""
         self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
         self.tensorboard_log = tensorboard_log
         self.stats_window_size, self.success_threshold = stats_window_size, success_threshold
@@ -141,45 +140,47 @@ class BaseAgent(ABC):
         """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
         self.ep_success_buffer: deque[float] = deque(maxlen=stats_window_size)
         self.interrupted = False
-        """Whether the last ``learn`` was ended by Ctrl-C or SIGTERM."""
+        """Whether Ctrl-C or SIGTERM ended the last ``learn``."""
         self.interrupted_by: int | None = None
         """The number of that signal."""
         self.logger = Logger()
-        """Takes further numbers for the rows of statistics."""
+        """Accepts further numbers for the rows of statistics."""
         self.failed_writes = FailedWrites()
-        """What ``learn`` could not write, such as checkpoints and log rows on a full disk; training continues without."""
+        """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
         self.best: Best | None = None
-        """The best weights so far, by smoothed training return or by evaluation."""
+        """The best weights so far, by mean training return or by evaluation."""
         self.steps_per_second = math.nan
-        """Environment steps per second of the present or last ``learn``."""
+        """Environment steps per second in the current or last ``learn``."""
         self.resumed: Resumed | None = None
-        """Where :meth:`resume` took up the run; None for an agent that began here or was loaded."""
+        """Where :meth:`resume` continued the run; None for a new or loaded agent."""
         self.run_id = secrets.token_hex(8)
+        """Identifies the run in its checkpoints."""
         self.training_call: TrainingCall | None = None
-        """The present or last call of ``learn``: its limits and how far it has come."""
+        """The current or last call of ``learn``: its limits and progress."""
         self.callbacks: list[Stateful] = []
-        """The callbacks of the present or last ``learn`` whose state a checkpoint contains."""
+        """The callbacks of the current or last ``learn`` whose state a checkpoint contains."""
         self.saved_callbacks: list[tuple[str, Any]] | None = None
         """Class names and states of callbacks in a resumed checkpoint, until ``learn`` restores them."""
         self.run_folders: dict[Path, RunFolder] = {}
         """Folders that contain its checkpoints, by path."""
         self.reset_step = 0
-        """Environment steps taken in all when the last ``learn`` with ``reset_num_timesteps=True`` began."""
+        """Total environment steps when the last ``learn`` with ``reset_num_timesteps=True`` started."""
         self.reset_episode = 0
-        """Episodes finished in all at that time."""
+        """Total finished episodes at that time."""
         self.reset_seconds = 0.0
-        """Training time in all at that time."""
+        """Total training time at that time, in seconds."""
         self.n_predictions = 0
+        """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
         self.carry_shapes: Any = None
-        """The form of what the policy remembers of one episode, once somebody has given it."""
+        """Shapes of a recurrent policy's state for one episode; computed when they are first needed."""
         self.trained_on: tuple[str, Mapping[str, Any]] | None = None
-        """Id and keyword arguments of the environments that a loaded agent was trained on, where its file says."""
+        """Id and keyword arguments of the environments a loaded agent was trained on, if its file contains them."""
         self.made_from_id = False
-        """Whether the environment was given by its id."""
+        """Whether the environments were made from an id."""
         xla.enable_cache()
 
     def build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
-        """Compiles the algorithm for these spaces."""
+        """Makes the algorithm for these spaces, and its learner."""
         self.observation_space, self.action_space = observation_space, action_space
         self.obs_leaves = spaces.leaves(observation_space)
         self.config = configs.with_widths(self.config, self.obs_leaves)
@@ -193,57 +194,68 @@ class BaseAgent(ABC):
         self.learner = Learner(algorithm, noise, self.config.nonfinite == "skip")
 
     def n_threads(self, n_envs: int) -> int:
-        """Returns how many threads suit updates on ``n_envs`` environments, by the largest layer; for images all."""
+        """Returns how many threads JAX should use: all for images and large layers, else one."""
         if any(leaf.kind == "image" for leaf in self.obs_leaves):
             return xla.cores()
         weights = [leaf.size for leaf in jax.tree.leaves(self.learner.shapes) if len(leaf.shape) > 1]
         return xla.threads_for(self.gradient_batch_size(n_envs) * max(weights, default=0))
 
     def start_run(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
-        """Begins a run on ``env`` with a fresh state, or the given one, and an empty buffer; None only predicts."""
+        """Starts a run on ``env`` with an empty buffer; without ``env`` the agent only predicts.
+
+        Args:
+            env: the environments.
+            state: the state of the algorithm, packed; None initializes it from the seed.
+        """
         buffer, learn_from = (None, 0) if env is None else (self.make_buffer(env), self.first_learning_step(0))
         self.run: Run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
 
     @abstractmethod
     def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
-        """Returns environments as this agent needs them, from what :func:`make_vector` takes."""
+        """Returns vector environments for this agent; the arguments are those of :func:`rejeu.make_vector`."""
 
     @abstractmethod
     def make_noise(self) -> Noise | None:
-        """Returns the noise that exploration adds to actions."""
+        """Returns the exploration noise, None for none."""
 
     @abstractmethod
     def gradient_batch_size(self, n_envs: int) -> int:
-        """Returns how many steps of ``n_envs`` environments a gradient is taken on."""
+        """Returns the number of transitions in the batch of one gradient step."""
 
     @abstractmethod
     def make_buffer(self, env: VectorEnv) -> Any:
-        """Returns an empty buffer for the experience of ``env``."""
+        """Returns an empty buffer for transitions of ``env``."""
 
     @abstractmethod
     def keep_buffer(self, env: VectorEnv) -> None:
-        """Prepares the buffer for a new environment of the same number and spaces."""
+        """Called when ``env`` replaces the environments, with as many of the same spaces; the buffer is kept."""
 
     @abstractmethod
     def drop_rollout(self) -> None:
-        """Forgets experience that only the policy may learn from that collected it."""
+        """Discards transitions that only the policy that collected them can learn from."""
 
     @abstractmethod
     def first_learning_step(self, step: int) -> int:
-        """Returns the step from which on a run that begins at ``step`` takes gradients."""
+        """Returns the environment step of the first gradient step, for a run that starts at ``step``."""
 
     @abstractmethod
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        """Returns the loop."""
+        """Trains for ``n_steps`` environment steps (None: without end); yields after each step of all environments.
+
+        Args:
+            n_steps: over all environments.
+            progress: returns the progress of schedules, in [0, 1], after that many steps.
+        """
 
     @abstractmethod
     def start_episodes(self) -> None:
-        """Begins an episode in every environment."""
+        """Starts a new episode in every environment."""
 
     def abandon_episodes(self) -> None:
-        """Gives up the running episodes, of whose environments somebody else has made use.
+        """Abandons the running episodes, because their environments were used for something else.
 
-        New ones begin with the next ``learn``; within one at once, so that a checkpoint of this step can hold them.
+        During ``learn`` new episodes start at once, so that a checkpoint of this step contains them; otherwise they start
+        with the next ``learn``.
         """
         self.run.obs = self.run.action = None
         if self.is_learning:
@@ -261,40 +273,40 @@ class BaseAgent(ABC):
 
     @property
     def n_envs(self) -> int:
-        """How many environments it steps at once."""
+        """Number of environments."""
         return self.run.env.n_envs if self.run.env is not None else 1
 
     @property
     def state(self) -> Any:
-        """Everything learnt, as the algorithm's own class; a copy. Waits for the updates under way."""
+        """A copy of the algorithm's state. Waits for pending updates."""
         finite.settle(self)
         return self.learner.state(self.run.state)
 
     @property
     def num_timesteps(self) -> int:
-        """Environment steps taken since the last ``learn`` with ``reset_num_timesteps=True`` began."""
+        """Environment steps since the last ``learn`` with ``reset_num_timesteps=True`` started."""
         return self.run.step - self.reset_step
 
     @property
     def n_updates(self) -> int:
-        """Gradient steps taken in all."""
+        """Total gradient steps."""
         return self.run.n_updates
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Wall time spent training, in all and by what it went into: ``env``, ``replay``, ``update``, ``total``."""
+        """Wall time spent training, in seconds: ``total``, and of it ``env``, ``replay`` and ``update``."""
         return dict(self.run.seconds)
 
     @abstractmethod
     def with_masks(self, obs: Any, masks: Any) -> Any:
-        """Returns a batch of observations as the algorithm takes it, with the given masks where it takes any."""
+        """Returns a batch of observations together with action masks, if the algorithm takes any."""
 
     def get_env(self) -> Any:
-        """Returns the environments it trains on, to be stepped by hand as in Stable-Baselines3; None if it has none.
+        """Returns the training environments with the interface of Stable-Baselines3's ``VecEnv``; None if there are none.
 
-        That is the vector environment it was given, if it was given one that resets itself; around a Gymnasium environment
-        it is a :class:`DummyVecEnv`. The episodes that ran there are given up: the next ``learn`` begins new ones. While
-        it learns they are to be looked at only.
+        That is the vector environment that was given, if it resets itself; a Gymnasium environment is returned in a
+        ``DummyVecEnv``. Its running episodes are abandoned: the next ``learn`` starts new ones. Do not step it during
+        ``learn``.
         """
         env = self.run.env
         if env is None:
@@ -306,23 +318,23 @@ class BaseAgent(ABC):
         return env.venv
 
     def set_logger(self, logger: Logger) -> None:
-        """Lets rows of statistics go to the outputs of a logger, in place of console and TensorBoard."""
+        """Replaces console and TensorBoard by the outputs of a logger."""
         self.logger = logger
 
     def get_vec_normalize_env(self) -> Any:
-        """Returns the ``VecNormalize`` around the environments it trains on, or None."""
+        """Returns the ``VecNormalize`` around the training environments, or None."""
         env = self.run.env
         return None if env is None else env.vec_normalize
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
-        """Gives the agent another environment of the same spaces; its episodes start anew.
+        """Replaces the environment by another with the same spaces; new episodes start there.
 
-        With another number of environments a replay buffer starts empty, and ``learning_starts`` steps are taken before
-        the next gradient step, as after ``load``; otherwise it is kept.
+        If the number of environments changes, a replay buffer starts empty, and ``learning_starts`` steps are taken before
+        the next gradient step, as after ``load``. Otherwise the buffer is kept.
 
         Raises:
             ValueError: if the spaces differ.
-            RuntimeError: while it learns.
+            RuntimeError: during ``learn``.
         """
         if self.is_learning:
             raise RuntimeError(
@@ -345,26 +357,27 @@ class BaseAgent(ABC):
         run.ended = np.ones(vector.n_envs, bool)
 
     def check_spaces(self, vector: VectorEnv, what: str) -> None:
+        """Raises ``ValueError`` if environments, called ``what`` in the message, have other spaces than the agent."""
         for kind in ("observation", "action"):
             own, other = getattr(self, f"{kind}_space"), getattr(vector, f"{kind}_space")
             if not spaces.same(own, other, bounds=kind == "action"):
                 raise ValueError(f"{what} has the {kind} space {other}, and this agent was made for {own}")
 
     def get_parameters(self) -> dict[str, np.ndarray]:
-        """Returns everything learnt as arrays by name, copied: networks, targets, optimizers, temperature, counters."""
+        """Returns a copy of the algorithm's state as arrays by name: networks, targets, optimizers, counters."""
         return {key: value.copy() for key, value in checkpoint.tree_to_arrays(self.state).items()}
 
     def set_parameters(
         self, load_path_or_dict: Mapping[str, np.ndarray] | str | Path, exact_match: bool = True
     ) -> None:
-        """Puts parameters in place, from :meth:`get_parameters` or from a model file.
+        """Sets parameters from :meth:`get_parameters` or from a model file.
 
         Args:
             load_path_or_dict: arrays by name, or a path.
-            exact_match: require all of them; False takes those that are given and keeps the rest.
+            exact_match: require all parameters; False sets those that are given and keeps the others.
 
         Raises:
-            CheckpointError: if a name, shape or dtype does not match; nothing is then changed.
+            CheckpointError: if a name, shape or dtype does not match; the agent is then unchanged.
         """
         source = load_path_or_dict
         if isinstance(source, str | Path):
@@ -394,10 +407,10 @@ class BaseAgent(ABC):
 
 
 def whole_seed(seed: Any) -> int:
-    """Returns a seed as an int in [0, 2^32).
+    """Returns a seed as an ``int``.
 
     Raises:
-        ValueError: otherwise.
+        ValueError: if it is not an integer in [0, 2^32).
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
         raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
@@ -405,7 +418,7 @@ def whole_seed(seed: Any) -> int:
 
 
 def check_policy(policy: str, space: gym.Space) -> None:
-    """Raises ``ValueError`` if there is no such policy, or if it is not for observations of ``space``."""
+    """Raises ``ValueError`` if there is no such policy, or if it does not fit the observations of ``space``."""
     if policy not in POLICIES:
         raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
     is_dict = isinstance(space, gym.spaces.Dict)

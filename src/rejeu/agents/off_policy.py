@@ -1,4 +1,4 @@
-"""The agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC and CrossQ."""
+"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC and CrossQ."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ from rejeu.loops.run import Progress
 
 
 class OffPolicyAgent(Agent):
-    """What the agents share that learn from a replay buffer. Abstract."""
+    """The base class of agents that learn from a replay buffer. Abstract: subclasses set ``algorithm``.
+
+    They may override :meth:`make_buffer`, :meth:`make_noise`, :meth:`make_envs` and :meth:`loop`.
+    """
 
     config: OffPolicyConfig
 
@@ -47,15 +50,14 @@ class OffPolicyAgent(Agent):
         return checkpoint.write(path, "replay", self.run.replay.arrays(), header)
 
     def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
-        """Replaces the replay buffer by a saved one; learning can then go on at once.
+        """Replaces the replay buffer by a saved one; gradient steps can then continue at once.
 
         Args:
             path: as given to :meth:`save_replay_buffer`.
-            truncate_last_traj: accepted; the episodes that ran when it was saved are closed without a terminal state
-                when the next begins, so hindsight uses them as far as they went.
+            truncate_last_traj: accepted and ignored; episodes that were running when it was saved are truncated.
 
         Raises:
-            CheckpointError: if the file is damaged, or of another environment or buffer size; nothing is then changed.
+            CheckpointError: if the file is damaged, or its spaces or size do not match; the buffer is then unchanged.
         """
         if self.run.replay is None:
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
@@ -72,30 +74,29 @@ class OffPolicyAgent(Agent):
         except ValueError as error:
             raise CheckpointError(f"{path}: {model_files.brief(error)}") from None
         self.run.learn_from = self.config.learning_starts
-        self.run.td_errors = []  # of steps that are gone
+        self.run.td_errors = []  # of transitions that are gone
         self.abandon_episodes()
 
     def q_values(
         self, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
     ) -> np.ndarray:
-        """Returns what the critics say of actions: the discounted return that they expect from then on, as ``float32``.
+        """Returns the critics' values of actions, that is, the expected discounted return, as ``float32``.
 
-        Observations are scaled as in training with ``normalize``, which may scale rewards too: the values are then sums of
-        scaled rewards. SAC's, TQC's and CrossQ's include the entropy that is to come. The networks are those that learn,
-        not their targets.
+        With ``normalize``, observations are scaled as in training; if rewards are scaled, so are the values. Those of SAC,
+        TQC and CrossQ include the entropy of future actions. The online networks are used, not the targets.
 
         Args:
             observation: one of the environment's space, or a batch of them with a leading axis.
-            action: in the environment's own range, one for each observation. None, for Discrete actions: all of them.
-            critics: where there are several, ``"min"`` of their values, as targets take it, their ``"mean"``, or ``"all"``.
-                Each of TQC's and QR-DQN's is the mean of its quantiles.
+            action: one for each observation, in the environment's own range. None: all Discrete actions.
+            critics: with several, the ``"min"`` of their values, as in TD targets, their ``"mean"``, or ``"all"``. The
+                value of a critic of TQC or QR-DQN is the mean of its quantiles.
 
         Returns:
-            ``(batch,)``, without ``action`` ``(batch, n_actions)``. There is no batch axis if the observation has none, and
-            with ``"all"`` the first axis is that of the critics.
+            ``(batch,)``, or ``(batch, n_actions)`` without ``action``. There is no batch axis if the observation has none.
+            With ``"all"`` the first axis is that of the critics.
 
         Raises:
-            ValueError: if observations or actions are not of their spaces, or actions are missing.
+            ValueError: if observations or actions are not in their spaces, or actions are missing.
 
         >>> import gymnasium as gym, rejeu
         >>> agent = rejeu.DDPG("MlpPolicy", gym.make("Pendulum-v1"), seed=0)
@@ -150,7 +151,7 @@ class OffPolicyAgent(Agent):
         return HerReplayBuffer(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
 
     def drop_rollout(self) -> None:
-        """Nothing: learners with a replay buffer use the experience of any policy."""
+        """Does nothing: off-policy algorithms learn from the transitions of any policy."""
 
     def keep_buffer(self, env: VectorEnv) -> None:
         if isinstance(self.run.replay, HerReplayBuffer):

@@ -1,4 +1,4 @@
-"""The agents that learn from the experience of their present policy: PPO, RecurrentPPO, MaskablePPO and A2C."""
+"""Agents that learn from rollouts of their current policy: PPO, RecurrentPPO, MaskablePPO and A2C."""
 
 from __future__ import annotations
 
@@ -25,27 +25,29 @@ from rejeu.loops.run import Progress
 
 
 class OnPolicyAgent(Agent):
-    """What the agents share that learn from rollouts of their present policy. Abstract."""
+    """The base class of agents that learn from rollouts of their current policy. Abstract: subclasses set ``algorithm``.
+
+    They may override :meth:`make_buffer`, :meth:`make_envs` and :meth:`loop`.
+    """
 
     config: OnPolicyConfig
 
     def value(self, observation: Any, state: Any = None, episode_start: Any = None) -> np.ndarray:
-        """Returns what the critic says of observations: the discounted return that it expects from then on, as ``float32``.
+        """Returns the critic's values of observations, that is, the expected discounted return, as ``float32``.
 
-        Observations are scaled as in training with ``normalize``, which may scale rewards too: the values are then sums of
-        scaled rewards.
+        With ``normalize``, observations are scaled as in training; if rewards are scaled, so are the values.
 
         Args:
             observation: one of the environment's space, or a batch of them with a leading axis.
-            state: what ``predict`` returned before these observations, for a policy with a memory; None where episodes
-                begin.
-            episode_start: where an episode begins with this observation, ``bool (batch,)``; None for nowhere.
+            state: the state of a recurrent policy, which ``predict`` returned before these observations; None at the start
+                of episodes.
+            episode_start: whether an episode starts with this observation, ``bool (batch,)``; None for nowhere.
 
         Returns:
             ``(batch,)``, or one number if the observation has no batch axis.
 
         Raises:
-            ValueError: if the observation is not of the space, or ``state`` not of the policy's memory.
+            ValueError: if the observation or ``state`` has the wrong structure or shape.
 
         >>> import gymnasium as gym, rejeu
         >>> agent = rejeu.PPO("MlpPolicy", gym.make("CartPole-v1"), seed=0)
@@ -95,11 +97,11 @@ class OnPolicyAgent(Agent):
         return RolloutBuffer(n_steps, env.n_envs, obs_leaves, structure, action.shape[1:], action.dtype, config.gamma)
 
     def keep_buffer(self, env: VectorEnv) -> None:
-        """Forgets the rollout under way, which is of another environment."""
+        """Discards the current rollout, which comes from another environment."""
         self.drop_rollout()
 
     def drop_rollout(self) -> None:
-        """Forgets the rollout under way; another begins with new episodes."""
+        """Discards the current rollout; the next one starts with new episodes."""
         run = self.run
         if run.replay is not None and run.replay.length:
             run.replay.length = 0
@@ -119,13 +121,13 @@ class A2C(OnPolicyAgent):
 
 
 class RecurrentPPO(OnPolicyAgent):
-    """PPO with an LSTM or GRU between observation and hidden layers, for environments that hide part of their state."""
+    """PPO with an LSTM or GRU before the hidden layers, for partially observable environments."""
 
     algorithm: ClassVar[ModuleType] = recurrent_ppo
 
 
 class MaskablePPO(OnPolicyAgent):
-    """PPO in environments that allow only some actions at a time, as they say themselves (Huang and Ontanon 2022)."""
+    """PPO with masks of the allowed actions, which the environment provides (Huang and Ontanon 2022)."""
 
     algorithm: ClassVar[ModuleType] = maskable_ppo
     takes_masks: ClassVar[bool] = True

@@ -27,19 +27,19 @@ CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mean": lambda values: values.mean(axis=0),
     "all": lambda values: values,
 }
-"""What :func:`q_values` returns of the critics' values, whose first axis is that of the critics."""
+"""How :func:`q_values` reduces the values of several critics, ``(n_critics, ...)``."""
 
 
 def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
-    """Returns observations as a batch of arrays of the right types, and whether a single one was given.
+    """Returns observations as a batch of arrays of the right types, and whether it was a single observation.
 
     Args:
-        observation: one of ``space``, or several with a leading axis; arrays, or lists of numbers.
-        space: of observations.
+        observation: one of ``space``, or a batch with a leading axis; arrays, or lists of numbers.
+        space: the observation space.
         leaves: of ``space``.
 
     Raises:
-        ValueError: if structure or shapes are others, or if the parts are batches of different sizes.
+        ValueError: if structure or shapes do not match, or the parts are batches of different sizes.
     """
     expected = spaces.structure(space)
     try:
@@ -63,7 +63,7 @@ def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tupl
 
 
 def described(observation: Any) -> str:
-    """Returns the structure of what was given as an observation, in words.
+    """Returns the structure of an invalid observation, in words.
 
     >>> described({"goal": [0.0], "place": None}), described((1, 2))
     ('dict(goal: list, place: NoneType)', 'tuple(int, int)')
@@ -76,17 +76,17 @@ def described(observation: Any) -> str:
 
 
 def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
-    """Returns actions in the algorithm's range, and what the policy remembers (None without a memory).
+    """Returns actions in the algorithm's range, and the next state of a recurrent policy, else None.
 
     Args:
-        agent: whose policy; its updates under way are waited for.
-        obs: a batch of observations, cast.
-        deterministic: the policy's mode; False draws from the policy, without the noise that training adds.
-        memory: what the last call returned; None stands for episodes that have not begun.
-        ended: where an episode begins with these observations, ``bool (batch,)``.
+        agent: the agent; its pending updates are waited for.
+        obs: a batch of observations from :func:`as_batch`.
+        deterministic: return the mode of the policy; False samples from it, without the noise of training.
+        memory: the state of a recurrent policy from the last call; None at the start of episodes.
+        ended: whether an episode starts with these observations, ``bool (batch,)``.
 
     Raises:
-        ValueError: if ``memory`` is not of this policy, or of another number of episodes.
+        ValueError: if the shapes of ``memory`` do not match.
     """
     finite.settle(agent)
     run, learner, n = agent.run, agent.learner, len(ended)
@@ -109,7 +109,7 @@ def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.
 
 
 def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> np.ndarray:
-    """Returns what the critics say of actions; see :meth:`OffPolicyAgent.q_values`."""
+    """Returns the critics' values of actions; see :meth:`OffPolicyAgent.q_values`."""
     if critics not in CRITICS:
         raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
@@ -117,7 +117,7 @@ def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> n
     space = agent.action_space
     is_discrete = isinstance(space, gym.spaces.Discrete)
     if action is None and not is_discrete:
-        raise ValueError(f"q_values needs actions of {space}: only of Discrete actions all can be rated at once")
+        raise ValueError(f"q_values needs actions of {space}; only for Discrete actions it returns the values of all")
     given = None if action is None else _actions(space, action, single, n)
     finite.settle(agent)
     values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
@@ -129,10 +129,10 @@ def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> n
 
 
 def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
-    """Returns actions of a Box or Discrete space as algorithms take them, with a leading axis.
+    """Returns a batch of Box or Discrete actions in the algorithm's range.
 
     Raises:
-        ValueError: if there are not as many as observations, or if they are not of the space's shape or choices.
+        ValueError: if their number is not that of the observations, or they are not in the space.
     """
     array = np.asarray(action)
     expected = space.shape if single else (n, *(space.shape or ()))
@@ -147,7 +147,7 @@ def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
 
 
 def value(agent: BaseAgent, observation: Any, memory: Any, episode_start: Any) -> np.ndarray:
-    """Returns what the critic says of observations; see :meth:`OnPolicyAgent.value`."""
+    """Returns the critic's values of observations; see :meth:`OnPolicyAgent.value`."""
     if agent.takes_masks:
         observation, _ = split(observation, None)
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
@@ -166,8 +166,8 @@ def value(agent: BaseAgent, observation: Any, memory: Any, episode_start: Any) -
 
 
 def check_memory(agent: BaseAgent, memory: Any, n: int) -> None:
-    """Raises ``ValueError`` unless ``memory`` is what the agent's policy remembers of ``n`` episodes."""
-    if agent.carry_shapes is None:  # found out once: it takes longer than a prediction
+    """Raises ``ValueError`` unless ``memory`` is the state of the agent's recurrent policy for ``n`` episodes."""
+    if agent.carry_shapes is None:  # once: it takes longer than a prediction
         agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_carry(1))
     given = jax.tree.map(np.shape, memory)
     expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent.carry_shapes)
@@ -185,9 +185,9 @@ def refuse_masks(masks: Any, name: str) -> None:
 
 
 USUAL_EPISODES = 100
-"""How many are played if neither a number nor a time is given."""
+"""Number of episodes if neither a number nor a time is given."""
 MOST_ENVS = 16
-"""Most environments that are made to play in."""
+"""Upper limit on the environments that are made for an evaluation."""
 
 
 def play(
@@ -199,10 +199,10 @@ def play(
     success_threshold: float | None,
     minutes: float | None,
 ) -> Evaluation:
-    """Returns what whole episodes came to; the arguments are those of :meth:`Agent.evaluate`.
+    """Plays whole episodes and returns their results; the arguments are those of :meth:`Agent.evaluate`.
 
     Raises:
-        ValueError: without environments, or in those of other spaces or without the agent's ``VecNormalize``.
+        ValueError: if there are no environments, or their spaces or a missing ``VecNormalize`` do not match.
     """
     threshold = agent.success_threshold if success_threshold is None else success_threshold
     run = agent.run
@@ -225,7 +225,7 @@ def play(
     try:
         agent.check_spaces(vector, "the environment to evaluate in")
         check_scaled(agent, vector)
-        again = None if made_here else seed  # others have just been made with it
+        again = None if made_here else seed  # new environments have this seed already
         with lent(agent, vector, seeded=again is not None):
             return evaluate(policy(agent, deterministic), vector, episodes, threshold, again, seconds)
     finally:
@@ -234,10 +234,10 @@ def play(
 
 
 def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
-    """Returns what a loaded agent was trained on, as ``make_vector`` takes it.
+    """Returns the environment that a loaded agent was trained on, as an id or a function that makes it.
 
     Raises:
-        ValueError: if its file does not say, or if that is not registered here.
+        ValueError: if its file does not name it, or it is not registered.
     """
     if agent.trained_on is None:
         raise ValueError("this agent has no environment; give one: evaluate(env=...)")
@@ -252,15 +252,15 @@ def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
 
 @contextmanager
 def lent(agent: BaseAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[None]:
-    """While entered, ``vector`` may be played in: if the agent trains on the same environments, its episodes are given up.
+    """Context in which episodes may be played in ``vector``, which may share environments with the agent's own.
 
-    Training goes on in new ones, whether it is under way or still to come; ``seeded`` says that the environments were seeded
-    for the play, and gives them a seed of training again.
+    If it does, the running episodes of training are abandoned, and training continues in new ones. If the environments
+    were ``seeded`` for the evaluation, they get a new seed for training.
     """
     run = agent.run
     shared = run.env is not None and not run.env.identities().isdisjoint(vector.identities())
     if shared:
-        run.obs = run.action = None  # also if playing fails
+        run.obs = run.action = None  # even if the evaluation fails
     yield
     if shared:
         if seeded:
@@ -269,7 +269,7 @@ def lent(agent: BaseAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[
 
 
 def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
-    """Returns the policy as :func:`rejeu.reporting.evaluation.evaluate` takes it; it remembers from call to call."""
+    """Returns the policy as a function for :func:`rejeu.reporting.evaluation.evaluate`, which keeps a recurrent state."""
     memory: Any = None
 
     def choose(obs: Any, ended: np.ndarray) -> np.ndarray:
@@ -281,7 +281,7 @@ def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray],
 
 
 def check_scaled(agent: BaseAgent, vector: VectorEnv) -> None:
-    """Raises ``ValueError`` if the agent learns from a ``VecNormalize`` and ``vector`` is none."""
+    """Raises ``ValueError`` if the agent trains in a ``VecNormalize`` and ``vector`` has none."""
     if agent.get_vec_normalize_env() is not None and vector.vec_normalize is None:
         raise ValueError(
             "this agent learns in a VecNormalize, so it must be evaluated in one that has the same statistics; wrap the "

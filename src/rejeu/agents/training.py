@@ -139,7 +139,7 @@ def train(
 
 
 def in_order(callbacks: Iterable[Callback]) -> list[Callback]:
-    """Returns callbacks in the order in which they are called: those that run last behind the others."""
+    """Returns callbacks in the order in which they are called: those that run last after the others."""
     return sorted(callbacks, key=lambda callback: isinstance(callback, TrainingCallback) and callback.runs_last)
 
 
@@ -238,12 +238,12 @@ def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: S
 
 
 def warn_without_noise(agent: BaseAgent) -> None:
-    """Warns, at the beginning of a run, if its policy is deterministic and nothing makes it try other actions."""
+    """Warns at the start of a run if the policy is deterministic and there is no exploration noise."""
     deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
     if deterministic and agent.make_noise() is None and agent.run.step == 0:
         warnings.warn(
             f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
-            f"learning_starts={agent.config.learning_starts} it tries nothing new; set action_noise=0.1 (--set "
+            f"learning_starts={agent.config.learning_starts} it explores nothing new; set action_noise=0.1 (--set "
             "action_noise=0.1), 'ou(0.2)' or ParameterNoise()",
             UserWarning,
             stacklevel=4,
@@ -251,26 +251,26 @@ def warn_without_noise(agent: BaseAgent) -> None:
 
 
 def open_outputs(
-    agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, held: ExitStack
+    agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
 ) -> Sequence[RetryingSink]:
-    """Returns where rows of statistics go; ``held`` closes those that are opened here."""
+    """Returns the outputs for rows of statistics; ``stack`` closes those that are opened here."""
     loggers = agent.logger.outputs
     outputs: list[Sink] = [*sinks, *loggers]
     if agent.verbose and not loggers:
         console = Console(TABLE_SECONDS)
-        held.callback(console.close)
+        stack.callback(console.close)
         outputs.append(console)
     if agent.tensorboard_log is not None and not loggers:
         tensorboard = TensorBoard(next_folder(agent.tensorboard_log, tb_log_name or agent.name))
-        held.callback(tensorboard.close)
+        stack.callback(tensorboard.close)
         outputs.append(tensorboard)
     return [RetryingSink(output, agent.failed_writes) for output in outputs]
 
 
 def note_training_return(agent: BaseAgent, ended: int) -> None:
-    """Keeps the present weights if ``ended`` episodes that have just ended bring the best mean return so far.
+    """Keeps the current weights if the mean return of the last ``best_window`` episodes is the best so far.
 
-    Where several ended at once, each of them closes a window of its own.
+    Each of the ``ended`` episodes that have just finished is the last of a window.
     """
     window = agent.best_window
     returns = [episode.episode_return for episode in agent.history.last(window + ended - 1)]
@@ -280,7 +280,7 @@ def note_training_return(agent: BaseAgent, ended: int) -> None:
 
 
 def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str) -> bool:
-    """Keeps the present weights if ``score`` is the best of its kind so far; returns whether it is."""
+    """Keeps the current weights if ``score`` is the best of its kind so far; returns whether it is."""
     if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
         return False
     finite.settle(agent)
@@ -289,22 +289,22 @@ def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str) -
 
 
 def restore_best(agent: BaseAgent) -> None:
-    """Puts the best weights back.
+    """Restores the best weights.
 
     Raises:
-        ValueError: if none were kept yet.
+        ValueError: if there are none yet.
     """
     if agent.best is None:
         raise ValueError(
-            f"no best weights are known yet: they are kept once {counted(agent.best_window, 'episode')} of training "
-            "ended, and at every evaluation by rejeu.callbacks.Evaluate"
+            f"no best weights are known yet: they are kept after {counted(agent.best_window, 'episode')} of training, "
+            "and at every evaluation by rejeu.callbacks.Evaluate"
         )
     agent.run.state = agent.learner.copy(agent.best.state)
     agent.drop_rollout()
 
 
 def record_episode(agent: BaseAgent, episode: Episode) -> None:
-    """Adds an episode to the history and to the windows."""
+    """Adds an episode to the history and to the buffers of recent episodes."""
     agent.history.append(episode)
     agent.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
     if not math.isnan(episode.success):
@@ -312,7 +312,7 @@ def record_episode(agent: BaseAgent, episode: Episode) -> None:
 
 
 def fill_windows(agent: BaseAgent) -> None:
-    """Fills the windows from the history."""
+    """Fills the buffers of recent episodes from the history."""
     episodes = agent.history.last(agent.stats_window_size)
     agent.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
     successes = agent.history["success"]

@@ -1,8 +1,8 @@
-"""What else happens while an agent learns: evaluation, checkpoints, a progress bar, stopping early.
+"""Callbacks: evaluation, checkpoints, videos, a progress bar and early stopping.
 
-A callback is anything that ``agent.learn`` can call after every step of the environments as
-``callback(agent, progress)``; ``False``, and nothing else, stops training. All frequencies are in environment steps,
-whatever the number of environments.
+A callback is any callable. ``agent.learn`` calls it after every step of the environments as ``callback(agent, progress)``;
+only ``False`` stops training. A :class:`TrainingCallback` is also called when training starts and ends. All frequencies
+are in environment steps, over all environments.
 """
 
 from rejeu.callbacks.base import Callback, TrainingCallback

@@ -1,4 +1,4 @@
-"""When what happens every so many steps falls due."""
+"""Whether something that happens at an interval of steps is due."""
 
 from __future__ import annotations
 
@@ -16,6 +16,6 @@ def crossed(before: int, now: int, every: int) -> bool:
 
 
 def step_before(agent: TrainedAgent, progress: Progress, n_steps: int | None = None) -> int:
-    """Returns the step count before this first turn of a run that takes ``n_steps`` (None: more than one turn's)."""
+    """Returns the total environment steps before the first turn of a ``learn`` of ``n_steps`` (None: of more than a turn)."""
     taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
     return max(progress.step - taken, 0)

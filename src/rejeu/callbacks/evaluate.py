@@ -1,4 +1,4 @@
-"""Evaluation in the course of training, and which of two evaluations is the better."""
+"""Evaluation in the course of training, and the comparison of evaluations."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from rejeu.validation import whole
 EVALUATED = ("returns", "lengths", "successes")
 """The arrays of an :class:`Evaluation`."""
 EVALUATION = 0x4556
-"""Sets the random numbers of evaluations apart from all others."""
+"""Added to the seeds of evaluations, so that they differ from all others."""
 
 
 class Evaluated(NamedTuple):
     """One evaluation during a run."""
 
     step: int
-    """Environment steps taken in all when it was made."""
+    """Total environment steps at that time."""
     evaluation: Evaluation
-    """What it came to."""
+    """Its result."""
 
 
 class Evaluate:
-    """Evaluates the deterministic policy every so many steps, on environments of its own, and keeps the best model.
+    """Evaluates the deterministic policy at an interval of steps, in separate environments, and keeps the best model.
 
-    ``agent.restore_best()`` puts the best weights back.
+    ``agent.restore_best()`` restores the best weights.
 
     >>> import rejeu
     >>> evaluate = Evaluate("Pendulum-v1", every=200, episodes=2, seed=0)
@@ -53,15 +53,15 @@ class Evaluate:
         seed: int | None = None,
         report: Callable[[Evaluated, bool], object] | None = None,
     ) -> None:
-        """Makes the environments at once, so that a wrong name is found before training.
+        """Makes the environments immediately, so that a wrong id raises before training.
 
         Args:
-            env: as for the agent; an id or a function is made into at most 16 environments. Never the agent's own.
+            env: as for the agent; of an id or a function up to 16 environments are made. Never the training environments.
             every: environment steps between two evaluations.
             episodes: of each evaluation.
-            best_path: where the best model so far is saved, replacing the one before it; None for nowhere. Where it cannot be
-                written, training continues with a warning, and the write is tried again.
-            seed: with the number of steps taken, of the environments at each evaluation; None takes the agent's.
+            best_path: file for the best model so far; None saves none. If it cannot be written, training continues with a
+                warning, and the write is repeated later.
+            seed: of the evaluations, combined with the step of each; None uses the agent's.
             report: called with each result and whether it is the best so far.
         """
         self.every = whole("every", every, least=1)
@@ -78,14 +78,14 @@ class Evaluate:
         self._last_step: int | None = None
 
     def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
-        """Evaluates if an evaluation has fallen due in this step."""
+        """Evaluates if an evaluation is due."""
         before = step_before(agent, progress) if self._last_step is None else self._last_step
         self._last_step = progress.step
         if crossed(before, progress.step, self.every):
             self.run(agent, progress.step)
 
     def run(self, agent: TrainedAgent, step: int) -> Evaluated:
-        """Evaluates now, whatever ``every`` says, and returns the result, which is also kept.
+        """Evaluates now, regardless of ``every``; keeps and returns the result.
 
         Raises:
             ValueError: if the environments are those that the agent trains on.
@@ -107,7 +107,7 @@ class Evaluate:
         return result
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns every result so far, as plain data for a checkpoint."""
+        """Returns its results for a checkpoint."""
         parts = [r.evaluation for r in self.results]
         columns = {key: [getattr(part, key) for part in parts] for key in EVALUATED}
         return {
@@ -118,7 +118,7 @@ class Evaluate:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Takes back what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned."""
         ends = np.cumsum(state["counts"])[:-1]
         returns, lengths, successes = (np.split(state[key], ends) for key in EVALUATED)
         parts = zip(state["steps"].tolist(), returns, lengths, successes, strict=False)
@@ -126,20 +126,20 @@ class Evaluate:
         self.best = None if state["best"] is None else self.results[state["best"]]
 
     def close(self) -> None:
-        """Releases the environments, unless they were given ready-made."""
+        """Closes the environments, unless they were given as objects."""
         if self._made_here:
             self.env.close()
 
 
 def better(evaluation: Evaluation, other: Evaluation) -> bool:
-    """Returns whether an evaluation beats another: by success rate, then by mean return.
+    """Returns whether an evaluation is better than another: by success rate, then by mean return.
 
-    An unknown success rate counts as none, so where the environment does not say, the return decides.
+    Without a success rate the return decides.
     """
     return merit(evaluation) > merit(other)
 
 
 def merit(evaluation: Evaluation) -> tuple[float, float]:
-    """Returns what evaluations are compared by: success rate, -1 where it is unknown, and mean return."""
+    """Returns the success rate, -1 if it is unknown, and the mean return, by which evaluations are compared."""
     rate = evaluation.success_rate
     return (-1.0 if math.isnan(rate) else rate), evaluation.mean_return

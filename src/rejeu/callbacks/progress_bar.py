@@ -1,4 +1,4 @@
-"""How far training has come, as a bar or as lines, and what its time went into."""
+"""The progress of training, as a bar or as lines, and how its time is spent."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ REFRESH_SECONDS = 0.125
 NOTEBOOK_SECONDS = 0.5
 """The same in a notebook, where each is a message to the browser."""
 LINE_SECONDS = 10.0
-"""Least time between two lines of progress where the output is no terminal."""
+"""Least time between two lines of progress if the output is not a terminal."""
 RATE_SECONDS = 10.0
-"""Stretch over which the shown steps per second and shares of time are measured."""
+"""Interval over which steps per second and shares of time are measured."""
 
 
 BAR_WIDTH = 40
@@ -32,7 +32,7 @@ BAR_WIDTH = 40
 
 
 class _Mark(NamedTuple):
-    """Where a run stood at a moment."""
+    """The progress of a run at one time."""
 
     time: float
     step: int
@@ -41,12 +41,10 @@ class _Mark(NamedTuple):
 
 
 class ProgressBar(TrainingCallback):
-    """Shows how far training has come; on a terminal and in a notebook as a bar, elsewhere as a line every ten seconds.
+    """Shows the progress of training: a bar on a terminal or in a notebook, elsewhere a line every ten seconds.
 
-    Beneath the bar, or at the end of the line, stands what the time went into: the environment's steps and resets, the replay
-    buffer, the update (off-policy: the time that the loop waited for the device) and everything else.
-
-    Between two refreshes a call costs a look at the clock.
+    Below the bar, or at the end of the line, are the shares of time spent on the environment's steps and resets, the replay
+    buffer, the update (off-policy: the time the loop waited for the device) and everything else.
     """
 
     def __init__(
@@ -57,14 +55,14 @@ class ProgressBar(TrainingCallback):
         taken: int = 0,
         spent: float = 0.0,
     ) -> None:
-        """Starts counting time; the bar appears with the first step.
+        """Starts the clock; the bar appears with the first step.
 
         Args:
-            n_steps: environment steps that will be taken, None if only time ends the run.
-            seconds: wall time after which the run ends, None if only steps do.
+            n_steps: environment steps to take; None without such a limit.
+            seconds: wall time to take; None without such a limit.
             console: where to write; None: standard output.
-            taken: how many of the steps a resumed run had taken before.
-            spent: how much of the wall time it had taken, in seconds.
+            taken: steps of a resumed run that were taken before.
+            spent: wall time that it had taken before, in seconds.
         """
         from rich.console import Console
         from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
@@ -88,7 +86,7 @@ class ProgressBar(TrainingCallback):
         self._marks: deque[_Mark] = deque()
 
     def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
-        """Takes note of the step, and shows it if the last refresh is long enough ago."""
+        """Refreshes the bar if it is due."""
         now = time.perf_counter()
         if self._latest is None:
             self._start(agent, progress, now)
@@ -101,7 +99,7 @@ class ProgressBar(TrainingCallback):
         self.close()
 
     def close(self) -> None:
-        """Shows where the run ended and gives the terminal back."""
+        """Shows the last step and releases the terminal."""
         if self._latest is None:
             return
         agent, step = self._latest
@@ -181,7 +179,7 @@ def status(
 
 
 def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
-    """Returns what the time between two readings of ``agent.seconds`` went into, empty if none has passed.
+    """Returns how the time between two values of ``agent.seconds`` was spent, empty if there is none.
 
     >>> time_spent(
     ...     {"env": 1.0, "replay": 0.5, "update": 3.0, "total": 5.0},

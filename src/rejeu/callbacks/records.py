@@ -1,4 +1,4 @@
-"""A mark in the output wherever an episode returns more than all before it."""
+"""A line of output for every episode with a higher return than all before it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from rejeu.loops.run import Progress
 
 
 def print_records(agent: TrainedAgent, progress: Progress) -> None:
-    """Prints a line for every record: an episode that returned more than all before it in the agent's history.
+    """Prints a line for every record, an episode with a higher return than all before it in the agent's history.
 
-    Give it to ``learn`` as a callback. ``agent.history.records()`` returns the same episodes.
+    It is a callback for ``learn``. ``agent.history.records()`` returns the same episodes.
 
     >>> import rejeu
     >>> agent = rejeu.DQN("MlpPolicy", "MountainCar-v0", learning_starts=10_000, seed=0)

@@ -1,4 +1,4 @@
-"""Callbacks that stop training once the policy is good enough."""
+"""Callbacks that stop training when the policy is good enough."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def stop_on_return(threshold: float, episodes: int = 100) -> Callback:
 def stop_on_success(rate: float, episodes: int = 100) -> Callback:
     """Returns a callback that stops once at least ``rate`` (in [0, 1]) of the last ``episodes`` episodes succeeded.
 
-    In an environment that does not say whether an episode succeeded it never stops.
+    It never stops if the environment does not report success.
 
     Raises:
-        ValueError: if ``rate`` is not a share.
+        ValueError: if ``rate`` is not in [0, 1].
     """
     if not 0 <= rate <= 1:
         raise ValueError(f"rate={rate} must be a share in [0, 1]; for 90 % write 0.9")
