@@ -274,7 +274,7 @@ def test_eval_callback_keeps_to_the_masks(masked):
 def test_an_evaluation_whose_masks_cannot_be_reached_is_refused_before_training(masked):
     from rejeu.sb3.common.vec_env import VecMonitor
 
-    with pytest.raises(TypeError, match="the masks of SelfResetting cannot be reached"):
+    with pytest.raises(TypeError, match="the masks of VecEnvAdapter cannot be accessed"):
         masked.learn(12, callback=EvalCallback(VecMonitor(DummyVecEnv([One])), eval_freq=12))
 
 

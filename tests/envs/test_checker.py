@@ -6,8 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu.envs.advice import advice_on_observations
-from rejeu.envs.checker import check_env
+from rejeu.envs.checker import advice_on_observations, check_env
 from rejeu.errors import BadEnvironmentError
 from tests.environments import Reach, Sampled
 from tests.golden.vec_env_script import Walk

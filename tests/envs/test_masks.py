@@ -408,9 +408,9 @@ def test_an_environment_that_says_nothing_is_refused_with_the_fix():
         (
             lambda: make_vector("CartPole-v1", 2, "envpool"),
             TypeError,
-            "the masks of EnvPool cannot be reached; give the id",
+            "the masks of EnvPool cannot be accessed; give the id",
         ),
-        (lambda: gym.vector.SyncVectorEnv([Rules]), TypeError, "the masks of SyncVectorEnv cannot be reached"),
+        (lambda: gym.vector.SyncVectorEnv([Rules]), TypeError, "the masks of SyncVectorEnv cannot be accessed"),
         (lambda: 3, TypeError, "must be an id, an environment or a function that makes one, got int"),
     ],
 )
@@ -420,7 +420,7 @@ def test_environments_whose_masks_cannot_be_had_are_refused(env, error, message)
 
 
 def test_the_id_of_an_envpool_environment_is_made_where_its_masks_can_be_reached():
-    with pytest.raises(BadEnvironmentError, match="CartPole-v1 says nowhere which actions are allowed"):
+    with pytest.raises(BadEnvironmentError, match="CartPole-v1 does not return action masks"):
         small("CartPole-v1", n_steps=4).learn(4)
 
 

@@ -275,7 +275,7 @@ def test_masks_are_found_in_a_vector():
     agent = rejeu.MaskablePPO("MlpPolicy", make_vec_env(Masked, n_envs=2), n_steps=8, batch_size=16, **SMALL)
     taught(agent)
     assert agent.learn(16).num_timesteps == 16
-    with pytest.raises(TypeError, match="cannot be reached"):
+    with pytest.raises(TypeError, match="cannot be accessed"):
         rejeu.MaskablePPO("MlpPolicy", Doubled(make_vec_env(Masked)), **SMALL)
 
 

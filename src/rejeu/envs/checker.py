@@ -1,4 +1,4 @@
-"""Looking at an environment of one's own before training: what would fail, and what would make learning needlessly hard."""
+"""Checks of an environment before training: errors, and properties that make learning harder."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import copy
 import re
 import time
 import warnings
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -14,31 +15,32 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 
-from rejeu.envs import answers, conversions, faults
-from rejeu.envs.advice import advice_on_observations
+from rejeu.envs import batching, validation
 from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import leaves, plain
+from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain
 
 MOST_STEPS = 10_000
-"""Random steps after which an environment counts as one whose episodes never end."""
+"""Random steps after which episodes are assumed never to end."""
 ENOUGH_STEPS, ENOUGH_EPISODES = 100, 2
-"""Random steps and whole episodes that are looked at, if they do not take too long."""
+"""Random steps and complete episodes that are checked, if they do not take too long."""
 MOST_SECONDS = 5.0
-"""After which no further steps are taken."""
+"""Time limit of these steps, in seconds."""
+MOST_GOALS = 32
+"""Steps whose goals are checked."""
 SEED = 0
 
 
 class Finding(NamedTuple):
-    """One thing that an environment does not do as it should."""
+    """A problem found in an environment."""
 
     level: Literal["error", "warning"]
-    """An error stops training or spoils what is learnt; a warning may be as it is meant to be."""
+    """An error stops training or makes its result wrong; a warning may be intended."""
     text: str
     """What was received, what was expected, and the fix."""
 
 
 class Seen(NamedTuple):
-    """One step as it was seen, with copies of what was returned."""
+    """One step, with copies of the returned values."""
 
     obs: Any
     reward: float
@@ -48,22 +50,22 @@ class Seen(NamedTuple):
 
 
 def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -> None:
-    """Plays some episodes of an environment, raises what is wrong with it and warns of what may be.
+    """Runs some episodes of an environment; raises its errors and warns about its other problems.
 
-    Errors: answers of another structure, shape or dtype than declared, numbers that are not finite, rewards and flags of
-    the wrong kind, a reset without seed or info, goals whose ``compute_reward`` disagrees with ``step``. Warnings: numbers
-    outside of the declared bounds, time limits that are told as ``terminated``, episodes that never end, arrays that are
-    written again, resets that cannot be repeated, what Gymnasium's own (strict) checker says, and observations that are
-    hard to learn from. See :func:`findings` for all of them as a list; ``rejeu check ENV`` prints them.
+    Errors: observations whose structure, shape or dtype differs from the space, numbers that are not finite, rewards and
+    flags of the wrong type, a reset without seed or info, a ``compute_reward`` that disagrees with ``step``. Warnings:
+    numbers outside of the bounds, time limits reported as ``terminated``, episodes that never end, arrays that are reused,
+    resets that a seed does not reproduce, warnings of Gymnasium's checker, and observations that are hard to learn from.
+    :func:`findings` returns all of them; ``rejeu check ENV`` prints them.
 
     Args:
         env: an environment; it is reset and stepped, and left open.
-        warn: whether to warn as well; errors are raised in any case.
-        skip_render_check: leave out whether it renders in each of its modes.
+        warn: whether to warn; errors are always raised.
+        skip_render_check: skip the check of its render modes.
 
     Raises:
         TypeError: if it is no Gymnasium environment.
-        BadEnvironmentError: with all errors, one a line.
+        BadEnvironmentError: with all errors, one per line.
 
     >>> check_env(gym.make("Pendulum-v1"), warn=False)
     """
@@ -74,11 +76,11 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
                 warnings.warn(finding.text, UserWarning, stacklevel=2)
     errors = [finding.text for finding in found if finding.level == "error"]
     if errors:
-        raise BadEnvironmentError(f"{faults.id_of(env)}: " + "\n".join(errors))
+        raise BadEnvironmentError(f"{validation.id_of(env)}: " + "\n".join(errors))
 
 
 def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
-    """Returns all that is found in an environment by playing it; see :func:`check_env`.
+    """Returns the problems of an environment; see :func:`check_env`.
 
     Raises:
         TypeError: if it is no Gymnasium environment.
@@ -98,12 +100,10 @@ def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
     if seen is not None:
         _check_repeats(env, found)
         if isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
-            from rejeu.envs.goal_checks import goal_findings  # which imports this module
-
             for finding in goal_findings(env, seen):
                 found[finding.text] = finding
     if all(finding.level == "warning" for finding in found.values()):
-        for text in _said_by_gymnasium(env, skip_render_check):
+        for text in _gymnasium_messages(env, skip_render_check):
             found[text] = Finding("warning", text)
     for text in advice_on_observations(env.observation_space):
         found[text] = Finding("warning", text)
@@ -119,10 +119,10 @@ def check_action_space(space: gym.Space) -> None:
 
 
 def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
-    """Takes random steps and notes what is wrong, each kind of fault once; None if it cannot be stepped on."""
+    """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
-    obs = _begun(env, found, SEED)
+    obs = _reset(env, found, SEED)
     if obs is None:
         return None
     seen: list[Seen] = []
@@ -135,18 +135,18 @@ def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
         if len(seen) >= ENOUGH_STEPS and time.monotonic() > until:
             break
         answer = env.step(env.action_space.sample())
-        fault = faults.step_fault(answer, space)
+        fault = validation.step_fault(answer, space)
         if fault is not None:
             found.setdefault("step", Finding("error", fault))
             return None
-        _look(answer, space, found)
+        _check_step(answer, space, found)
         if _rewritten(space, obs, kept, answer[0]):
             text = (
                 "step returns the same array each time and writes the next observation into it; rejeu copies "
                 "observations, but other code that keeps them sees them change: return a copy"
             )
             found.setdefault("same array", Finding("warning", text))
-        obs, reward, terminated, truncated, info = conversions.numbers_of(answer)
+        obs, reward, terminated, truncated, info = validation.convert_step(answer)
         kept = _copied(space, obs)
         seen.append(Seen(kept, reward, terminated, truncated, copy.deepcopy(info)))
         length += 1
@@ -155,7 +155,7 @@ def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
             if length == limit:
                 at_limit.append(terminated)
             length = 0
-            obs = _begun(env, found)
+            obs = _reset(env, found)
             if obs is None:
                 return None
             kept = _copied(space, obs)
@@ -163,7 +163,7 @@ def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
         text = (
             f"every one of {len(at_limit)} episodes that came so far terminated at its time limit of {limit} steps; if "
             "that is the limit and not the task, return terminated=False, truncated=True there, or what comes after is "
-            "learnt to be worth nothing"
+            "learned to have no value"
         )
         found["limit"] = Finding("warning", text)
     if len(seen) >= MOST_STEPS and not lengths and limit is None:
@@ -175,25 +175,25 @@ def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
     return seen
 
 
-def _begun(env: gym.Env, found: dict[str, Finding], seed: int | None = None) -> Any:
-    """Returns the first observation of an episode, None if there is none; notes what is wrong with it."""
+def _reset(env: gym.Env, found: dict[str, Finding], seed: int | None = None) -> Any:
+    """Resets the environment and checks its observation, which is returned; None if it is unusable."""
     try:
-        obs = answers.reset(env, seed)[0]
+        obs = batching.reset_env(env, seed)[0]
     except BadEnvironmentError as error:
         found.setdefault("reset", Finding("error", str(error)))
         return None
-    _look_at_observation(obs, env.observation_space, found, "reset")
+    _check_observation(obs, env.observation_space, found, "reset")
     return obs
 
 
-def _look(answer: tuple[Any, ...], space: gym.Space, found: dict[str, Finding]) -> None:
-    """Notes what is wrong with the answer to a step that can be learnt from at all."""
+def _check_step(answer: tuple[Any, ...], space: gym.Space, found: dict[str, Finding]) -> None:
+    """Checks the values of a step."""
     obs, reward, terminated, truncated, info = answer
-    _look_at_observation(obs, space, found, "step")
+    _check_observation(obs, space, found, "step")
     for kind, fault in (
-        ("reward", faults.reward_fault(reward, strict=True)),
-        ("terminated", faults.flag_fault("terminated", terminated, strict=True)),
-        ("truncated", faults.flag_fault("truncated", truncated, strict=True)),
+        ("reward", validation.reward_fault(reward, strict=True)),
+        ("terminated", validation.flag_fault("terminated", terminated, strict=True)),
+        ("truncated", validation.flag_fault("truncated", truncated, strict=True)),
     ):
         if fault is not None:
             found.setdefault(kind, Finding("error", f"step returned {fault}"))
@@ -205,14 +205,14 @@ def _look(answer: tuple[Any, ...], space: gym.Space, found: dict[str, Finding]) 
         found.setdefault("folded", Finding("error", text))
 
 
-def _look_at_observation(obs: Any, space: gym.Space, found: dict[str, Finding], said: str) -> None:
-    fault = faults.observation_fault(space, obs, strict=True)
+def _check_observation(obs: Any, space: gym.Space, found: dict[str, Finding], said: str) -> None:
+    fault = validation.observation_fault(space, obs, strict=True)
     if fault is not None:
         found.setdefault("observation", Finding("error", f"{said} returned {fault}"))
-    fault = faults.finite_fault_of(space, obs)
+    fault = validation.nonfinite_fault(space, obs)
     if fault is not None:
         found.setdefault("finite", Finding("error", f"{said} returned {fault}"))
-    elif (outside := faults.bounds_fault(space, obs)) is not None:
+    elif (outside := validation.bounds_fault(space, obs)) is not None:
         # Networks never see the bounds of a Box, but a choice that does not exist has no place in them.
         level, fault = outside
         found.setdefault("bounds", Finding(level, f"{said} returned {fault}"))
@@ -253,9 +253,9 @@ def _check_repeats(env: gym.Env, found: dict[str, Finding]) -> None:
     env.action_space.seed(SEED)
     actions = [env.action_space.sample() for _ in range(5)]
     for _ in range(2):
-        walk = [_copied(space, answers.reset(env, SEED)[0])]
+        walk = [_copied(space, batching.reset_env(env, SEED)[0])]
         for action in actions:
-            obs, _, terminated, truncated, _ = conversions.numbers_of(env.step(action))
+            obs, _, terminated, truncated, _ = validation.convert_step(env.step(action))
             walk.append(_copied(space, obs))
             if terminated or truncated:
                 break
@@ -275,8 +275,8 @@ def _check_repeats(env: gym.Env, found: dict[str, Finding]) -> None:
         found["repeat"] = Finding("warning", text)
 
 
-def _said_by_gymnasium(env: gym.Env, skip_render_check: bool) -> list[str]:
-    """Returns what Gymnasium's own checker warns of or refuses, which is more than learning needs."""
+def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
+    """Returns the warnings and errors of Gymnasium's own checker."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         refused = []
@@ -290,3 +290,163 @@ def _said_by_gymnasium(env: gym.Env, skip_render_check: bool) -> list[str]:
         for one in dict.fromkeys(said)
         if "different from the unwrapped version" not in one
     ]
+
+
+def goal_findings(env: gym.Env, seen: Sequence[Seen]) -> list[Finding]:
+    """Returns the problems with the goals of an environment, from some of its steps."""
+    try:
+        check_goal_space(env.observation_space)
+    except ValueError as error:
+        return [Finding("error", str(error))]
+    if not env.has_wrapper_attr("compute_reward"):
+        return [
+            Finding(
+                "error",
+                "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
+                "there is none; add it, for hindsight replay",
+            )
+        ]
+    ended = [one for one in seen if one.terminated][: MOST_GOALS // 4]
+    rows = [*seen[:MOST_GOALS], *ended]
+    found = _check_goal_function("compute_reward", env.get_wrapper_attr("compute_reward"), rows)
+    if env.has_wrapper_attr("compute_terminated"):
+        found += _check_goal_function("compute_terminated", env.get_wrapper_attr("compute_terminated"), rows)
+    return found
+
+
+def _check_goal_function(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> list[Finding]:
+    """Returns the worst problem with ``compute_reward`` or ``compute_terminated``."""
+    for row in rows:
+        own = function(*_goals(row), row.info)
+        if np.shape(own) != ():
+            return [
+                Finding(
+                    "error", f"{name} returned the shape {np.shape(own)} of one goal, expected one number; index it"
+                )
+            ]
+        if (finding := _against_step(name, own, row)) is not None:
+            return [finding]
+        alone = _attempt(function, *_goals(row), {})
+        if isinstance(alone, Exception) or not _agree(own, alone):
+            return [
+                Finding(
+                    "error",
+                    f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; "
+                    "hindsight replay keeps no infos: let it depend on the goals alone",
+                )
+            ]
+    return _check_batches(name, function, rows)
+
+
+def _against_step(name: str, own: Any, row: Seen) -> Finding | None:
+    """Returns the difference between a step and the function for one goal."""
+    if name == "compute_terminated":
+        if bool(own) == row.terminated:
+            return None
+        level: Any = "error" if own else "warning"
+        text = (
+            f"compute_terminated gave {bool(own)} where step gave terminated={row.terminated}; hindsight replay goes by the "
+            "former: let step return it too"
+            + ("" if own else ", unless something else than the goal ended the episode")
+        )
+        return Finding(level, text)
+    if _agree(own, row.reward):
+        return None
+    text = f"step gave the reward {row.reward}, and compute_reward of the same goals {own}"
+    if row.terminated:
+        return Finding("warning", f"{text}, where the episode ended; hindsight replay will not know of the difference")
+    return Finding("error", f"{text}; they must agree: let step call compute_reward")
+
+
+def _check_batches(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> list[Finding]:
+    """Returns the difference between the results for many goals at once and for each alone."""
+    achieved, desired = (np.array([_goals(row)[k] for row in rows]) for k in range(2))
+    achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
+    single = [_attempt(function, a, d, {}) for a, d in zip(achieved, desired, strict=True)]
+    if (raised := next((one for one in single if isinstance(one, Exception)), None)) is not None:
+        return [
+            Finding(
+                "error",
+                f"{name} of goals of other steps {_describe_result(raised)}; it must take any goals of the space",
+            )
+        ]
+    whole = _attempt(function, achieved, desired, {})
+    if isinstance(whole, Exception) or np.shape(whole) != (len(achieved),):
+        what = _describe_result(whole) if isinstance(whole, Exception) else f"gave the shape {np.shape(whole)}"
+        return [
+            Finding(
+                "warning",
+                f"{name} of {len(achieved)} goals at once {what}, expected ({len(achieved)},); rejeu then calls it row by "
+                "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does",
+            )
+        ]
+    if not _agree(whole, np.array(single)):
+        at = int(np.flatnonzero(~np.isclose(whole, single, rtol=1e-4, atol=1e-5))[0])
+        return [
+            Finding(
+                "error",
+                f"{name} of many goals at once gave {whole[at]} in row {at}, and {single[at]} of the same goals one by one; "
+                "compute each row by itself: over the last axis",
+            )
+        ]
+    return []
+
+
+def _goals(row: Seen) -> tuple[Any, Any]:
+    _, achieved, desired = (row.obs[key] for key in GOAL_KEYS)
+    return achieved, desired
+
+
+def _attempt(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Returns the result of a function, or the exception that it raised."""
+    try:
+        return function(*arguments)
+    except Exception as error:  # whatever it raises of goals that it did not expect
+        return error
+
+
+def _agree(one: Any, two: Any) -> bool:
+    first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
+    return bool(np.allclose(first, second, rtol=1e-4, atol=1e-5))
+
+
+def _describe_result(result: Any) -> str:
+    return f"raised {type(result).__name__}: {result}" if isinstance(result, Exception) else f"{result}"
+
+
+def advice_on_observations(space: spaces.Space, path: str = "") -> list[str]:
+    """Returns advice on an observation space, one sentence each: nothing fails, but learning may be slower."""
+    where = f" under {path!r}" if path else ""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        found = []
+        for key, part in parts:
+            name = f"{path}.{key}".lstrip(".")
+            if isinstance(part, spaces.Dict | spaces.Tuple):
+                found.append(
+                    f"the observation under {name!r} is nested; rejeu takes it, Stable-Baselines3 takes one level only"
+                )
+            found += advice_on_observations(part, name)
+        return found
+    if not isinstance(space, spaces.Box):
+        return []
+    if len(space.shape) == 3:
+        return _advice_on_image(space, where)
+    if len(space.shape) > 1:
+        return [f"the observation{where} has the shape {space.shape}; arrays of two axes are flattened"]
+    if space.dtype != np.float32 and space.dtype != np.uint8:
+        return [f"the observation{where} has the dtype {space.dtype}; use float32, which it is turned into"]
+    return []
+
+
+def _advice_on_image(space: spaces.Box, where: str) -> list[str]:
+    found = []
+    if space.dtype != np.uint8:
+        found.append(f"the image{where} has the dtype {space.dtype}; only uint8 images go through convolutions")
+    elif np.any(space.low != 0) or np.any(space.high != 255):
+        found.append(f"the image{where} has other bounds than 0 and 255; it is divided by 255 in any case")
+    if min(sorted(space.shape)[1:]) < 36 and space.dtype == np.uint8:
+        found.append(
+            f"the image{where} has the shape {space.shape}; below 36x36 small convolutions are used, below 8x8 none"
+        )
+    return found

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.envs.faults import described
+from rejeu.envs.validation import describe_value
 from rejeu.errors import BadEnvironmentError
 
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
@@ -72,7 +72,7 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
             wrong = next(row for row in rows if row is None or np.shape(row) != ())
             name = getattr(function, "__name__", "the function of goals")
             raise BadEnvironmentError(
-                f"{name} returned {described(wrong)} of one goal, expected one number; rejeu.check_env(env) says more"
+                f"{name} returned {describe_value(wrong)} of one goal, expected one number; rejeu.check_env(env) says more"
             )
         return np.array(rows, dtype)
 

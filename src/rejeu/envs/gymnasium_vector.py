@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from rejeu.envs import answers, faults, goals as goals_module
+from rejeu.envs import batching, goals as goals_module, validation
 from rejeu.envs.base import SUCCESS_KEYS, Description, Step, VectorEnv, describe_spec, replaced
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
@@ -76,12 +76,14 @@ class GymnasiumVector(VectorEnv):
         answer = self._called(self.env.step, action)
         try:
             obs, reward, terminated, truncated, info = answer
-            obs = answers.batch(self.observation_space, self._leaves, self.n_envs, obs)
-            reward = answers.for_each("rewards", reward, self.n_envs, np.float32)
-            terminated = answers.for_each("terminated", terminated, self.n_envs, bool)
-            truncated = answers.for_each("truncated", truncated, self.n_envs, bool)
+            obs = batching.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
+            reward = batching.to_vector("rewards", reward, self.n_envs, np.float32)
+            terminated = batching.to_vector("terminated", terminated, self.n_envs, bool)
+            truncated = batching.to_vector("truncated", truncated, self.n_envs, bool)
         except ValueError:
-            raise self._bad(None, f"step returned {faults.described(answer)}, expected {faults.STEP_VALUES}") from None
+            raise self._bad(
+                None, f"step returned {validation.describe_value(answer)}, expected {validation.STEP_VALUES}"
+            ) from None
         except BadEnvironmentError as error:
             raise self._bad(None, f"step returned {error}") from error.__cause__
         if self._same_step:
@@ -132,9 +134,9 @@ class GymnasiumVector(VectorEnv):
     def _reset(self, **arguments: Any) -> Any:
         answer = self._called(self.env.reset, **arguments)
         if not isinstance(answer, tuple) or len(answer) != 2:
-            raise self._bad(None, f"reset returned {faults.described(answer)}, expected (obs, info)")
+            raise self._bad(None, f"reset returned {validation.describe_value(answer)}, expected (obs, info)")
         try:
-            return answers.batch(self.observation_space, self._leaves, self.n_envs, answer[0])
+            return batching.to_batch(self.observation_space, self._leaves, self.n_envs, answer[0])
         except BadEnvironmentError as error:
             raise self._bad(None, f"reset returned {error}") from error.__cause__
 
@@ -158,7 +160,7 @@ class GymnasiumVector(VectorEnv):
             raise self._bad(env, fault or f"{type(error).__name__}: {error}; {advice}") from error
 
     def _bad(self, env: int | None, fault: str) -> BadEnvironmentError:
-        return BadEnvironmentError(faults.blamed(self.env_id, env, self.n_steps, fault))
+        return BadEnvironmentError(validation.with_location(self.env_id, env, self.n_steps, fault))
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
@@ -194,7 +196,7 @@ def culprit(error: Exception, vector: Any) -> tuple[int | None, str | None]:
     if isinstance(vector, AsyncVectorEnv):
         return next((i for i, pipe in enumerate(vector.parent_pipes) if pipe is None), None), None
     for i, obs in enumerate(getattr(vector, "_env_obs", ())):
-        fault = None if obs is None else faults.observation_fault(vector.single_observation_space, obs)
+        fault = None if obs is None else validation.observation_fault(vector.single_observation_space, obs)
         if fault is not None:
             return i, f"it returned {fault}"
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
@@ -202,7 +204,7 @@ def culprit(error: Exception, vector: Any) -> tuple[int | None, str | None]:
     if not isinstance(number, int):
         return None, None
     if "unpack" in str(error) and frame.f_code.co_name == "step":
-        return number, f"{error}; step must return {faults.STEP_VALUES}; {faults.TERMINATED_AND_TRUNCATED}"
+        return number, f"{error}; step must return {validation.STEP_VALUES}; {validation.TERMINATED_AND_TRUNCATED}"
     return number, None
 
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import jax
 import numpy as np
-from numpy import ndarray
 
-from rejeu.envs import answers, faults, goals as goals_module, snapshot
+from rejeu.envs import batching, goals as goals_module, snapshot, validation
 from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
-from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, reward_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
+from rejeu.envs.validation import convert_step
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves, structure
 
@@ -23,8 +21,13 @@ from rejeu.spaces import leaves, structure
 class InProcess(VectorEnv):
     """Gymnasium environments stepped one after the other in this process.
 
-    What they answer is checked as it comes, for some nanoseconds: :class:`rejeu.errors.BadEnvironmentError` says which
-    environment answered what at which step. What an environment itself raises is raised as it is.
+    Invalid values raise :class:`rejeu.errors.BadEnvironmentError`, which names the environment and the step. Exceptions that
+    an environment raises itself are not changed.
+
+    Args:
+        envs: the environments.
+        seed: seed of the first reset.
+        venv: the vector environment with automatic resets that contains them, if there is one.
     """
 
     backend = "gymnasium"
@@ -41,21 +44,17 @@ class InProcess(VectorEnv):
         self.action_space = envs[0].action_space
         self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(envs[0])
         self.n_steps = 0
-        """How often the vector was stepped."""
-        self._all = range(self.n_envs)
+        """Number of steps of the vector."""
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
-        self._put = answers.writer(self.observation_space, self._stores)
-        only = self._stores[0] if isinstance(self.observation_space, gym.spaces.Box) else None
-        self._hot = (self._put, only, math.prod(self._leaves[0].shape), self.observation_space.dtype)
-        """What every step needs, in one place; ``only`` is the store of observations that are one array."""
+        self._put = batching.make_writer(self.observation_space, self._stores)
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
 
-    def handed_on(self, wrap: Callable[[gym.Env], gym.Env], seed: Seed = None) -> InProcess:
-        """Returns the same environments wrapped, as another vector that is to be used in place of this one.
+    def with_wrapper(self, wrap: Callable[[gym.Env], gym.Env], seed: Seed = None) -> InProcess:
+        """Returns a vector of the same environments in a wrapper, which replaces this one.
 
-        It takes over the seed of the first reset if that is still to come; ``seed`` is for where there is none.
+        Its first reset uses the seed of this vector's first reset if that has not happened yet, else ``seed``.
         """
         seed, self._seed = seed if self._seed is None else self._seed, None
         wrapped = InProcess([wrap(env) for env in self.envs], seed)
@@ -67,7 +66,7 @@ class InProcess(VectorEnv):
         self._seed = None
         for i, (env, own_seed) in enumerate(zip(self.envs, for_each(seed, self.n_envs), strict=True)):
             try:
-                self._put(i, answers.reset(env, own_seed)[0])
+                self._put(i, batching.reset_env(env, own_seed)[0])
             except BadEnvironmentError as error:
                 raise self._bad(i, str(error), error) from error.__cause__
         return self._obs
@@ -76,52 +75,39 @@ class InProcess(VectorEnv):
         return self._step_all(action, np.flatnonzero(active).tolist())
 
     def _step_all(self, action: np.ndarray, which: Sequence[int] | None = None) -> Step:
-        """Steps the environments ``which``, None for all."""
+        """Steps the environments with the indices ``which``, None for all."""
         reward = np.zeros(self.n_envs, np.float32)
         terminated = np.zeros(self.n_envs, bool)
         truncated = np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
-        envs = self.envs
-        put, only, size, dtype = self._hot
         self.n_steps += 1
-        for i in self._all if which is None else which:
-            answer = envs[i].step(action[i])
+        for i in range(self.n_envs) if which is None else which:
+            answer = self.envs[i].step(action[i])
             try:
-                obs, gain, ended, cut, info[i] = answer
-                if only is not None and type(obs) is ndarray and obs.size == size and obs.dtype is dtype:
-                    only[i] = obs  # what put does, without the call
-                else:
-                    put(i, obs)
-                if type(gain) is not float or not -LARGEST <= gain <= LARGEST:
-                    gain = reward_of(gain)
-                reward[i] = gain
-                if ended is not False:
-                    terminated[i] = ended if type(ended) in FLAGS else flag_of(ended)
-                if cut is not False:
-                    truncated[i] = cut if type(cut) in FLAGS else flag_of(cut)
-                if type(info[i]) is not dict and not isinstance(info[i], dict):
-                    raise TypeError("the info is no dict")
-            except Exception as error:  # whatever NumPy says of an answer that does not fit
-                raise self._bad(i, faults.step_fault(answer, self.observation_space), error) from error
+                obs, reward[i], terminated[i], truncated[i], info[i] = convert_step(answer)
+                self._put(i, obs)
+                if not isinstance(info[i], dict):
+                    raise TypeError("the info is not a dict")
+            except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
+                raise self._bad(i, validation.step_fault(answer, self.observation_space), error) from error
         return Step(self._obs, reward, terminated, truncated, info)
 
     def reset_done(self, done: np.ndarray) -> Any:
-        envs, put = self.envs, self._put
         for i in np.flatnonzero(done).tolist():
-            answer = envs[i].reset()
+            answer = self.envs[i].reset()
             try:
                 obs, info = answer
                 if type(answer) is not tuple or not isinstance(info, dict):
-                    raise TypeError("no tuple of an observation and a dict")
-                put(i, obs)
-            except Exception as error:  # whatever NumPy says of an answer that does not fit
-                raise self._bad(i, faults.reset_fault(answer, self.observation_space), error) from error
+                    raise TypeError("not a tuple of an observation and a dict")
+                self._put(i, obs)
+            except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
+                raise self._bad(i, validation.reset_fault(answer, self.observation_space), error) from error
         return self._obs
 
     def _bad(self, i: int, fault: str | None, error: Exception) -> BadEnvironmentError:
-        """Returns what is wrong with environment ``i``'s answer, be it only what NumPy said of it."""
-        said = fault or f"{type(error).__name__}: {error}"
-        return BadEnvironmentError(faults.blamed(self.env_id, i, self.n_steps, said))
+        """Returns the error for invalid values of environment ``i``; without a description, that of NumPy."""
+        description = fault or f"{type(error).__name__}: {error}"
+        return BadEnvironmentError(validation.with_location(self.env_id, i, self.n_steps, description))
 
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])
@@ -142,7 +128,7 @@ class InProcess(VectorEnv):
             snapshot.restore(env, one)
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf
-        self._seed = None  # they have been reset, in another process
+        self._seed = None  # they were reset in another process
         return [i for i, env in enumerate(self.envs) if snapshot.is_over(env)]
 
     def close(self) -> None:

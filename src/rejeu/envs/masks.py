@@ -1,4 +1,9 @@
-"""Vectors of environments with action masks; :mod:`rejeu.envs.mask_wrapper` says how an environment gives its mask."""
+"""Action masks: which actions an environment allows, passed along with its observations.
+
+An environment returns the mask in ``info["action_mask"]``, at reset and at every step, or by a method ``action_masks()``. It
+is an array of booleans or of zeros and ones: one for each action of a Discrete space, one for each option of every choice of a
+MultiDiscrete space, one for each bit of a MultiBinary space that may be 1.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +19,97 @@ from rejeu.core import Masked
 from rejeu.envs.adapters import adapter_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
-from rejeu.envs.mask_wrapper import MASK, OBSERVATION, MaskInObservation, n_choices
 from rejeu.envs.registry import maker
 from rejeu.envs.seeds import Seed
+from rejeu.envs.validation import id_of
 from rejeu.envs.workers.pool import TIMEOUT
+from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import Leaf
+
+OBSERVATION, MASK = "observation", "action_mask"
+"""Keys of the observations of :class:`MaskInObservation`."""
+
+
+def n_choices(space: spaces.Space, env_id: str) -> int:
+    """Returns the length of a mask for an action space.
+
+    Raises:
+        ValueError: for Box actions, which cannot be masked.
+    """
+    if isinstance(space, spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, spaces.MultiDiscrete):
+        return int(space.nvec.sum())
+    if isinstance(space, spaces.MultiBinary):
+        return int(np.prod(space.shape, dtype=int))
+    raise ValueError(f"masks need Discrete, MultiDiscrete or MultiBinary actions; {env_id} has {space}: use PPO")
+
+
+class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper that adds the mask to the observations: a Dict of ``observation`` and ``action_mask``."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self._n = n_choices(env.action_space, id_of(env))
+        self.observation_space = spaces.Dict({OBSERVATION: env.observation_space, MASK: spaces.MultiBinary(self._n)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        return {OBSERVATION: obs, MASK: self._mask(info, False)}, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        mask = self._mask(info, terminated or truncated)
+        return {OBSERVATION: obs, MASK: mask}, reward, terminated, truncated, info
+
+    def get_wrapper_state(self) -> dict[str, Any]:
+        """Returns an empty dict: the wrapper has no state (see :mod:`rejeu.envs.snapshot`)."""
+        return {}
+
+    def set_wrapper_state(self, state: Mapping[str, Any]) -> None:
+        """Does nothing.
+
+        Raises:
+            ValueError: if ``state`` is not empty.
+        """
+        if state:
+            raise ValueError(f"the state of {type(self).__name__} has {sorted(state)}, expected nothing")
+
+    def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
+        if MASK in info:
+            given = info[MASK]
+        else:
+            try:
+                given = self.env.get_wrapper_attr("action_masks")()
+            except AttributeError:
+                raise BadEnvironmentError(
+                    f'{id_of(self.env)} does not return action masks; put info["action_mask"] into what '
+                    "reset and step return, or add a method action_masks()"
+                ) from None
+        mask = (
+            np.concatenate([np.asarray(part).ravel() for part in given]) if isinstance(given, list | tuple) else given
+        )
+        mask = np.asarray(mask).ravel().astype(np.int8)
+        if mask.shape != (self._n,):
+            raise BadEnvironmentError(
+                f"{id_of(self.env)} gave a mask of {mask.size} entries, expected {self._n} for {self.action_space}"
+            )
+        if not over:  # after the end of an episode there may be no allowed action
+            self._check_some_allowed(mask)
+        return mask
+
+    def _check_some_allowed(self, mask: np.ndarray) -> None:
+        space = self.action_space
+        if isinstance(space, spaces.MultiBinary):
+            return
+        sizes = space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else [self._n]
+        if not all(part.any() for part in np.split(mask, np.cumsum(sizes)[:-1])):
+            raise BadEnvironmentError(f"{id_of(self.env)} allows no action: its mask is {mask.tolist()}")
 
 
 @dataclass(frozen=True)
 class MaskedMaker:
-    """Makes an environment with its mask in the observation; can be sent to another process."""
+    """Makes an environment with its mask in the observation; can be pickled."""
 
     make: Callable[[], gym.Env]
 
@@ -33,7 +119,7 @@ class MaskedMaker:
 
 
 class MaskedVector(VectorEnv):
-    """A vector of environments whose observations are :class:`rejeu.core.Masked`."""
+    """A vector environment whose observations are :class:`rejeu.core.Masked`."""
 
     def __init__(self, inner: VectorEnv) -> None:
         """Wraps a vector of :class:`MaskInObservation` environments."""
@@ -49,12 +135,12 @@ class MaskedVector(VectorEnv):
         return masked(self.inner.reset(seed))
 
     def _step_all(self, action: np.ndarray) -> Step:
-        return self._shown(self.inner.step(action))
+        return self._masked(self.inner.step(action))
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
-        return self._shown(self.inner.step(action, active))
+        return self._masked(self.inner.step(action, active))
 
-    def _shown(self, step: Step) -> Step:
+    def _masked(self, step: Step) -> Step:
         return step._replace(obs=masked(step.obs))
 
     def reset_done(self, done: np.ndarray) -> Masked:
@@ -84,8 +170,8 @@ def masked(obs: dict[str, Any]) -> Masked:
     return Masked(obs[OBSERVATION], obs[MASK].astype(bool))
 
 
-def shown_to(agent: Any, env: gym.Env) -> gym.Env:
-    """Returns an environment as an agent is to see it: with its masks, if the agent takes any."""
+def for_agent(agent: Any, env: gym.Env) -> gym.Env:
+    """Returns an environment with masks in its observations if the agent uses masks, else the environment itself."""
     return MaskInObservation(env) if getattr(agent, "takes_masks", False) else env
 
 
@@ -113,7 +199,7 @@ def make_masked(
     """Returns ``n_envs`` environments with their masks as one; arguments as for :func:`make_vector`.
 
     Raises:
-        TypeError: for a vector environment whose single environments cannot be reached.
+        TypeError: for a vector environment whose single environments cannot be accessed.
         ValueError: for worker options out of range, or ``restart_workers`` where there are no worker processes.
     """
     check_workers(env, backend, worker_timeout, restart_workers)
@@ -122,10 +208,10 @@ def make_masked(
     if isinstance(env, MaskedVector):
         return env
     if isinstance(env, InProcess):
-        return MaskedVector(env.handed_on(MaskInObservation, seed))
+        return MaskedVector(env.with_wrapper(MaskInObservation, seed))
     if isinstance(env, VectorEnv | gym.vector.VectorEnv):
         raise TypeError(
-            f"the masks of {type(env).__name__} cannot be reached; give the id, the environment, or a function that makes "
+            f"the masks of {type(env).__name__} cannot be accessed; give the id, the environment, or a function that makes "
             "one, or rejeu.make_vector(function, n_envs, 'gymnasium')"
         )
     made_from: tuple[str, dict[str, Any]] | None = (env, {}) if isinstance(env, str) else None

@@ -23,7 +23,6 @@ from gymnasium.envs import classic_control
 from msgspec import Meta
 
 from rejeu.envs.ball.ball import Ball
-from rejeu.envs.mask_wrapper import MaskInObservation
 
 STATELESS = (
     wrappers.ClipAction,
@@ -39,7 +38,6 @@ STATELESS = (
     wrappers.TransformAction,
     wrappers.TransformObservation,
     wrappers.TransformReward,
-    MaskInObservation,
 )
 """Wrappers without state."""
 ABSENT = "absent"

@@ -18,7 +18,7 @@ from jax import Array
 
 from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree
-from rejeu.envs import faults
+from rejeu.envs import validation
 from rejeu.envs.make import Step, VectorEnv
 from rejeu.errors import BadEnvironmentError, NonFiniteError
 from rejeu.loops.learner import Learner, PackedState
@@ -266,7 +266,7 @@ def look_at_bounds(run: Run, obs: PyTree) -> None:
     step of some environments.
     """
     run.next_look = 2 * run.step + 1
-    fault = faults.far_outside(run.env.observation_space, obs)
+    fault = validation.far_outside(run.env.observation_space, obs)
     if fault is not None:
         run.next_look = math.inf
         warnings.warn(

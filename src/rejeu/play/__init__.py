@@ -16,9 +16,9 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import Agent
-from rejeu.envs.faults import id_of
-from rejeu.envs.masks import shown_to
+from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env
+from rejeu.envs.validation import id_of
 from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Pace, Player
 from rejeu.play.keys import KeyMap
@@ -70,7 +70,7 @@ def play(
         by_hand = Player("you", playing_env, lambda obs, held, step: keys_of_env.action(held, step))
         players = [by_hand]
         if against is not None:
-            opponent_env = shown_to(against, rendering(env))
+            opponent_env = for_agent(against, rendering(env))
             stack.callback(opponent_env.close)
             players.append(Player(_name(against), opponent_env, _policy(against)))
         if record is not None:
@@ -105,7 +105,7 @@ def watch(
     """
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing_env = shown_to(agent, rendering(env))
+        playing_env = for_agent(agent, rendering(env))
         stack.callback(playing_env.close)
         fps = natural_fps(playing_env) if fps is None else fps
         player = Player(_name(agent), playing_env, _policy(agent))

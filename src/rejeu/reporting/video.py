@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.envs.make import InProcess
-from rejeu.envs.masks import shown_to
+from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env, provider, register
 from rejeu.errors import MissingExtra
 from rejeu.interrupt import Interrupt
@@ -81,7 +81,7 @@ def record_video(
     fps = None if fps is None else number("fps", fps, above=0)
     ffmpeg()
     given = isinstance(env, gym.Env)
-    playing_env = shown_to(agent, env if given else rendering_env(agent, env))
+    playing_env = for_agent(agent, env if given else rendering_env(agent, env))
     try:
         check_renders(playing_env)
         with Interrupt() as stop, VideoFile(path, natural_fps(playing_env) if fps is None else fps) as video:

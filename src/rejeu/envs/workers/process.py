@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from rejeu.envs import answers, conversions, faults, snapshot
+from rejeu.envs import batching, snapshot, validation
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves
 
@@ -79,7 +79,7 @@ def serve(
         env = make.fn()
         put = None
         if buffers is not None:
-            put = answers.writer(env.observation_space, rows(env.observation_space, buffers, n_envs))
+            put = batching.make_writer(env.observation_space, rows(env.observation_space, buffers, n_envs))
         send(pipe, Description(env.observation_space, env.action_space, env.metadata, env.render_mode))
         while (request := receive(pipe))[0] != "close":
             send(pipe, _answered(env, request, put, number))
@@ -113,7 +113,7 @@ def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
     if name == "step":
         return checked_step(env, arguments[0])
     if name == "reset":
-        return answers.reset(env, *arguments)
+        return batching.reset_env(env, *arguments)
     if name == "snapshot":
         return snapshot.state_of(env)
     if name == "restore":
@@ -131,7 +131,7 @@ def checked_step(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dic
         BadEnvironmentError: if that is something else than the five values, or an observation does not fit its space.
     """
     answer = env.step(action)
-    fault = faults.step_fault(answer, env.observation_space)
+    fault = validation.step_fault(answer, env.observation_space)
     if fault is not None:
         raise BadEnvironmentError(fault)
-    return conversions.numbers_of(answer)
+    return validation.convert_step(answer)

@@ -10,7 +10,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.envs import faults, goals as goals_module, snapshot
+from rejeu.envs import goals as goals_module, snapshot, validation
 from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
@@ -154,7 +154,7 @@ class InWorkers(VectorEnv):
             return said
         first, failure = next(iter(failed.items()))
         if failure.kind == "bad answer":
-            raise BadEnvironmentError(faults.blamed(self.env_id, first, self.n_steps, failure.message))
+            raise BadEnvironmentError(validation.with_location(self.env_id, first, self.n_steps, failure.message))
         which = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
         raise WorkerError(f"{which} failed in a worker process, at a {what}:\n{failure.trace}")
 
@@ -172,15 +172,15 @@ class InWorkers(VectorEnv):
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
         snapshot.check_count(saved, self.n_envs)
-        answers = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
-        for i, answer in answers.items():
+        replies = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
+        for i, answer in replies.items():
             if not isinstance(answer, bool):
                 why = answer.message if isinstance(answer, Failure) else answer.why
                 raise ValueError(f"environment {i} cannot be restored: {why}")
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf
         self._seed = None
-        return [i for i, is_over in answers.items() if is_over]
+        return [i for i, is_over in replies.items() if is_over]
 
     def close(self) -> None:
         """Ends the processes; a second call does nothing."""

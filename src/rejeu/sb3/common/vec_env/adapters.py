@@ -14,7 +14,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.envs import adapters, answers, faults, goals as goals_module
+from rejeu.envs import adapters, batching, goals as goals_module, validation
 from rejeu.envs.base import Step, VectorEnv, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.in_process import InProcess
@@ -121,11 +121,11 @@ class VecEnvAdapter(VectorEnv):
         self.n_steps += 1
         answer = self.venv.step(action)
         if not isinstance(answer, tuple) or len(answer) != 4:
-            raise self._bad(f"step returned {faults.described(answer)}, expected (obs, rewards, dones, infos)")
+            raise self._bad(f"step returned {validation.describe_value(answer)}, expected (obs, rewards, dones, infos)")
         returned, reward, dones, infos = answer
         try:
-            done = answers.for_each("dones", dones, self.n_envs, bool)
-            reward = answers.for_each("rewards", reward, self.n_envs, np.float32)
+            done = batching.to_vector("dones", dones, self.n_envs, bool)
+            reward = batching.to_vector("rewards", reward, self.n_envs, np.float32)
         except BadEnvironmentError as error:
             raise self._bad(f"step returned {error}") from error.__cause__
         for i, info in enumerate(infos):
@@ -220,12 +220,12 @@ class VecEnvAdapter(VectorEnv):
 
     def _cast(self, obs: Any) -> Any:
         try:
-            return answers.batch(self.observation_space, self._leaves, self.n_envs, obs)
+            return batching.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
         except BadEnvironmentError as error:
             raise self._bad(f"it returned {error}") from error.__cause__
 
     def _bad(self, fault: str) -> BadEnvironmentError:
-        return BadEnvironmentError(faults.blamed(self.env_id, None, self.n_steps, fault))
+        return BadEnvironmentError(validation.with_location(self.env_id, None, self.n_steps, fault))
 
 
 def _first_attr(venv: VecEnv, name: str) -> Any:

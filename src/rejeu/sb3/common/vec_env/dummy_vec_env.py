@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from rejeu.envs import answers, conversions, faults
+from rejeu.envs import batching, validation
 from rejeu.errors import BadEnvironmentError
 from rejeu.reporting.video import check_renders, rgb_frame
 from rejeu.sb3.common.vec_env.base_vec_env import (
@@ -84,11 +84,11 @@ class DummyVecEnv(VecEnv):
         rewards, dones = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
         for i, env in enumerate(self.envs):
             answer = env.step(self._actions[i])
-            if (fault := faults.step_fault(answer, env.observation_space)) is not None:
-                raise BadEnvironmentError(faults.blamed(faults.id_of(env), i, self.n_steps, fault))
-            obs, rewards[i], terminated, truncated, info = conversions.numbers_of(answer)
+            if (fault := validation.step_fault(answer, env.observation_space)) is not None:
+                raise BadEnvironmentError(validation.with_location(validation.id_of(env), i, self.n_steps, fault))
+            obs, rewards[i], terminated, truncated, info = validation.convert_step(answer)
             # A copy: an environment may write its next observation into the same array.
-            obs = answers.kept(env.observation_space, obs)
+            obs = batching.copy_observation(env.observation_space, obs)
             info = {**info, TIME_LIMIT_TRUNCATED: truncated and not terminated}
             dones[i] = terminated or truncated
             if dones[i]:
@@ -101,10 +101,12 @@ class DummyVecEnv(VecEnv):
     def _reset_env(self, i: int, env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Resets one environment; returns a copy of its observation."""
         try:
-            obs, self.reset_infos[i] = answers.reset(env, seed, options)
+            obs, self.reset_infos[i] = batching.reset_env(env, seed, options)
         except BadEnvironmentError as error:
-            raise BadEnvironmentError(faults.blamed(faults.id_of(env), i, self.n_steps, str(error))) from error
-        return answers.kept(env.observation_space, obs)
+            raise BadEnvironmentError(
+                validation.with_location(validation.id_of(env), i, self.n_steps, str(error))
+            ) from error
+        return batching.copy_observation(env.observation_space, obs)
 
     def _stack(self, parts: list[Any]) -> Any:
         space = self.observation_space

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from rejeu.envs import answers
-from rejeu.envs.faults import blamed
+from rejeu.envs import batching
+from rejeu.envs.validation import with_location
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
 from rejeu.envs.workers.process import Failure, checked_step
 from rejeu.errors import BadEnvironmentError, WorkerError
@@ -165,7 +165,7 @@ class SubprocVecEnv(VecEnv):
                     raise AttributeError(answer.message)
                 self.close()
                 if answer.kind == "bad answer":
-                    raise BadEnvironmentError(blamed(type(self).__name__, i, self._n_steps, answer.message))
+                    raise BadEnvironmentError(with_location(type(self).__name__, i, self._n_steps, answer.message))
                 raise WorkerError(f"environment {i} raised an error:\n{answer.trace}")
         return replies
 
@@ -176,8 +176,8 @@ class SubprocVecEnv(VecEnv):
 
 def _reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
     """Resets an environment; returns a copy of the observation and the info."""
-    obs, info = answers.reset(env, seed, options)
-    return answers.kept(env.observation_space, obs), info
+    obs, info = batching.reset_env(env, seed, options)
+    return batching.copy_observation(env.observation_space, obs), info
 
 
 def _step_and_reset(env: gym.Env, action: Any) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
@@ -187,7 +187,7 @@ def _step_and_reset(env: gym.Env, action: Any) -> tuple[Any, float, bool, dict[s
         The observation to act on, the reward, whether the episode has ended, the info, and the info of the reset.
     """
     obs, reward, terminated, truncated, info = checked_step(env, action)
-    obs = answers.kept(env.observation_space, obs)
+    obs = batching.copy_observation(env.observation_space, obs)
     info = {**info, TIME_LIMIT_TRUNCATED: truncated and not terminated}
     reset_info: dict[str, Any] = {}
     if terminated or truncated:

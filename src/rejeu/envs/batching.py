@@ -1,6 +1,6 @@
-"""What environments answer to reset and step, taken apart: written into batches, or refused in words.
+"""Batches of what environments return: observations written into arrays, rewards and flags checked for shape.
 
-The loops pay for a few comparisons here; what to say where they fail is in :mod:`rejeu.envs.faults`.
+The loops pay for a few comparisons here; :mod:`rejeu.envs.validation` explains what is wrong where they fail.
 """
 
 from __future__ import annotations
@@ -15,22 +15,29 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.envs.conversions import fitted, parts
-from rejeu.envs.faults import described, name_of, reset_fault, reward_fault, seed_fault
+from rejeu.envs.validation import (
+    describe_value,
+    leaf_name,
+    leaf_spaces,
+    reset_fault,
+    reward_fault,
+    seed_fault,
+    to_array,
+)
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import Leaf, cast, flat_keys, leaves, plain, structure
 
 
-def writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, Any], None]:
+def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, Any], None]:
     """Returns ``put(i, observation)``, which writes one observation into row ``i`` of each of the ``stores``.
 
     ``stores`` hold the leaves of ``space`` in the order of :func:`rejeu.spaces.leaves`, ``(n_envs, *leaf.shape)``, of the
-    kept dtypes. Numbers of another dtype are cast where that loses no more than precision. ``put`` raises anything for an
-    observation that does not fit; :func:`rejeu.envs.faults.observation_fault` then says why.
+    kept dtypes. Values of another dtype are cast if only precision is lost. ``put`` raises any exception for an invalid
+    observation; :func:`rejeu.envs.validation.observation_fault` then describes what is wrong.
     """
     slots = [
         (store, leaf.shape, math.prod(leaf.shape), part.dtype, np.ndarray)
-        for store, leaf, part in zip(stores, leaves(space), parts(space), strict=True)
+        for store, leaf, part in zip(stores, leaves(space), leaf_spaces(space), strict=True)
     ]
     if isinstance(space, spaces.Box):
         store, shape, size, dtype, array = slots[0]
@@ -38,7 +45,7 @@ def writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, 
         def put_array(i: int, obs: Any) -> None:
             # As many numbers as are expected can only be broadcast from shapes with leading ones, which is harmless.
             if type(obs) is not array or obs.size != size or obs.dtype is not dtype:
-                obs = fitted(obs, shape, store.dtype)
+                obs = to_array(obs, shape, store.dtype)
             store[i] = obs
 
         return put_array
@@ -50,14 +57,14 @@ def writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, 
             for key, store, shape, size, dtype, array in keyed:
                 part = obs[key]
                 if type(part) is not array or part.size != size or part.dtype is not dtype:
-                    part = fitted(part, shape, store.dtype)
+                    part = to_array(part, shape, store.dtype)
                 store[i] = part
 
         return put_dict
 
     def put_tree(i: int, obs: Any) -> None:
         for (store, shape, *_), part in zip(slots, jax.tree.leaves(plain(space, obs), is_leaf=_is_list), strict=True):
-            store[i] = fitted(part, shape, store.dtype)
+            store[i] = to_array(part, shape, store.dtype)
 
     return put_tree
 
@@ -66,12 +73,13 @@ def _is_list(value: Any) -> bool:
     return isinstance(value, list)
 
 
-def reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-    """Returns what ``env.reset`` returned; ``seed`` and ``options`` are handed over only if they are not None.
+def reset_env(
+    env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Resets an environment and returns the observation and the info; passes ``seed`` and ``options`` only if not None.
 
     Raises:
-        BadEnvironmentError: if it does not take a seed, or returned something else than an observation of its space and a
-            dict.
+        BadEnvironmentError: if it does not accept a seed, or does not return an observation of its space and a dict.
     """
     arguments: dict[str, Any] = {} if seed is None else {"seed": seed}
     if options is not None:
@@ -88,47 +96,49 @@ def reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None 
     return answer
 
 
-def kept(space: spaces.Space, obs: Any) -> Any:
-    """Returns a copy of an observation of the right structure, in which every leaf can be cast to the dtype declared."""
+def copy_observation(space: spaces.Space, obs: Any) -> Any:
+    """Returns a copy of a valid observation, in which every leaf can be cast to the declared dtype."""
     if isinstance(space, spaces.Dict):
-        return {key: kept(part, obs[key]) for key, part in space.spaces.items()}
+        return {key: copy_observation(part, obs[key]) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(kept(part, one) for part, one in zip(space.spaces, obs, strict=True))
+        return tuple(copy_observation(part, one) for part, one in zip(space.spaces, obs, strict=True))
     dtype = np.dtype(space.dtype)
     if isinstance(obs, np.ndarray) and np.can_cast(obs.dtype, dtype, "same_kind"):
         return obs.copy()
     return copy.deepcopy(obs) if np.isscalar(obs) else np.asarray(obs).astype(dtype)
 
 
-def batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:
-    """Returns observations that a vector environment showed as :func:`rejeu.spaces.cast` does.
+def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:
+    """Returns the observations of a vector environment, converted by :func:`rejeu.spaces.cast`.
 
     Raises:
-        BadEnvironmentError: with the words only, if they are not ``(n_envs, *leaf.shape)`` at every leaf.
+        BadEnvironmentError: with the description only, if they are not ``(n_envs, *leaf.shape)`` at every leaf.
     """
     try:
         arrays = cast(space, space_leaves, obs)
-    except Exception as error:  # whatever NumPy says of what does not fit
-        raise BadEnvironmentError(f"observations as {described(obs)}, expected a batch of {space}: {error}") from error
+    except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
+        raise BadEnvironmentError(
+            f"observations as {describe_value(obs)}, expected a batch of {space}: {error}"
+        ) from error
     for leaf, array in zip(space_leaves, jax.tree.leaves(arrays), strict=True):
         if array.shape != (n_envs, *leaf.shape):
             raise BadEnvironmentError(
-                f"{name_of(leaf.path)} of all environments of shape {array.shape}, expected {(n_envs, *leaf.shape)}; one "
+                f"{leaf_name(leaf.path)} of all environments of shape {array.shape}, expected {(n_envs, *leaf.shape)}; one "
                 "row for each environment"
             )
     return arrays
 
 
-def for_each(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
+def to_vector(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
     """Returns the rewards or flags that a vector environment returned, ``dtype (n_envs,)``.
 
     Raises:
-        BadEnvironmentError: with the words only, if they are no numbers of that shape.
+        BadEnvironmentError: with the description only, if they are not numbers of that shape.
     """
     array = np.asarray(values)
     if array.shape != (n_envs,) or array.dtype.kind not in ("fiub" if dtype == np.float32 else "iub"):
         kind = "numbers" if dtype == np.float32 else "bools"
-        raise BadEnvironmentError(f"{name} as {described(values)}, expected {kind} of shape ({n_envs},)")
+        raise BadEnvironmentError(f"{name} as {describe_value(values)}, expected {kind} of shape ({n_envs},)")
     with np.errstate(over="ignore"):
         kept = array.astype(dtype, copy=False)
     if dtype == np.float32 and not math.isfinite(np.vdot(kept, kept)):

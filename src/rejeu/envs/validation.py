@@ -1,12 +1,16 @@
-"""What is wrong with what an environment returned, in words.
+"""Validation of what environments return: what is accepted, how it is converted, and what is wrong with the rest.
 
-Every function here that is called ``*_fault`` returns one sentence that says what was received, what was expected and what
-to do, or None where nothing is wrong. They run once something has failed, and in :func:`rejeu.check_env`.
+Every function named ``*_fault`` returns one sentence that says what was received, what was expected and how to fix it, or
+None where nothing is wrong. Those functions run once something has failed, and in :func:`rejeu.check_env`.
+
+Accepted although the space declares something else: other dtypes whose values are kept, NumPy's scalars, and 0 and 1 as
+booleans.
 """
 
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -15,19 +19,102 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.envs.conversions import FLAGS, LARGEST, flag_of, keeps, parts, reward_of
 from rejeu.spaces import Leaf, leaves
+
+FLAGS = frozenset((bool, np.bool_))
+"""Types of ``terminated`` and ``truncated``."""
+NUMBERS = frozenset((float, int, np.float64, np.float32, np.int64, np.int32))
+"""Types of rewards that need no conversion."""
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest reward that float32 can hold."""
+
+
+def keeps_values(array: np.ndarray, dtype: Any) -> bool:
+    """Returns whether casting to ``dtype`` keeps the values, except for precision."""
+    if array.dtype.kind not in "fiub":
+        return False
+    if np.can_cast(array.dtype, dtype, "same_kind"):
+        return True
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool((array.astype(dtype) == array).all())
+
+
+def to_array(value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Returns an array of that shape whose values can be cast to that dtype.
+
+    Raises:
+        ValueError: if the shape differs, or if an integer dtype cannot hold the values.
+    """
+    array = np.asarray(value)
+    if array.shape != shape:
+        raise ValueError(f"shape {array.shape}")
+    if not keeps_values(array, dtype):
+        raise ValueError(f"dtype {array.dtype}")
+    return array
+
+
+def leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
+    """Returns the spaces at the leaves of a space, in the order of :func:`rejeu.spaces.leaves`."""
+    if isinstance(space, spaces.Dict):
+        return [part for key in sorted(space.spaces) for part in leaf_spaces(space.spaces[key])]
+    if isinstance(space, spaces.Tuple):
+        return [part for one in space.spaces for part in leaf_spaces(one)]
+    return [space]
+
+
+def convert_step(answer: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """Returns the five values that ``step`` returned, with reward and flags as Python scalars.
+
+    Raises any exception if they are invalid; :func:`step_fault` then describes what is wrong.
+    """
+    obs, reward, terminated, truncated, info = answer
+    return obs, to_reward(reward), to_bool(terminated), to_bool(truncated), info
+
+
+def to_reward(reward: Any) -> float:
+    """Returns a reward as a float; arrays of one number are accepted, None and strings are not.
+
+    Raises:
+        OverflowError: if it is finite and beyond ``LARGEST``.
+        TypeError, ValueError: if it is not a number.
+    """
+    if type(reward) in NUMBERS:
+        number = float(reward)
+    elif reward is None or isinstance(reward, str | bytes):
+        raise TypeError("not a number")
+    else:
+        number = float(np.asarray(reward, np.float64).reshape(()) if np.size(reward) == 1 else reward)
+    if LARGEST < abs(number) < math.inf:
+        raise OverflowError("more than a float32 holds")
+    return number
+
+
+def to_bool(flag: Any) -> bool:
+    """Returns ``terminated`` or ``truncated`` as a bool; zeros and ones are accepted, None and strings are not.
+
+    Raises:
+        TypeError, ValueError: if it is neither.
+    """
+    if type(flag) in FLAGS:
+        return bool(flag)
+    if flag is None or isinstance(flag, str | bytes) or np.size(flag) != 1:
+        raise TypeError("not a bool")
+    number = np.asarray(flag).reshape(())
+    if number.dtype.kind not in "fiub" or number not in (0, 1):
+        raise ValueError("not a bool")
+    return bool(number)
+
 
 STEP_VALUES = "(obs, reward, terminated, truncated, info)"
 FAR = 10.0
-"""How many times the distance of its bounds an observation may lie outside of them before that is told."""
+"""Warn if an observation is outside its bounds by more than this multiple of their distance."""
 TERMINATED_AND_TRUNCATED = (
     "terminated says that the task itself ended, truncated that a time limit cut the episode off; return both as bools"
 )
 
 
 def seed_fault(env: gym.Env) -> str | None:
-    """Says which of an environment and its wrappers cannot be reset with a seed."""
+    """Describes which of an environment and its wrappers cannot be reset with a seed."""
     layer: Any = env
     while layer is not None:
         parameters = inspect.signature(layer.reset).parameters
@@ -41,19 +128,19 @@ def seed_fault(env: gym.Env) -> str | None:
 
 
 def reset_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | None:
-    """Says what is wrong with what ``reset`` returned; for ``strict`` see :func:`observation_fault`."""
+    """Describes what is wrong with what ``reset`` returned; for ``strict`` see :func:`observation_fault`."""
     if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
         only = observation_fault(space, answer) is None
-        what = "the observation only" if only else f"{described(answer)}"
+        what = "the observation only" if only else f"{describe_value(answer)}"
         return f"reset returned {what}, expected (obs, info); return obs, {{}} if there is nothing to say"
     fault = observation_fault(space, answer[0], strict=strict)
     return None if fault is None else f"reset returned {fault}"
 
 
 def step_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | None:
-    """Says what is wrong with what ``step`` returned; for ``strict`` see :func:`observation_fault`."""
+    """Describes what is wrong with what ``step`` returned; for ``strict`` see :func:`observation_fault`."""
     if not isinstance(answer, tuple) or len(answer) != 5:
-        what = f"{len(answer)} values" if isinstance(answer, tuple) else described(answer)
+        what = f"{len(answer)} values" if isinstance(answer, tuple) else describe_value(answer)
         old = " as in the old package gym" if isinstance(answer, tuple) and len(answer) == 4 else ""
         return f"step returned {what}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
     obs, reward, terminated, truncated, info = answer
@@ -64,12 +151,12 @@ def step_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | 
         or flag_fault("truncated", truncated, strict)
     )
     if fault is None and not isinstance(info, dict):
-        fault = f"the info {described(info)}, expected a dict; return {{}} if there is nothing to say"
+        fault = f"the info {describe_value(info)}, expected a dict; return {{}} if there is nothing to say"
     return None if fault is None else f"step returned {fault}"
 
 
 def reward_fault(reward: Any, strict: bool = False) -> str | None:
-    """Says what is wrong with a reward; if ``strict``, an array of one number and what is not finite are wrong too.
+    """Describes what is wrong with a reward; if ``strict``, an array of one number and what is not finite are wrong too.
 
     The loops look at whether rewards are finite themselves, all of a step at once.
     """
@@ -80,20 +167,20 @@ def reward_fault(reward: Any, strict: bool = False) -> str | None:
         hint = "sum or average it: float(reward.sum())" if np.size(reward) > 1 else "return float(reward[0])"
         return f"a reward of shape {np.shape(reward)}, expected one finite number; {hint}"
     try:
-        number = reward_of(reward)
+        number = to_reward(reward)
     except OverflowError:
         return f"the reward {reward!r:.40}, beyond {LARGEST:.3g}, the largest that float32 holds; scale rewards down"
     except (TypeError, ValueError):
-        return f"the reward {described(reward)}, {fix}"
+        return f"the reward {describe_value(reward)}, {fix}"
     if strict and not np.isfinite(number):
         return f"the reward {reward}, {fix}, and look for divisions by zero"
     return None
 
 
 def flag_fault(name: str, flag: Any, strict: bool = False) -> str | None:
-    """Says what is wrong with ``terminated`` or ``truncated``; if ``strict``, zeros and ones are wrong too."""
+    """Describes what is wrong with ``terminated`` or ``truncated``; if ``strict``, zeros and ones are wrong too."""
     try:
-        flag_of(flag)
+        to_bool(flag)
         fits = not strict or type(flag) in FLAGS
     except (TypeError, ValueError):
         fits = False
@@ -104,20 +191,20 @@ def flag_fault(name: str, flag: Any, strict: bool = False) -> str | None:
 
 
 def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: bool = False) -> str | None:
-    """Says what is wrong with the structure, shape or dtype of one observation.
+    """Describes what is wrong with the structure, shape or dtype of one observation.
 
     Args:
-        space: what is declared.
-        obs: what came.
+        space: the declared space.
+        obs: the value that was returned.
         path: where it sits in the whole observation.
         strict: whether anything else than the declared dtype, a key too many or a list for an array is wrong as well; in
             training these are cast, ignored and turned into arrays.
     """
-    what = name_of(path)
+    what = leaf_name(path)
     if isinstance(space, spaces.Dict):
         keys = sorted(space.spaces)
         if not isinstance(obs, Mapping):
-            return f"{what} as {described(obs)}, expected a dict with the keys {', '.join(keys)}"
+            return f"{what} as {describe_value(obs)}, expected a dict with the keys {', '.join(keys)}"
         missing = [key for key in keys if key not in obs]
         extra = [str(key) for key in obs if key not in space.spaces] if strict else []
         if missing or extra:
@@ -127,7 +214,7 @@ def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: boo
     elif isinstance(space, spaces.Tuple):
         n = len(space.spaces)
         if not isinstance(obs, tuple | list) or len(obs) != n:
-            got = f"{len(obs)} parts" if isinstance(obs, tuple | list) else described(obs)
+            got = f"{len(obs)} parts" if isinstance(obs, tuple | list) else describe_value(obs)
             return f"{what} as {got}, expected a tuple of {n} parts"
         inner = [(str(i), part, one) for i, (part, one) in enumerate(zip(space.spaces, obs, strict=True))]
     else:
@@ -137,18 +224,18 @@ def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: boo
 
 
 def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str | None:
-    """Says what is wrong with one array of an observation."""
+    """Describes what is wrong with one array of an observation."""
     (leaf,) = leaves(space)
     try:
         array = np.asarray(obs)
     except ValueError:
-        return f"{what} as {described(obs)}, expected an array of shape {leaf.shape}"
+        return f"{what} as {describe_value(obs)}, expected an array of shape {leaf.shape}"
     if array.dtype.kind not in "fiub":
-        return f"{what} as {described(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
+        return f"{what} as {describe_value(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
     if array.shape != leaf.shape:
         fix = f"return it with .reshape({leaf.shape})" if array.size == _size(leaf) else "return the declared shape"
         return f"{what} of shape {array.shape}, expected {leaf.shape}; {fix}, or declare {array.shape} in the space"
-    if not keeps(array, leaf.dtype):
+    if not keeps_values(array, leaf.dtype):
         with np.errstate(invalid="ignore", over="ignore"):
             at = tuple(np.argwhere(array.astype(leaf.dtype) != array)[0].tolist())
         fix = "multiply by 255 first if the numbers lie in [0, 1], or " if leaf.kind == "image" else ""
@@ -159,23 +246,23 @@ def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str 
     if strict and isinstance(space, spaces.Box) and array.dtype != space.dtype:
         return f"{what} of dtype {array.dtype}, expected {space.dtype}; return it with .astype(np.{space.dtype})"
     if strict and not isinstance(space, spaces.Discrete) and not isinstance(obs, np.ndarray | np.generic):
-        return f"{what} as {described(obs)}, expected an array; return np.array(..., np.{space.dtype})"
+        return f"{what} as {describe_value(obs)}, expected an array; return np.array(..., np.{space.dtype})"
     return None
 
 
-def finite_fault_of(space: spaces.Space, obs: Any) -> str | None:
-    """Says which number of one observation of the right structure is not finite."""
+def nonfinite_fault(space: spaces.Space, obs: Any) -> str | None:
+    """Describes which number of one observation of the right structure is not finite."""
     named = zip(leaves(space), _values(space, obs), strict=True)
-    said = (_finite_fault(np.asarray(value), name_of(leaf.path)) for leaf, value in named)
+    said = (_array_nonfinite_fault(np.asarray(value), leaf_name(leaf.path)) for leaf, value in named)
     return next((fault for fault in said if fault is not None), None)
 
 
 def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warning"], str] | None:
-    """Says which number of one observation of the right structure lies outside of the declared bounds.
+    """Describes which number of one observation of the right structure lies outside of the declared bounds.
 
     A warning for a Box, whose bounds networks never see; an error for choices and bits, which would have no place in one.
     """
-    for leaf, part, value in zip(leaves(space), parts(space), _values(space, obs), strict=True):
+    for leaf, part, value in zip(leaves(space), leaf_spaces(space), _values(space, obs), strict=True):
         array = np.asarray(value)
         if isinstance(part, spaces.Box):
             low, high = part.low, part.high
@@ -189,18 +276,20 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
             at = tuple(outside[0].tolist())
             more = f" (and {len(outside) - 1} more)" if len(outside) > 1 else ""
             return "warning" if leaf.kind in ("continuous", "image") else "error", (
-                f"{name_of(leaf.path)} with {array[at]}{_place(at)}{more}, outside of the declared bounds "
+                f"{leaf_name(leaf.path)} with {array[at]}{_place(at)}{more}, outside of the declared bounds "
                 f"[{low[at]}, {high[at]}]; declare the bounds that it really has, or clip it"
             )
     return None
 
 
 def far_outside(space: spaces.Space, obs: Any) -> str | None:
-    """Says which number of a batch of observations lies far outside of the declared bounds.
+    """Describes which number of a batch of observations lies far outside of the declared bounds.
 
     Far is ``FAR`` times the distance of the two bounds. Images cannot lie outside, and what is unbounded is not looked at.
     """
-    for leaf, part, array in zip(leaves(space), parts(space), jax.tree.leaves(obs), strict=False):  # a mask may follow
+    for leaf, part, array in zip(
+        leaves(space), leaf_spaces(space), jax.tree.leaves(obs), strict=False
+    ):  # a mask may follow
         if leaf.kind != "continuous":
             continue
         assert isinstance(part, spaces.Box)
@@ -212,13 +301,13 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
             env, *at = outside[0].tolist()
             where = tuple(at)
             return (
-                f"{name_of(leaf.path)} with {array[env, *where]:.4g}{_place(where)} in environment {env}, far outside of "
+                f"{leaf_name(leaf.path)} with {array[env, *where]:.4g}{_place(where)} in environment {env}, far outside of "
                 f"the declared bounds [{part.low[where]:.4g}, {part.high[where]:.4g}]"
             )
     return None
 
 
-def _finite_fault(array: np.ndarray, what: str) -> str | None:
+def _array_nonfinite_fault(array: np.ndarray, what: str) -> str | None:
     if array.dtype.kind != "f" or np.isfinite(array).all():
         return None
     at = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
@@ -241,13 +330,13 @@ def _place(at: tuple[int, ...]) -> str:
     return f" at index {at[0] if len(at) == 1 else at}" if at else ""
 
 
-def name_of(path: str) -> str:
-    """Returns what a leaf of an observation is called in a message."""
+def leaf_name(path: str) -> str:
+    """Returns the name of a leaf of an observation for a message."""
     return f"the observation under {path!r}" if path else "the observation"
 
 
-def described(value: Any) -> str:
-    """Returns a value as it is told to a user: type, and shape or beginning."""
+def describe_value(value: Any) -> str:
+    """Returns a description of a value: its type, and its shape or beginning."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and dtype {value.dtype}"
     if isinstance(value, tuple | list):
@@ -257,10 +346,10 @@ def described(value: Any) -> str:
     return "None" if value is None else f"{value!r:.80} of type {type(value).__name__}"
 
 
-def blamed(env_id: str, env: int | None, n_steps: int, fault: str) -> str:
-    """Returns a message that names the environment, its number in the vector (None: unknown), and the step.
+def with_location(env_id: str, env: int | None, n_steps: int, fault: str) -> str:
+    """Returns a message that starts with the environment, its index in the vector (None: unknown), and the step.
 
-    >>> blamed("Walk", 2, 7, "step returned 4 values")
+    >>> with_location("Walk", 2, 7, "step returned 4 values")
     'Walk, environment 2, step 7: step returned 4 values'
     """
     which = "one of the environments" if env is None else f"environment {env}"
