@@ -1,6 +1,6 @@
 """The few types and functions that every algorithm, replay and loop shares.
 
-An algorithm is four pure functions over one explicit state, held in an :class:`Algorithm`; data flows between the
+An algorithm is a NamedTuple of pure functions over one state, an :class:`Algorithm`. Data flows between the
 environment and the gradient as a :class:`Transition`. Nothing here knows of any particular algorithm.
 """
 

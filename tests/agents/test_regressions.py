@@ -19,8 +19,12 @@ Final observations
   ``agents/test_regressions.py::test_wrappers_change_final_observations_like_all_others``
 
 Advantages
-- generalised advantages were off by one (0.10.0), explained variance had its arguments swapped (0.11.0), time limits
-  did not bootstrap on-policy (1.4.0): does not apply, there is no on-policy algorithm yet; off-policy the last is
+- generalized advantages were off by one (0.10.0):
+  ``algorithms/test_gae.py::test_advantages_equal_the_sum_that_defines_them``
+- explained variance had its arguments swapped (0.11.0):
+  ``algorithms/test_ppo.py::test_explained_variance_is_1_for_exact_values_and_0_for_a_constant``
+- time limits did not bootstrap on-policy (1.4.0):
+  ``algorithms/probes/test_on_policy_probes.py::test_a_time_limit_bootstraps_from_the_state_it_was_reached_in``,
   ``algorithms/probes/test_off_policy_probes.py::test_the_critic_bootstraps_through_a_time_limit``
 
 Targets
@@ -59,10 +63,12 @@ Numbers of environments
 Not a number
 - batches of one (1.1.0, 1.6.1, PPO's): ``algorithms/test_every_algorithm.py::test_batches_of_one_transition_are_learnt_from``,
   ``algorithms/test_every_on_policy.py::test_one_step_at_a_time_is_learnt_from``
-- the checker of environments did not reset them (2.0.0): does not apply, there is none; a reward that is no number ends
-  training: ``agents/test_bad_input.py::test_a_reward_that_is_no_number_ends_training_with_its_place``
-- MaskablePPO's probabilities did not add up to 1 in float32 (2.8.0): does not apply, there is no MaskablePPO;
-  probabilities of 0 are in ``algorithms/test_sac_discrete.py::test_a_certain_policy_has_finite_losses_and_gradients``
+- the checker of environments did not reset them (2.0.0): ``envs/test_checker.py::test_environments_are_checked_and_advised_on``;
+  a reward that is not a number ends training:
+  ``agents/test_bad_input.py::test_a_reward_that_is_no_number_ends_training_with_its_place``
+- MaskablePPO's probabilities did not add up to 1 in float32 (2.8.0):
+  ``envs/test_masks.py::test_learning_knows_the_probabilities_among_what_was_allowed``; probabilities of 0:
+  ``algorithms/test_sac_discrete.py::test_a_certain_policy_has_finite_losses_and_gradients``
 
 Dtypes
 - float64 actions (2.1.0):

@@ -70,7 +70,7 @@ class Recording:
         )
 
     def begin(self, obs: Any, seed: int, frame: np.ndarray) -> None:
-        """Begins an episode; one under way is given up."""
+        """Starts an episode, and ends a running one as truncated."""
         self._end()
         self._buffer = self._buffer_type(seed=seed, observations=copy.deepcopy(obs))
         self._frame = frame
