@@ -158,6 +158,19 @@ def backends() -> str:
     return table(("environment", "`n_envs`", *(f"`{name}`" for name in names)), rows)
 
 
+def overlap() -> str:
+    """Learning with and without the overlap of environments and updates."""
+    rows = []
+    for case, settings in load("overlap.json").items():
+        if isinstance(settings, dict):
+            cells = (
+                f"{found['mean_return']:.1f} ({found['interval'][0]:.1f} to {found['interval'][1]:.1f})"
+                for found in settings.values()
+            )
+            rows.append((case, *cells))
+    return table(("mean return (95 % CI), 5 seeds", "`overlap=True`", "`overlap=False`"), rows)
+
+
 def mountain_car() -> str:
     """The exercise on MountainCar, one row for each seed."""
     rows = [
@@ -237,6 +250,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "speed": speed,
     "backends": backends,
     "mountain-car": mountain_car,
+    "overlap": overlap,
     "lunar-lander": lunar_lander,
     "size": size,
 }

@@ -113,9 +113,13 @@ def layers() -> list[str]:
 
 
 def layering_violations(found: list[tuple[str, str, int]], order: list[str]) -> list[str]:
-    """Returns the imports from a layer further down the list. Every module may be imported by ``__init__``, and it by none."""
+    """Returns the imports from a layer further down the list, and modules that are not in the list.
+
+    ``__init__`` may import everything, and nothing may import from it.
+    """
     rank = {name: i for i, name in enumerate(order)} | {"__init__": len(order), "__main__": len(order)}
-    violations = []
+    listed = (([*name.split("."), "__init__"])[1] for name, *_ in found)
+    violations = [f"rejeu.{name} is not in the list" for name in sorted(set(listed) - rank.keys())]
     for importer, imported, line in found:
         a, b = ([*name.split("."), "__init__"][1] for name in (importer, imported))
         if a in rank and b in rank and rank[a] < rank[b]:

@@ -63,8 +63,8 @@ Numbers of environments
 Not a number
 - batches of one (1.1.0, 1.6.1, PPO's): ``algorithms/test_every_algorithm.py::test_batches_of_one_transition_are_learnt_from``,
   ``algorithms/test_every_on_policy.py::test_one_step_at_a_time_is_learnt_from``
-- the checker of environments did not reset them (2.0.0): ``envs/test_checker.py::test_environments_are_checked_and_advised_on``;
-  a reward that is not a number ends training:
+- the checker of environments did not reset them (2.0.0):
+  ``envs/test_checker.py::test_environments_are_checked_and_advised_on``; a reward that is not a number ends training:
   ``agents/test_bad_input.py::test_a_reward_that_is_no_number_ends_training_with_its_place``
 - MaskablePPO's probabilities did not add up to 1 in float32 (2.8.0):
   ``envs/test_masks.py::test_learning_knows_the_probabilities_among_what_was_allowed``; probabilities of 0:
