@@ -151,14 +151,19 @@ def test_a_preset_is_registered_with_the_algorithm(awac):
     assert presets.find("Pendulum-v1").algorithm != "AWAC"  # rejeu's own stays the first
 
 
-def test_a_name_is_registered_once_and_a_module_may_register_again(awac):
-    assert rejeu.register(awac.AWAC) is awac.AWAC
-
+def test_a_later_registration_replaces_the_earlier_one_but_not_rejeus_own(awac):
     class Other(rejeu.OffPolicyAgent):
         algorithm = awac.AWAC.algorithm
 
-    with pytest.raises(ValueError, match=r"the name 'AWAC' belongs to awac\.AWAC"):
-        rejeu.register(Other)
+    assert rejeu.register(Other) is Other
+    assert rejeu.AGENTS["AWAC"] is Other
+    assert presets.find("Pendulum-v1", "AWAC") is None
+
+    class Own(rejeu.OffPolicyAgent):
+        algorithm = rejeu.SAC.algorithm
+
+    with pytest.raises(ValueError, match="rejeu has an algorithm 'SAC'; choose another"):
+        rejeu.register(Own)
 
 
 def test_the_file_works_as_a_notebook_cell(forget):

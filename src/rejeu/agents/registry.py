@@ -19,9 +19,10 @@ from rejeu.presets import Preset
 
 A = TypeVar("A", bound=type[Agent])
 
-BUILT_IN = (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO)
+KINDS = (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO)
+BUILT_IN: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
 
-AGENTS: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in BUILT_IN}
+AGENTS: dict[str, type[Agent]] = dict(BUILT_IN)
 """Every agent by the name of its algorithm; :func:`register` adds to it."""
 
 ENTRY_POINTS = "rejeu.algorithms"
@@ -31,22 +32,19 @@ ENTRY_POINTS = "rejeu.algorithms"
 def register(agent: A, presets: Iterable[Preset] = ()) -> A:
     """Makes an agent of your own known by the name of its algorithm, and returns it.
 
-    :func:`rejeu.load` and the commands then find it, and ``rejeu train`` uses its presets. To define the class again, as a
-    notebook does, replaces it.
+    :func:`rejeu.load` and the commands then find it, and ``rejeu train`` uses its presets. A later registration of the same
+    name replaces the earlier one, as when a notebook cell is run again.
 
     Args:
         agent: a subclass of :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`.
         presets: tuned settings of this algorithm for some environments.
 
     Raises:
-        ValueError: if another algorithm has this name, or a preset is for another algorithm.
+        ValueError: if rejeu has an algorithm of this name, or a preset is for another algorithm.
     """
     name = agent.algorithm.Config.name
-    other = AGENTS.get(name, agent)
-    if (other.__module__, other.__qualname__) != (agent.__module__, agent.__qualname__):
-        raise ValueError(
-            f"the name {name!r} belongs to {other.__module__}.{other.__qualname__}; choose another Config.name"
-        )
+    if name in BUILT_IN and agent is not BUILT_IN[name]:
+        raise ValueError(f"rejeu has an algorithm {name!r}; choose another Config.name")
     given = tuple(presets)
     for preset in given:
         if preset.algorithm != name:
@@ -65,10 +63,11 @@ def find_agent(name: str) -> type[Agent]:
         ValueError: if there is no such algorithm, with the nearest name.
     """
     known = {key.lower(): key for key in AGENTS}
-    if name.lower() not in known and (found := entry_point(name)) is not None:
-        return register(found.load())
     if name.lower() in known:
         return AGENTS[known[name.lower()]]
+    if (found := entry_point(name)) is not None:
+        agent = found.load()
+        return agent if agent in AGENTS.values() else register(agent)
     near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
     hint = f"did you mean {known[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
     raise ValueError(f"no algorithm is called {name!r}; {hint} --import MODULE imports one that registers others")

@@ -1,0 +1,45 @@
+"""A script that uses the package type-checks: the package has ``py.typed``, and its lazy names are visible."""
+
+import subprocess
+import sys
+from importlib import resources
+
+SCRIPT = """
+import gymnasium as gym
+import numpy as np
+
+import rejeu
+from rejeu.callbacks import Checkpoint, Evaluate
+
+env: gym.Env = gym.make("Pendulum-v1")
+agent = rejeu.SAC("MlpPolicy", env, learning_rate=1e-3, seed=0)
+agent = agent.learn(1_000, [Checkpoint("checkpoints", minutes=5)])
+reveal_type(agent)
+action, state = agent.predict(np.zeros(3, np.float32))
+reveal_type(action)
+loaded: rejeu.SAC = rejeu.SAC.load("model")
+rejeu.register(rejeu.SAC)
+vector = rejeu.make_vec("Pendulum-v1", 2)
+batch = rejeu.Transition(0, 0, 0.0, 0, 1.0)
+print(batch.reward, vector.n_envs)
+rejeu.SACC
+agent.lern(3)
+"""
+
+
+def test_a_script_type_checks_and_its_mistakes_are_found(tmp_path):
+    assert resources.files("rejeu").joinpath("py.typed").is_file()
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--no-incremental", "--follow-imports=silent", "--strict", str(script)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    errors = [line for line in done.stdout.splitlines() if ": error:" in line]
+    assert len(errors) == 2, done.stdout
+    assert 'Module has no attribute "SACC"' in errors[0]
+    assert '"SAC" has no attribute "lern"' in errors[1]
+    assert 'Revealed type is "rejeu.agents.off_policy.SAC"' in done.stdout
