@@ -252,3 +252,28 @@ def test_a_strategy_is_given_by_string_or_enum(strategy):
 def test_impossible_settings_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         HindsightConfig(**settings)
+
+
+FUNCTIONS = {
+    "final": lambda rng, time, first, last: last,
+    "future": lambda rng, time, first, last: time + 1 + (rng.random(len(time)) * (last - time)).astype(np.int64),
+    "episode": lambda rng, time, first, last: first + (rng.random(len(time)) * (last - first + 1)).astype(np.int64),
+}
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("strategy", FUNCTIONS)
+def test_a_function_as_strategy_draws_what_the_named_one_does(strategy, n_envs):
+    history = RUNNING_AND_WRAPPED if n_envs == 1 else [turn("no", "no")] * 6
+    named, _ = filled(n_envs, 16, history, strategy)
+    own, _ = filled(n_envs, 16, history, FUNCTIONS[strategy])
+    one, two = (buffer.sample(np.random.default_rng(0), (200,)) for buffer in (named, own))
+    np.testing.assert_array_equal(one.obs["desired_goal"], two.obs["desired_goal"])
+    np.testing.assert_array_equal(one.reward, two.reward)
+
+
+@pytest.mark.parametrize("chosen", [lambda last: last + 1, lambda last: last[1:], lambda last: last + 0.0])
+def test_a_function_that_leaves_the_episode_is_refused(chosen):
+    replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, lambda rng, time, first, last: chosen(last))
+    with pytest.raises(ValueError, match="must return whole numbers from first to last"):
+        replay.sample(np.random.default_rng(0), (40,))

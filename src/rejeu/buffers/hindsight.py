@@ -16,7 +16,7 @@ kept as it was elsewhere: a crash remains a crash.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -49,28 +49,39 @@ class GoalSelectionStrategy(str, Enum):
     RANDOM = "random"
 
 
+GoalStrategy = Callable[[np.random.Generator, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""A goal strategy of your own: ``strategy(rng, time, first, last) -> times``.
+
+All arrays have one entry for each relabeled transition, ``int64 (n,)``. ``time`` is when it began; its next observation is at
+``time + 1``. The result says at which time of the same episode the achieved goal is taken, from ``first``, the first time kept
+after a step, to ``last``, the last so far. ``future`` is ``rng.integers(time + 1, last + 1)``, ``final`` is ``last``."""
+
+
 @dataclass(frozen=True)
 class HindsightConfig:
     """Settings of hindsight replay (Stable-Baselines3's ``replay_buffer_kwargs``)."""
 
     n_sampled_goal: int = 4
     """Relabelled transitions per original one. Raising it learns more from failures and less from the real goals."""
-    goal_selection_strategy: str = "future"
-    """``future``, ``final``, ``episode`` or ``random``, or a ``GoalSelectionStrategy``."""
+    goal_selection_strategy: str | GoalStrategy = "future"
+    """``future``, ``final``, ``episode`` or ``random``, a ``GoalSelectionStrategy``, or a function
+    ``(rng, time, first, last) -> times``: see ``rejeu.buffers.hindsight.GoalStrategy``."""
     copy_info_dict: bool = False
     """Accepted for Stable-Baselines3's sake; rejeu computes rewards without info, so only False is possible."""
 
     def __post_init__(self) -> None:
         if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
             raise ValueError(f"n_sampled_goal={self.n_sampled_goal!r} must be a whole number of at least 0")
-        try:
-            strategy = GoalSelectionStrategy(self.goal_selection_strategy)
-        except ValueError:
-            known = ", ".join(s.value for s in GoalSelectionStrategy)
-            raise ValueError(
-                f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}"
-            ) from None
-        object.__setattr__(self, "goal_selection_strategy", strategy.value)
+        if not callable(self.goal_selection_strategy):
+            try:
+                strategy = GoalSelectionStrategy(self.goal_selection_strategy)
+            except ValueError:
+                known = ", ".join(s.value for s in GoalSelectionStrategy)
+                raise ValueError(
+                    f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}, or a function "
+                    "(rng, time, first, last) -> times, of which a file holds only the name: give it again to load"
+                ) from None
+            object.__setattr__(self, "goal_selection_strategy", strategy.value)
         if self.copy_info_dict:
             raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
 
@@ -83,7 +94,8 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     """
     if config is None or config.goal_selection_strategy == "random":
         return ()
-    return ("since_start", "until_end") if config.goal_selection_strategy == "episode" else ("until_end",)
+    of_episode = callable(config.goal_selection_strategy) or config.goal_selection_strategy == "episode"
+    return ("since_start", "until_end") if of_episode else ("until_end",)
 
 
 class HerReplayBuffer:
@@ -190,6 +202,8 @@ class HerReplayBuffer:
         The rows are given by environment and time, ``(n,)``; ``step`` is what the ring holds of them, records ``(n,)``.
         """
         ring, strategy = self.ring, self.config.goal_selection_strategy
+        if callable(strategy):
+            return custom_goal_index(strategy, ring, rng, env, time, step)
         if strategy == "random":
             other = ring.draw(rng, len(step))
             return ring.index(other.env, other.time + 1)
@@ -242,3 +256,21 @@ def relabelled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     chosen = np.zeros(shape, bool)
     chosen[..., :n] = True
     return np.flatnonzero(chosen)
+
+
+def custom_goal_index(
+    strategy: GoalStrategy, ring: Ring, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray
+) -> np.ndarray:
+    """Returns the positions of the rows whose achieved goals become the new goals, by a function; see ``_goal_index``.
+
+    Raises:
+        ValueError: if a time is outside of the episode.
+    """
+    first = time - np.minimum(step["since_start"], time - ring.oldest()[env]) + 1
+    last = time + np.where(step["until_end"], step["until_end"], ring.head[env] - time)
+    times = np.asarray(strategy(rng, time, first, last))
+    if times.shape != time.shape or times.dtype.kind not in "iu" or ((times < first) | (times > last)).any():
+        raise ValueError(
+            "goal_selection_strategy must return whole numbers from first to last, one for each transition"
+        )
+    return ring.index(env, times)
