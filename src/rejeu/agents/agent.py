@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,14 +12,14 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy, resume, training
 from rejeu.agents.base import BaseAgent
-from rejeu.agents.description import ClassOnly
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
+from rejeu.envs.adapters import vec_env_view
 from rejeu.envs.masks import split
 from rejeu.io import checkpoint
 from rejeu.reporting import summary
 from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.logging import Sink
+from rejeu.reporting.logging import Logger, Sink
 
 
 class Agent(BaseAgent):
@@ -217,9 +217,107 @@ class Agent(BaseAgent):
         """Returns a folder for the checkpoints of its run, which :class:`rejeu.callbacks.Checkpoint` writes."""
         return run_folder(self, Path(folder))
 
+    def get_env(self) -> Any:
+        """Returns the training environments with the interface of Stable-Baselines3's ``VecEnv``; None if there are none.
+
+        That is the vector environment that was given, if it resets itself; a Gymnasium environment is returned in a
+        ``DummyVecEnv``. Its running episodes are abandoned: the next ``learn`` starts new ones. Do not step it during
+        ``learn``.
+        """
+        env = self.run.env
+        if env is None:
+            return None
+        if not self.is_learning:
+            self.abandon_episodes()
+        if env.venv is None:
+            env.venv = vec_env_view(env)
+        return env.venv
+
+    def set_logger(self, logger: Logger) -> None:
+        """Replaces console and TensorBoard by the outputs of a logger."""
+        self.logger = logger
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Replaces the environment by another with the same spaces; new episodes start there.
+
+        If the number of environments changes, a replay buffer starts empty, and ``learning_starts`` steps are taken before
+        the next gradient step, as after ``load``. Otherwise the buffer is kept.
+
+        Raises:
+            ValueError: if the spaces differ.
+            RuntimeError: during ``learn``.
+        """
+        if self.is_learning:
+            raise RuntimeError(
+                "set_env was called while the agent learns; stop training first (a callback that returns False), then "
+                "call set_env and learn(..., reset_num_timesteps=False)"
+            )
+        vector = self.make_envs(env, 1, seed=self.seed)
+        self.check_spaces(vector, "the new environment")
+        self.made_from_id = isinstance(env, str)
+        run = self.run
+        if run.env is None or run.env.n_envs != vector.n_envs:
+            run.replay = self.make_buffer(vector)
+            run.td_errors = []
+            run.carry = self.learner.initial_carry(vector.n_envs)
+            run.learn_from = self.first_learning_step(run.step)
+        else:
+            self.keep_buffer(vector)
+        run.env = vector
+        run.obs = run.action = None
+        run.ended = np.ones(vector.n_envs, bool)
+
+    def get_parameters(self) -> dict[str, np.ndarray]:
+        """Returns a copy of the algorithm's state as arrays by name: networks, targets, optimizers, counters."""
+        return {key: value.copy() for key, value in checkpoint.tree_to_arrays(self.state).items()}
+
+    def set_parameters(
+        self, load_path_or_dict: Mapping[str, np.ndarray] | str | Path, exact_match: bool = True
+    ) -> None:
+        """Sets parameters from :meth:`get_parameters` or from a model file.
+
+        Args:
+            load_path_or_dict: arrays by name, or a path.
+            exact_match: require all parameters; False sets those that are given and keeps the others.
+
+        Raises:
+            CheckpointError: if a name, shape or dtype does not match; the agent is then unchanged.
+        """
+        source = load_path_or_dict
+        if isinstance(source, str | Path):
+            path = source
+            with checkpoint.opened(path, "agent") as file:
+                shapes = self.learner.shapes
+                own = {} if exact_match else dict(zip(checkpoint.names(shapes), jax.tree.leaves(shapes), strict=True))
+                checkpoint.match(shapes, {**own, **file.specs}, path)
+                source = file.read()
+            checkpoint.require_finite(source, path)
+        arrays = {key: np.asarray(value) for key, value in source.items()}
+        if not exact_match:
+            arrays = self.get_parameters() | arrays
+        state = checkpoint.arrays_to_tree(self.learner.shapes, arrays, "set_parameters: the source")
+        self.run.state = self.learner.pack(state)
+        self.drop_rollout()
+
     def summary(self) -> str:
         """Returns a drawing of the networks in text, with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""
         return summary.describe(self.learner.shapes, self.obs_leaves)
+
+
+class ClassOnly:
+    """Makes ``load`` raise an error on an instance, where it would silently leave that instance as it was."""
+
+    def __init__(self, method: Any) -> None:
+        self.method = method
+        self.__doc__ = method.__func__.__doc__
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is not None:
+            raise TypeError(
+                f"load is called on the class and returns a new agent: agent = {owner.__name__}.load(path); "
+                "to change this one in place use agent.set_parameters(path)"
+            )
+        return self.method.__get__(None, owner)
 
 
 Agent.load = ClassOnly(Agent.__dict__["load"])  # type: ignore[method-assign,assignment]

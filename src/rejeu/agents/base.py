@@ -19,14 +19,11 @@ import jax
 import numpy as np
 
 from rejeu import spaces, validation, xla
-from rejeu.agents.description import AGENT_ARGUMENTS, Documentation, Signature
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import RunFolder, Stateful
-from rejeu.envs.adapters import vec_env_view
 from rejeu.envs.make import Backend, VectorEnv
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
-from rejeu.io import checkpoint
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops import finite
 from rejeu.loops.learner import Learner, PackedState
@@ -39,6 +36,21 @@ from rejeu.reporting.logging import Logger
 BEST_WINDOW = 20
 """Default number of training episodes over whose mean return the best weights are chosen."""
 POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
+AGENT_ARGUMENTS = {
+    "policy": "``MlpPolicy``, ``MultiInputPolicy`` (Dict observations) or ``CnnPolicy`` (images). All three build what "
+    "the observation space needs; a name that does not fit the space is an error.",
+    "env": "An id, a Gymnasium environment, a function that makes one, or a vector environment.",
+    "seed": "Seed of networks, exploration, batches and environments. None draws one.",
+    "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
+    "tensorboard_log": "Folder for TensorBoard logs, None for none.",
+    "stats_window_size": "Episodes over which reported means are taken.",
+    "success_threshold": "Least return of a successful episode where the environment does not report success; None: "
+    "the environment's own reward threshold, if it has one.",
+    "best_window": "Training episodes over whose mean return the best weights are chosen; 1 keeps those of the best "
+    "episode. A larger value is less affected by chance.",
+    "device": "Accepted for compatibility with Stable-Baselines3; JAX chooses the device (environment variable JAX_PLATFORMS).",
+}
+"""Arguments of every agent in addition to its hyperparameters, with their meanings."""
 
 
 class Best(NamedTuple):
@@ -301,60 +313,10 @@ class BaseAgent(ABC):
     def with_masks(self, obs: Any, masks: Any) -> Any:
         """Returns a batch of observations together with action masks, if the algorithm takes any."""
 
-    def get_env(self) -> Any:
-        """Returns the training environments with the interface of Stable-Baselines3's ``VecEnv``; None if there are none.
-
-        That is the vector environment that was given, if it resets itself; a Gymnasium environment is returned in a
-        ``DummyVecEnv``. Its running episodes are abandoned: the next ``learn`` starts new ones. Do not step it during
-        ``learn``.
-        """
-        env = self.run.env
-        if env is None:
-            return None
-        if not self.is_learning:
-            self.abandon_episodes()
-        if env.venv is None:
-            env.venv = vec_env_view(env)
-        return env.venv
-
-    def set_logger(self, logger: Logger) -> None:
-        """Replaces console and TensorBoard by the outputs of a logger."""
-        self.logger = logger
-
     def get_vec_normalize_env(self) -> Any:
         """Returns the ``VecNormalize`` around the training environments, or None."""
         env = self.run.env
         return None if env is None else env.vec_normalize
-
-    def set_env(self, env: Any, force_reset: bool = True) -> None:
-        """Replaces the environment by another with the same spaces; new episodes start there.
-
-        If the number of environments changes, a replay buffer starts empty, and ``learning_starts`` steps are taken before
-        the next gradient step, as after ``load``. Otherwise the buffer is kept.
-
-        Raises:
-            ValueError: if the spaces differ.
-            RuntimeError: during ``learn``.
-        """
-        if self.is_learning:
-            raise RuntimeError(
-                "set_env was called while the agent learns; stop training first (a callback that returns False), then "
-                "call set_env and learn(..., reset_num_timesteps=False)"
-            )
-        vector = self.make_envs(env, 1, seed=self.seed)
-        self.check_spaces(vector, "the new environment")
-        self.made_from_id = isinstance(env, str)
-        run = self.run
-        if run.env is None or run.env.n_envs != vector.n_envs:
-            run.replay = self.make_buffer(vector)
-            run.td_errors = []
-            run.carry = self.learner.initial_carry(vector.n_envs)
-            run.learn_from = self.first_learning_step(run.step)
-        else:
-            self.keep_buffer(vector)
-        run.env = vector
-        run.obs = run.action = None
-        run.ended = np.ones(vector.n_envs, bool)
 
     def check_spaces(self, vector: VectorEnv, what: str) -> None:
         """Raises ``ValueError`` if environments, called ``what`` in the message, have other spaces than the agent."""
@@ -362,38 +324,6 @@ class BaseAgent(ABC):
             own, other = getattr(self, f"{kind}_space"), getattr(vector, f"{kind}_space")
             if not spaces.same(own, other, bounds=kind == "action"):
                 raise ValueError(f"{what} has the {kind} space {other}, and this agent was made for {own}")
-
-    def get_parameters(self) -> dict[str, np.ndarray]:
-        """Returns a copy of the algorithm's state as arrays by name: networks, targets, optimizers, counters."""
-        return {key: value.copy() for key, value in checkpoint.tree_to_arrays(self.state).items()}
-
-    def set_parameters(
-        self, load_path_or_dict: Mapping[str, np.ndarray] | str | Path, exact_match: bool = True
-    ) -> None:
-        """Sets parameters from :meth:`get_parameters` or from a model file.
-
-        Args:
-            load_path_or_dict: arrays by name, or a path.
-            exact_match: require all parameters; False sets those that are given and keeps the others.
-
-        Raises:
-            CheckpointError: if a name, shape or dtype does not match; the agent is then unchanged.
-        """
-        source = load_path_or_dict
-        if isinstance(source, str | Path):
-            path = source
-            with checkpoint.opened(path, "agent") as file:
-                shapes = self.learner.shapes
-                own = {} if exact_match else dict(zip(checkpoint.names(shapes), jax.tree.leaves(shapes), strict=True))
-                checkpoint.match(shapes, {**own, **file.specs}, path)
-                source = file.read()
-            checkpoint.require_finite(source, path)
-        arrays = {key: np.asarray(value) for key, value in source.items()}
-        if not exact_match:
-            arrays = self.get_parameters() | arrays
-        state = checkpoint.arrays_to_tree(self.learner.shapes, arrays, "set_parameters: the source")
-        self.run.state = self.learner.pack(state)
-        self.drop_rollout()
 
     def __repr__(self) -> str:
         where = self.run.env.env_id if self.run.env is not None else "no environment"
@@ -404,6 +334,41 @@ class BaseAgent(ABC):
         if "algorithm" in cls.__dict__:
             cls.__doc__ = Documentation(cls.__doc__)  # type: ignore[assignment]
             cls.__signature__ = Signature(inspect.signature(BaseAgent.__init__))  # type: ignore[attr-defined]
+
+
+class Documentation:
+    """A class attribute ``__doc__``: the docstring of the class, of its configuration and of every hyperparameter."""
+
+    def __init__(self, text: str | None) -> None:
+        self.text = inspect.cleandoc(text or "")
+
+    def __get__(self, instance: Any, owner: type) -> str:
+        config = owner.algorithm.Config  # type: ignore[attr-defined]
+        docs = validation.field_docs(config)
+        lines = [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
+        for key, default in validation.field_defaults(config).items():
+            text = f"{docs[key]} " if key in docs else ""
+            lines.append(
+                f"    {key}: {text}" + ("" if default is inspect.Parameter.empty else f"Default: {default!r}.")
+            )
+        about = inspect.cleandoc(config.__doc__ or "")
+        return "\n".join([self.text, "", about, "", "Args:", *lines])
+
+
+class Signature:
+    """A class attribute ``__signature__``: what every agent takes, then the hyperparameters."""
+
+    def __init__(self, common: inspect.Signature) -> None:
+        self.common = common
+        """Of an agent's constructor, whose last parameter stands for the hyperparameters."""
+
+    def __get__(self, instance: Any, owner: type) -> inspect.Signature:
+        config = owner.algorithm.Config  # type: ignore[attr-defined]
+        hyperparameters = [
+            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default)
+            for key, default in validation.field_defaults(config).items()
+        ]
+        return inspect.Signature([*list(self.common.parameters.values())[1:-1], *hyperparameters])
 
 
 def whole_seed(seed: Any) -> int:

@@ -13,8 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from rejeu import spaces, validation, xla
-from rejeu.agents.base import BEST_WINDOW, BaseAgent, check_policy, whole_seed
-from rejeu.agents.description import AGENT_ARGUMENTS
+from rejeu.agents.base import AGENT_ARGUMENTS, BEST_WINDOW, BaseAgent, check_policy, whole_seed
 from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
