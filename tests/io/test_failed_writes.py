@@ -114,6 +114,23 @@ def test_an_episode_table_that_does_not_fit_leaves_the_old_one(tmp_path, disk):
     assert path.read_bytes() == before
 
 
+def test_rows_that_wait_are_written_when_an_error_ends_training(tmp_path, disk):
+    def fail(agent, turn):
+        disk.full = 25 <= turn.step < 95
+        if turn.step == 95:
+            raise RuntimeError("stopped by the test")
+
+    def learn(folder, *callbacks):
+        agent, table = small_sac(BALL), CsvFile(folder / "metrics.csv")
+        agent.learn(94 if not callbacks else 100, callbacks, log_interval=1, sinks=[table])
+
+    learn(tmp_path / "whole")
+    with pytest.warns(UserWarning, match="No space left"), pytest.raises(RuntimeError, match="stopped by the test"):
+        learn(tmp_path / "full", fail)
+    steps = [[row["step"] for row in rows(tmp_path / name / "metrics.csv")] for name in ("whole", "full")]
+    assert steps[0] == steps[1] != []
+
+
 def test_training_continues_while_the_disk_is_full_and_nothing_is_lost_after_it(tmp_path, disk):
     def learn(folder, *more):
         agent = small_sac(BALL)

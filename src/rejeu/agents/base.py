@@ -48,7 +48,7 @@ AGENT_ARGUMENTS = {
     "the environment's own reward threshold, if it has one.",
     "best_window": "Training episodes over whose mean return the best weights are chosen; 1 keeps those of the best "
     "episode. A larger value is less affected by chance.",
-    "device": "Accepted for compatibility with Stable-Baselines3; JAX chooses the device (environment variable JAX_PLATFORMS).",
+    "device": "Accepted for compatibility with Stable-Baselines3; JAX chooses the device (see JAX_PLATFORMS).",
 }
 """Arguments of every agent in addition to its hyperparameters, with their meanings."""
 
