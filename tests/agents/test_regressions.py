@@ -82,7 +82,7 @@ Files
 - models beyond 2 GB (1.6.0) and buffers beyond 4 GB (0.11.0):
   ``agents/test_regressions.py::test_a_file_of_more_than_4_gigabytes_comes_back``, marked slow
 - an object that could not be read was replaced by another (1.7.0):
-  ``io/test_no_code_from_files.py::test_no_source_runs_or_looks_up_what_a_file_names``,
+  ``io/test_no_code_from_files.py::test_ruff_reports_what_could_run_a_file``,
   ``networks/test_networks.py::test_a_saved_torso_must_be_given_again``
 - functions as schedules crashed on other platforms (2.7.0):
   ``test_schedules.py::test_what_is_no_schedule_is_refused_by_name``,
