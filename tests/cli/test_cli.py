@@ -406,7 +406,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path):
         str(tmp_path / "cut"),
     ]  # this process may have another thread count
     resumed = subprocess.run(resume, capture_output=True, text=True, check=True)
-    assert re.search(r"resumed at step [\d,]+, exactly where it stood", resumed.stdout), resumed.stdout
+    assert re.search(r"resumed at step [\d,]+, exactly as it was saved", resumed.stdout), resumed.stdout
     for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
         assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
     one, two = (rejeu.load(tmp_path / run / "agent.safetensors").get_parameters() for run in ("whole", "cut"))

@@ -79,7 +79,7 @@ class Resumed(NamedTuple):
     """Errors of the newer checkpoints that could not be read, newest first."""
 
     def __str__(self) -> str:
-        return f"resumed at step {self.step:,}, {'exactly where it stood' if self.exact else self.reason}"
+        return f"resumed at step {self.step:,}, {'exactly as it was saved' if self.exact else self.reason}"
 
 
 class BaseAgent(ABC):

@@ -169,7 +169,7 @@ def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
         return Resumed(agent.run.step, True, "")
     return Resumed(
         agent.run.step, False,
-        f"where it stood, but JAX computes with {here} threads here and had {before}, so results may differ in their last "
+        f"as it was saved, but JAX computes with {here} threads here and had {before}, so results may differ in their last "
         f"bits; resume in a new process, with the environment variable {xla.THREADS}={before} if JAX is used before",
     )  # fmt: skip
 
