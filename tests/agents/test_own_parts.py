@@ -1,0 +1,65 @@
+"""A subclass replaces the replay buffer, the noise or the loop of an agent by overriding one method."""
+
+import numpy as np
+
+import rejeu
+from rejeu.agents import OffPolicyAgent
+from rejeu.algorithms import sac
+from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.callbacks import Checkpoint
+from rejeu.exploration.noise import NormalActionNoise
+from tests.helpers import small_sac
+
+SMALL = {"learning_starts": 8, "batch_size": 4, "buffer_size": 300, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
+BALL = "rejeu/Ball-v0"
+
+
+class Counted(ReplayBuffer):
+    """Counts its draws."""
+
+    def draw(self, rng, shape, progress=1.0):
+        batch, drawn = super().draw(rng, shape, progress)
+        self.n_draws = getattr(self, "n_draws", 0) + 1
+        return batch, drawn
+
+
+class OwnSAC(OffPolicyAgent):
+    """SAC with a buffer, a loop and noise of its own."""
+
+    algorithm = sac
+
+    def make_buffer(self, env):
+        usual = super().make_buffer(env)
+        return Counted(usual.ring, usual.gamma, usual.n_steps, usual.priorities, usual.each_reward)
+
+    def make_noise(self):
+        return NormalActionNoise(np.zeros(self.action_space.shape), np.full(self.action_space.shape, 0.1))
+
+    def loop(self, n_steps, progress):
+        self.turns = 0
+        for turn in super().loop(n_steps, progress):
+            self.turns += 1
+            yield turn
+
+
+def test_a_subclass_replaces_buffer_loop_and_noise():
+    agent = OwnSAC("MlpPolicy", BALL, **SMALL).learn(20)
+    assert isinstance(agent.replay_buffer, Counted)
+    assert agent.replay_buffer.n_draws == agent.n_updates == 12
+    assert agent.turns == 20
+    plain = small_sac(BALL).learn(20)
+    assert any((plain.get_parameters()[name] != array).any() for name, array in agent.get_parameters().items())
+
+
+def test_an_agent_with_own_parts_is_loaded_and_resumed(tmp_path):
+    whole = OwnSAC("MlpPolicy", BALL, **SMALL).learn(40)
+    stop = lambda agent, progress: progress.step < 20  # noqa: E731
+    OwnSAC("MlpPolicy", BALL, **SMALL).learn(40, [Checkpoint(tmp_path / "run", every=100), stop])
+    again = OwnSAC.resume(tmp_path / "run").learn()
+    assert again.resumed.exact
+    assert isinstance(again.replay_buffer, Counted)
+    for name, array in whole.get_parameters().items():
+        np.testing.assert_array_equal(again.get_parameters()[name], array)
+    loaded = OwnSAC.load(again.save(tmp_path / "model"), BALL)
+    assert isinstance(loaded.replay_buffer, Counted)
+    assert rejeu.SAC.load(tmp_path / "model").num_timesteps == 40
