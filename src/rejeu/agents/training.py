@@ -18,11 +18,10 @@ from rejeu.callbacks.base import Callback, Stateful, TrainingCallback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.errors import CheckpointError
 from rejeu.interrupt import Interrupt
-from rejeu.io.failed_writes import RetryingSink
 from rejeu.loops import finite
 from rejeu.loops.run import Episode, Progress, time_shares
 from rejeu.loops.training_call import TrainingCall
-from rejeu.reporting.logging import Console, Sink, TensorBoard, next_folder
+from rejeu.reporting.logging import Console, RetryingSink, Sink, TensorBoard, next_folder
 from rejeu.reporting.text import counted
 from rejeu.validation import number, whole
 

@@ -19,10 +19,9 @@ from rejeu.cli.output import echo, reporter, summary
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.envs.make import VectorEnv
 from rejeu.interrupt import Interrupt, leaving
-from rejeu.io.failed_writes import RetryingSink
 from rejeu.loops.run import Progress
 from rejeu.reporting import plots
-from rejeu.reporting.logging import CsvFile
+from rejeu.reporting.logging import CsvFile, RetryingSink
 from rejeu.reporting.video import record_video
 
 VIDEO_EPISODES = 3

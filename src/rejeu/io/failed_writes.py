@@ -7,11 +7,9 @@ import os
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
-
-from rejeu.reporting.logging import Sink
 
 RETRY_SECONDS = 60.0
 """Seconds between two attempts at a write that failed."""
@@ -147,20 +145,3 @@ class FailedWrites:
             self._retry_at = min(self._retry_at, time.monotonic() + RETRY_SECONDS)
         if is_new:
             warnings.warn(text, UserWarning, stacklevel=3)
-
-
-class RetryingSink:
-    """A sink whose rows are queued while they cannot be written."""
-
-    def __init__(self, sink: Sink, failed: FailedWrites) -> None:
-        self.sink = sink
-        self._what = f"rows of {sink}"
-        self._failed = failed
-
-    def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Writes the metrics of environment step ``step``."""
-        self._failed.put(self._what, self.sink.write, step, dict(metrics))
-
-    def close(self) -> None:
-        """Closes the sink."""
-        self._failed.attempt(self._what, self.sink.close, retry=False)

@@ -17,6 +17,7 @@ import numpy as np
 
 from rejeu.errors import MissingExtra
 from rejeu.io import atomic
+from rejeu.io.failed_writes import FailedWrites
 from rejeu.reporting.notebook import Display
 
 
@@ -294,3 +295,20 @@ def next_folder(root: str | Path, name: str) -> Path:
     while (root / f"{name}_{k}").exists():
         k += 1
     return root / f"{name}_{k}"
+
+
+class RetryingSink:
+    """A sink whose rows are queued while they cannot be written."""
+
+    def __init__(self, sink: Sink, failed: FailedWrites) -> None:
+        self.sink = sink
+        self._what = f"rows of {sink}"
+        self._failed = failed
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Writes the metrics of environment step ``step``."""
+        self._failed.put(self._what, self.sink.write, step, dict(metrics))
+
+    def close(self) -> None:
+        """Closes the sink."""
+        self._failed.attempt(self._what, self.sink.close, retry=False)
