@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import json
 from typing import Any
-from unittest import mock
 
 import gymnasium as gym
 import jax
@@ -13,34 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import rejeu
-from rejeu import agents, spaces
-from rejeu.algorithms import sac
-from rejeu.core import Algorithm
-from rejeu.loops.learner import Learner
 from rejeu.loops.packing import Readings
-
-_algorithms: dict[Any, Algorithm] = {}
-_compiled: dict[Any, Learner] = {}
-
-
-def _make(config: sac.Config, observation_space: gym.Space, action_space: gym.Space, make: Any = sac.make) -> Algorithm:
-    key = config, json.dumps([spaces.describe(observation_space), spaces.describe(action_space)])
-    if key not in _algorithms:
-        _algorithms[key] = make(config, observation_space, action_space)
-    return _algorithms[key]
-
-
-def _compile(algorithm: Algorithm, *arguments: Any) -> Learner:
-    key = algorithm, *arguments
-    if key not in _compiled:
-        _compiled[key] = Learner(algorithm, *arguments)
-    return copy.copy(_compiled[key])
+from tests.sharing import shared_learners
 
 
 def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
     """A SAC with one narrow layer and batches of 4 that learns from step 8 on.
 
-    Agents of equal settings and spaces share their compiled functions, which are pure: building them dominates otherwise.
+    Agents of equal settings and spaces share their compiled functions.
     """
     given = env.observation_space if isinstance(env, gym.Env) else getattr(env, "observation_space", None)
     nested = isinstance(given, gym.spaces.Dict | gym.spaces.Tuple)
@@ -52,7 +29,7 @@ def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
         "seed": 0,
         **settings,
     }
-    with mock.patch.object(sac, "make", _make), mock.patch.object(agents.base, "Learner", _compile):
+    with shared_learners():
         return rejeu.SAC("MultiInputPolicy" if nested else "MlpPolicy", env, **settings)
 
 

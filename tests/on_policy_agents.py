@@ -1,4 +1,4 @@
-"""Small on-policy agents on every kind of action that they take, sharing what is compiled (see ``every_agent``)."""
+"""Small on-policy agents on every kind of action that they take, sharing what is compiled (see ``sharing``)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import rejeu
 from rejeu import agents
 from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Bitwise, Discretely, Doubly, Probe
-from tests.every_agent import shared_functions
+from tests.sharing import shared_learners
 
 
 class Kind(NamedTuple):
@@ -33,12 +33,12 @@ class Kind(NamedTuple):
 
     def small(self, env: Any, **settings: Any) -> agents.Agent:
         """A small agent of this kind."""
-        with shared_functions(self):
+        with shared_learners():
             return self.agent("MlpPolicy", env, **{**LEARNING, **self.settings, **settings})
 
     def load(self, path: Any, **settings: Any) -> agents.Agent:
         """The agent of a file, sharing what is compiled."""
-        with shared_functions(self):
+        with shared_learners():
             return rejeu.load(path, **settings)
 
     def numbers(self, actions: np.ndarray) -> np.ndarray:

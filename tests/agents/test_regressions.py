@@ -149,9 +149,10 @@ from rejeu.reporting.logging import Console, CsvFile
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter, Reach, Sampled
-from tests.every_agent import KINDS, env_of, shared_functions, small
+from tests.every_agent import KINDS, env_of, small
 from tests.helpers import assert_same_parameters, count_updates, small_sac
 from tests.reporting.test_video import Lamp
+from tests.sharing import shared_learners
 from tests.tiers import only
 
 NEVER = 10**6
@@ -316,7 +317,7 @@ def test_settings_are_the_same_after_any_number_of_savings(name, tmp_path):
     agent = small(kind, make(3), target_update_interval=12, train_freq=6)
     path, config = agent.save(tmp_path / "model"), agent.config
     for n_envs in (3, 1, 8):
-        with shared_functions(kind):
+        with shared_learners():
             loaded = rejeu.load(path, env=make(n_envs))
         assert loaded.config == config
         assert loaded.config.target_update_interval == 12
@@ -331,7 +332,7 @@ def test_a_loaded_agent_learns_with_any_number_of_environments(kind, tmp_path):
     make = lambda n: InProcess([env_of(kind) for _ in range(n)])  # noqa: E731
     path = small(kind, make(3), learning_starts=16, train_freq=8).learn(40).save(tmp_path / "model")
     for n_envs in (1, 8):
-        with shared_functions(kind):
+        with shared_learners():
             loaded = rejeu.load(path, env=make(n_envs), learning_starts=8)
         assert loaded.n_envs == n_envs
         loaded.learn(8 + 17)
@@ -540,7 +541,7 @@ def test_every_kind_of_noise_survives_saving(noise, tmp_path):
     agent.save(path)
     runs = []
     for _ in range(2):
-        with shared_functions(kind):
+        with shared_learners():
             loaded = rejeu.load(path, env=env_of(kind), learning_starts=0)
         assert_same_parameters(agent, loaded)
         assert loaded.config.action_noise == noise

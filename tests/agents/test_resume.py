@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import os
 import re
@@ -12,7 +11,6 @@ import subprocess
 import sys
 import textwrap
 import warnings
-from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -25,11 +23,11 @@ from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.hooks import BaseCallback, EvalCallback
 from rejeu.io import checkpoint, json_arrays
-from rejeu.loops.learner import Learner
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
 from tests.every_agent import KINDS
 from tests.helpers import small_sac
+from tests.sharing import shared_learners
 from tests.tiers import only
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 3}
@@ -112,25 +110,12 @@ class Rows:
         pass
 
 
-@contextlib.contextmanager
-def compiled_once():
-    """Within, agents share what is compiled, which holds no state: they must be of one kind."""
-    made = []
-
-    def make(*arguments):
-        made.extend([Learner(*arguments)] if not made else [])
-        return copy.copy(made[0])
-
-    with mock.patch.object(rejeu.agents.base, "Learner", make):
-        yield
-
-
 @pytest.mark.parametrize("case", only(DEFAULT_CASES, CASES))
 def test_a_run_that_is_cut_off_goes_on_as_if_it_had_not_been(case, tmp_path):
     name, make_env, settings = CASES[case]
     n, cut = 230, 107
     make = lambda: rejeu.AGENTS[name]("MlpPolicy", make_env(), **settings)  # noqa: E731
-    with compiled_once():
+    with shared_learners():
         whole_rows, first_rows, second_rows = Rows(), Rows(), Rows()
         whole = make().learn(n, log_interval=1, sinks=[whole_rows])
         cut_off = make().learn(
@@ -163,7 +148,7 @@ def test_hindsight_goes_on_exactly_where_the_environment_offers_its_state(tmp_pa
 
     settings = {**OFF, "replay_buffer_class": rejeu.HerReplayBuffer, "n_steps": 2, "priorities": {}}
     make = lambda: rejeu.DQN("MultiInputPolicy", Carried(4), **settings)  # noqa: E731
-    with compiled_once():
+    with shared_learners():
         whole = make().learn(150)
         make().learn(150, [Checkpoint(tmp_path, every=1000), lambda agent, turn: turn.step < 61])
         again = rejeu.DQN.resume(tmp_path, Carried(4))
@@ -568,7 +553,7 @@ JUNK = [
 def test_a_checkpoint_full_of_nonsense_is_refused_by_our_own_error_alone(kind, tmp_path):
     name, settings = ("DQN", {**OFF, "priorities": {}}) if kind == "off policy" else ("PPO", {**SMALL, "n_steps": 16})
     env = vector("CartPole-v1", 2)
-    with compiled_once(), warnings.catch_warnings():
+    with shared_learners(), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         rejeu.AGENTS[name]("MlpPolicy", env(), **settings).learn(
             60, [Checkpoint(tmp_path, every=1000), lambda agent, turn: turn.step < 40]
@@ -623,7 +608,7 @@ def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, tmp_
     """Two environments, 16 steps each a rollout: 13 more steps end within a turn, and are fewer than a minibatch."""
     make_env = vector("rejeu/CartPoleNoVelocity-v0", 2)
     make = lambda: rejeu.AGENTS[name]("MlpPolicy", make_env(), n_steps=16, batch_size=16, **SMALL)  # noqa: E731
-    with compiled_once():
+    with shared_learners():
         whole = make().learn(45).learn(50, reset_num_timesteps=False)
         cut_off = make().learn(45, Checkpoint(tmp_path))
         assert cut_off.run.replay.size() == 13

@@ -9,8 +9,9 @@ import pytest
 import rejeu
 from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Probe
-from tests.every_agent import KINDS, LEARNING, env_of, shared_functions, small
+from tests.every_agent import KINDS, LEARNING, env_of, small
 from tests.helpers import assert_same_parameters, same_parameters
+from tests.sharing import shared_learners
 from tests.tiers import crossed, only
 
 every_algorithm = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
@@ -82,7 +83,7 @@ def test_two_runs_with_one_seed_are_the_same_to_the_last_bit_and_another_seed_di
 def test_a_loaded_agent_predicts_the_same_bits_and_goes_on_learning_all_its_parts(kind, tmp_path):
     """Stable-Baselines3 1.1.0 mended a temperature that was no longer learnt after loading."""
     agent = small(kind, wanderers(kind, 1), learning_starts=16).learn(20)
-    with shared_functions(kind):
+    with shared_learners():
         loaded = rejeu.load(agent.save(tmp_path / "model"), env=wanderers(kind, 1), learning_starts=32)
     assert type(loaded) is kind.agent
     assert_same_parameters(agent, loaded)
@@ -143,7 +144,7 @@ def test_float64_actions_reach_the_environment_as_such_within_their_bounds(name)
 def test_an_agent_of_float64_actions_goes_on_after_loading(tmp_path):
     kind = KINDS["SAC"]
     path = small(kind, Precise()).save(tmp_path / "model")
-    with shared_functions(kind):
+    with shared_learners():
         loaded = rejeu.load(path, env=Precise(), learning_starts=4)
         assert_precise(rejeu.load(path))
     assert_precise(loaded.learn(6))

@@ -19,7 +19,8 @@ from rejeu.callbacks import Checkpoint
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, tensors
 from tests import hostile_files
-from tests.agents.test_resume import BALL, OFF, SMALL, compiled_once, vector
+from tests.agents.test_resume import BALL, OFF, SMALL, vector
+from tests.sharing import shared_learners
 
 CASES = {
     "replay": ("DQN", "CartPole-v1", {**OFF, "priorities": {}}),
@@ -271,7 +272,7 @@ def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):
 
     gym.register("tests/Counted-v0", Counted)
     try:
-        with compiled_once():
+        with shared_learners():
             agent = rejeu.SAC("MlpPolicy", rejeu.make_vector("tests/Counted-v0", 2, "gymnasium"), **OFF)
             agent.made_from_id = True
             agent.learn(10, Checkpoint(tmp_path, keep=1))

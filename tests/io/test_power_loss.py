@@ -9,8 +9,9 @@ import pytest
 import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.errors import CheckpointError
-from tests.agents.test_resume import BALL, OFF, compiled_once
+from tests.agents.test_resume import BALL, OFF
 from tests.crash_states import Operation, Recorder, crash_states, make
+from tests.sharing import shared_learners
 
 EVERY = 10
 
@@ -55,7 +56,7 @@ def is_loss(found):
 def run(tmp_path_factory):
     """The operations of a run whose replay buffer comes round, and the files that it left."""
     root = tmp_path_factory.mktemp("recorded")
-    with compiled_once():
+    with shared_learners():
         operations = recorded(root, rejeu.SAC("MlpPolicy", BALL, **{**OFF, "buffer_size": 25}))
     return operations, {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*.safetensors")}
 
@@ -63,7 +64,7 @@ def run(tmp_path_factory):
 def outcomes(operations, tmp_path, ignored=(), each=1):
     """Those of the states that a power cut may leave once the first checkpoint was saved."""
     states = [state for state in crash_states(operations, ignored) if state.n_done][::each]
-    with compiled_once():
+    with shared_learners():
         return [outcome(state, tmp_path / str(i)) for i, state in enumerate(states)]
 
 

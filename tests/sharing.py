@@ -1,0 +1,57 @@
+"""Agents that share compiled functions, which take most of the time of a test to build.
+
+A :class:`Learner` holds pure functions of an algorithm's configuration and the spaces, and no state. Agents for which these
+are equal can therefore share one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import json
+from collections.abc import Hashable, Iterator
+from unittest import mock
+
+import gymnasium as gym
+
+from rejeu import spaces
+from rejeu.agents import Agent, base
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.loops.learner import Learner
+
+READ_ELSEWHERE = ("learning_starts", "buffer_size", "train_freq", "gradient_steps", "n_steps")
+"""Settings of off-policy algorithms that only the loop and the replay buffer read."""
+
+_learners: dict[Hashable, Learner] = {}
+_build = Agent.build
+
+
+@contextlib.contextmanager
+def shared_learners() -> Iterator[None]:
+    """Agents that are made or loaded within the block share the learner of equal agents, those of other blocks included.
+
+    Not for tests that patch functions of an algorithm: a learner that was compiled earlier does not see them.
+    """
+    with mock.patch.object(Agent, "build", _build_or_share):
+        yield
+
+
+def _build_or_share(agent: Agent, observation_space: gym.Space, action_space: gym.Space) -> None:
+    key = _key(agent, observation_space, action_space)
+    if key not in _learners:
+        _build(agent, observation_space, action_space)
+        _learners[key] = agent.learner
+    with mock.patch.object(base, "Learner", return_value=copy.copy(_learners[key])):
+        _build(agent, observation_space, action_space)
+
+
+def _key(agent: Agent, observation_space: gym.Space, action_space: gym.Space) -> Hashable:
+    config = agent.config
+    if isinstance(config, OffPolicyConfig):
+        defaults = type(config)()
+        names = [name for name in READ_ELSEWHERE if hasattr(config, name)]
+        if config.normalize is None:
+            names.append("gamma")  # which is otherwise in the discounts of a batch only
+        config = dataclasses.replace(config, **{name: getattr(defaults, name) for name in names})
+    return type(agent), config, json.dumps([spaces.describe(observation_space), spaces.describe(action_space)])
