@@ -13,6 +13,7 @@ from rejeu.envs.make import InProcess
 from rejeu.errors import CheckpointError
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, count_updates, same_parameters, small_sac
+from tests.tiers import exhaustive
 
 NEVER = 10**6
 """``learning_starts`` of agents that only act at random."""
@@ -82,7 +83,7 @@ def test_num_timesteps_survives_saving(tmp_path):
         (1, 1, lambda steps: steps),
         (4, 1, lambda steps: steps // 4),
         (4, 2, lambda steps: 2 * (steps // 4)),
-        (1, 3, lambda steps: 3 * steps),
+        pytest.param(1, 3, lambda steps: 3 * steps, marks=exhaustive),
         (16, -1, lambda steps: None),
     ],
 )

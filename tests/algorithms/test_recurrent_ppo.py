@@ -22,6 +22,7 @@ from rejeu.spaces import leaves
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters, same_parameters
+from tests.tiers import only
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (3,), np.float32)
@@ -103,6 +104,8 @@ def made(kind="lstm", shared=False, **settings):
 
 
 KINDS = pytest.mark.parametrize("kind", ["lstm", "gru"])
+LSTM = pytest.mark.parametrize("kind", only(["lstm"], ["lstm", "gru"]))
+"""For tests that compile much."""
 RNG = np.random.default_rng(0)
 
 
@@ -280,7 +283,7 @@ def numpy_loss(network, rollout, config, log_prob_old, value_old, advantage):
     return (policy + 0.5 * value_part - 0.1 * entropy) / n
 
 
-@KINDS
+@LSTM
 def test_the_gradient_reaches_through_time(kind):
     """Along random directions in all weights, float64 differences of an independent loss agree with the gradient."""
     config, _, state = made(kind, ent_coef=0.1)
@@ -388,7 +391,7 @@ def recalling(algorithm, **policy):
     return agent, agent.evaluate(60, env=InProcess([Recall() for _ in range(4)], seed=1))
 
 
-@KINDS
+@LSTM
 def test_a_policy_that_remembers_solves_what_only_memory_can(kind, tmp_path):
     agent, evaluation = recalling(rejeu.RecurrentPPO, cell=kind, lstm_hidden_size=8)
     assert evaluation.mean_return >= 0.95
@@ -560,7 +563,7 @@ def test_learning_is_determined_by_the_seed(agent):
     assert not same_parameters(agent, small(seed=1).learn(12))
 
 
-@KINDS
+@LSTM
 def test_a_file_keeps_all_of_it(kind, tmp_path):
     agent = small(policy_kwargs={**SMALL["policy_kwargs"], "cell": kind, "shared_lstm": True}).learn(6)
     loaded = rejeu.load(agent.save(tmp_path / "model"))
