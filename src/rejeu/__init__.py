@@ -53,8 +53,9 @@ if TYPE_CHECKING:
     from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
     from rejeu.exploration.parameter_space import ParameterNoise
     from rejeu.reporting import plots
-    from rejeu.reporting.evaluation import Evaluation, evaluate_policy
+    from rejeu.reporting.evaluation import Evaluation
     from rejeu.reporting.video import record_video, show_videos
+    from rejeu.sb3.common.evaluation import evaluate_policy
     from rejeu.sb3.common.monitor import Monitor
     from rejeu.schedules import Exponential, Linear
 
@@ -69,13 +70,14 @@ _MODULES = {
     "rejeu.core": "Algorithm Clock Rollout Transition",
     "rejeu.envs.checker": "check_env",
     "rejeu.envs.make": "make_vec make_vector",
+    "rejeu.sb3.common.evaluation": "evaluate_policy",
     "rejeu.sb3.common.monitor": "Monitor",
     "rejeu.envs.time_limit": "TimeLimitTerminates",
     "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",
     "rejeu.exploration.parameter_space": "ParameterNoise",
     "rejeu.reporting": "plots",
-    "rejeu.reporting.evaluation": "Evaluation evaluate_policy",
+    "rejeu.reporting.evaluation": "Evaluation",
     "rejeu.reporting.video": "record_video show_videos",
     "rejeu.schedules": "Exponential Linear",
 }

@@ -10,8 +10,8 @@ import pytest
 import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.envs.make import InProcess, make_vector
-from rejeu.hooks import BaseCallback, EvalCallback
-from rejeu.reporting.evaluation import evaluate_policy
+from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
+from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv
 from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac

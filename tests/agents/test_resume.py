@@ -21,8 +21,8 @@ from rejeu import xla
 from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
-from rejeu.hooks import BaseCallback, EvalCallback
 from rejeu.io import checkpoint, json_arrays
+from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
 from tests.every_agent import KINDS

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.hooks import (
+from rejeu.reporting.logging import CsvFile, Logger, configure
+from rejeu.sb3.common.callbacks import (
     BaseCallback,
     CallbackList,
     CheckpointCallback,
@@ -20,7 +21,6 @@ from rejeu.hooks import (
     StopTrainingOnMaxEpisodes,
     StopTrainingOnRewardThreshold,
 )
-from rejeu.reporting.logging import CsvFile, Logger, configure
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import VecNormalize
 from tests.golden.vec_env_script import Walk
@@ -56,7 +56,7 @@ def test_a_callback_stops_training_and_knows_the_agent():
 
 
 def test_returning_nothing_is_an_error():
-    with pytest.raises(TypeError, match=r"Note._on_step returned None; return True to go on"):
+    with pytest.raises(TypeError, match=r"Note._on_step returned None; return True to continue"):
         dqn().learn(5, callback=Note(goes_on=lambda self: None))
 
 
@@ -121,7 +121,7 @@ def test_a_logger_of_one_s_own_takes_the_rows(tmp_path, capsys):
         assert [row["mine/n"] for row in csv.DictReader(file)] == ["1", "2"]
     assert agent.logger.get_dir() == str(tmp_path)
     agent.logger.close()
-    with pytest.raises(ValueError, match="'stdout', 'csv' and 'tensorboard'"):
+    with pytest.raises(ValueError, match="'stdout', 'csv' or 'tensorboard'"):
         configure(tmp_path, ["log"])
     with pytest.raises(TypeError, match=r"record\('mine/text'\) expected a number, got str"):
         Logger().record("mine/text", "words")
@@ -162,17 +162,17 @@ def test_results_are_printed_logged_and_written(tmp_path, capsys):
 
 def test_evaluation_wants_environments_of_its_own():
     env = Walk()
-    with pytest.raises(ValueError, match="that the agent trains on; give it others"):
+    with pytest.raises(ValueError, match="that the agent trains in; give it others"):
         dqn(env).learn(5, callback=EvalCallback(env))
     vector = make_vec_env(Walk)
-    with pytest.raises(ValueError, match="that the agent trains on"):
+    with pytest.raises(ValueError, match="that the agent trains in"):
         dqn(vector).learn(5, callback=EvalCallback(VecNormalize(vector)))
     with pytest.raises(TypeError, match="got str"):
         EvalCallback("CartPole-v1")
 
 
 def test_judges_of_evaluations_belong_to_one():
-    with pytest.raises(TypeError, match="StopTrainingOnRewardThreshold judges evaluations; give it to EvalCallback"):
+    with pytest.raises(TypeError, match="StopTrainingOnRewardThreshold needs evaluations; give it to EvalCallback"):
         dqn().learn(5, callback=StopTrainingOnRewardThreshold(1.0))
 
 

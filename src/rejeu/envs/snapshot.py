@@ -49,7 +49,7 @@ Number = float | None | Literal["absent"]
 def numbers(n: int) -> Any:
     """Returns the type of an attribute that holds ``n`` finite numbers, or none yet."""
     finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
-    return Annotated[list[finite], Meta(min_length=n, max_length=n)] | None | Literal["absent"]  # type: ignore[return-value]
+    return Annotated[list[finite], Meta(min_length=n, max_length=n)] | None | Literal["absent"]
 
 
 REMEMBERED: dict[type, dict[str, Any]] = {
