@@ -163,7 +163,7 @@ def listening(agent: BaseAgent, callbacks: Sequence[Callback]) -> Iterator[None]
         agent.saved_callbacks = None
         if saved:
             names = ", ".join(name for name, _ in saved)
-            warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=5)
+            warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=6)
         yield
     except BaseException as raised:
         error = raised
@@ -202,7 +202,7 @@ def restore_callback(callback: Stateful, saved: list[tuple[str, Any]]) -> None:
     name = type(callback).__name__
     match = next((entry for entry in saved if entry[0] == name), None)
     if match is None:
-        warnings.warn(f"the run was saved without a {name}; it starts from the beginning", UserWarning, stacklevel=6)
+        warnings.warn(f"the run was saved without a {name}; it starts from the beginning", UserWarning, stacklevel=7)
         return
     saved.remove(match)
     try:
