@@ -16,7 +16,7 @@ from rejeu.envs.make import InProcess
 from rejeu.errors import CheckpointError
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.parameter_space import ParameterNoise
-from rejeu.normalization import MOST, Moments, NormalizationConfig, merged, normalised, nothing
+from rejeu.normalization import MAX_COUNT, Moments, NormalizationConfig, merged, no_moments, normalized
 from rejeu.spaces import leaves, scale_action
 from tests.algorithms.probes.environments import Discretely, Later
 from tests.environments import Counter, Reach
@@ -31,7 +31,7 @@ merge = jax.jit(merged)
 
 def chunked(values, weight, sizes):
     """Moments after the values came in pieces of these sizes, each filled up to one length with weight 0."""
-    moments, at = nothing(values.shape[1:]), 0
+    moments, at = no_moments(values.shape[1:]), 0
     for size in sizes:
         piece, w = np.full((WIDTH, *values.shape[1:]), 1e3, np.float32), np.zeros(WIDTH, np.float32)
         piece[:size], w[:size] = values[at : at + size], weight[at : at + size]
@@ -65,23 +65,23 @@ def test_moments_are_numpys_however_the_values_come(sizes, seed, offset, share):
 
 @pytest.mark.usefixtures("strict_dtypes")
 def test_the_first_values_replace_the_variance_that_stood_there_before():
-    moments = merged(nothing(()), jnp.float32([2.0, 4.0]), jnp.float32([1.0, 1.0]))
+    moments = merged(no_moments(()), jnp.float32([2.0, 4.0]), jnp.float32([1.0, 1.0]))
     assert (float(moments.mean), float(moments.variance), float(moments.n_seen)) == (3.0, 1.0, 2.0)
-    moments = merged(nothing(()), jnp.float32([7.0]), jnp.float32([1.0]))
+    moments = merged(no_moments(()), jnp.float32([7.0]), jnp.float32([1.0]))
     assert (float(moments.mean), float(moments.variance)) == (7.0, 0.0)
 
 
 def test_long_runs_forget_rather_than_stand_still():
     """Beyond 2^24 float32 no longer counts by ones: the share of a new value must not vanish."""
-    before = Moments(jnp.float32(0.0), jnp.float32(1.0), jnp.float32(MOST))
+    before = Moments(jnp.float32(0.0), jnp.float32(1.0), jnp.float32(MAX_COUNT))
     after = merge(before, np.full(WIDTH, 1e6, np.float32), np.ones(WIDTH, np.float32))
-    share = WIDTH / (MOST + WIDTH)
-    assert float(after.n_seen) == MOST
+    share = WIDTH / (MAX_COUNT + WIDTH)
+    assert float(after.n_seen) == MAX_COUNT
     assert float(after.mean) == pytest.approx(share * 1e6, rel=1e-6)
     assert float(after.variance) == pytest.approx((1 - share) + (1 - share) * share * 1e12, rel=1e-5)
 
 
-# What is scaled: the normalised form of an algorithm that shows what it is given.
+# What is scaled: the normalized form of an algorithm that shows what it is given.
 
 
 def showing(space, **settings):
@@ -94,7 +94,7 @@ def showing(space, **settings):
         update=lambda state, batch, clock: (state, batch),
         recall=lambda carry, actor, obs, ended: (obs, carry),
     )
-    return normalised(inner, exploration.plain(inner), leaves(space), NormalizationConfig(**settings), GAMMA)
+    return normalized(inner, exploration.plain(inner), leaves(space), NormalizationConfig(**settings), GAMMA)
 
 
 def box(*shape):
@@ -529,7 +529,7 @@ def test_noise_on_parameters_leaves_the_statistics_that_scale_as_they_are():
         update=lambda state, batch, clock: (state, {}),
     )
     explorer = exploration.make(inner, ParameterNoise(initial_sigma=100.0))
-    algorithm = normalised(inner, explorer, leaves(box(2)), NormalizationConfig())
+    algorithm = normalized(inner, explorer, leaves(box(2)), NormalizationConfig())
     obs = np.random.default_rng(0).normal(3.0, 2.0, (5, 2)).astype(np.float32)
     actor = algorithm.actor(after_seeing(algorithm, obs))
     carry, begun = algorithm.explorer.init(actor, 5), np.ones(5, bool)

@@ -1,7 +1,7 @@
-"""The few types and functions that every algorithm, replay and loop shares.
+"""The types and functions that every algorithm, buffer and loop shares.
 
-An algorithm is a NamedTuple of pure functions over one state, an :class:`Algorithm`. Data flows between the
-environment and the gradient as a :class:`Transition`. Nothing here knows of any particular algorithm.
+An algorithm is a NamedTuple of pure functions over one explicit state (:class:`Algorithm`). Experience reaches it as a
+:class:`Transition` or a :class:`Rollout`. Nothing here depends on a particular algorithm.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Transition(NamedTuple):
     discount: Any
     """Weight of the bootstrapped value, ``(batch,)`` in [0, 1]."""
     weight: Any = None
-    """Importance weights of prioritised replay, ``(batch,)`` in (0, 1]; None where all steps are equally likely."""
+    """Importance weights of prioritized replay, ``(batch,)`` in (0, 1]; None where all steps are equally likely."""
     rewards: Any = None
     """The discounted rewards that ``reward`` is the sum of, ``(batch, n)``, where normalization clips each; None
     elsewhere. Algorithms do not see them."""
@@ -124,7 +124,7 @@ class Algorithm(NamedTuple):
     update: Callable[[PyTree, Any, Clock], tuple[PyTree, Metrics]]
     """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns on a batch of
     :class:`Transition`, or for on-policy algorithms all the steps that one :class:`Rollout` is good for. The metrics are
-    scalars, and under ``TD_ERROR`` the absolute TD errors ``(batch,)`` that prioritised replay goes by."""
+    scalars, and under ``TD_ERROR`` the absolute TD errors ``(batch,)`` that prioritized replay goes by."""
     explorer: Explorer | None = None
     """How training actions are chosen where that takes more than ``explore``; its carry is the policy's memory if it has
     one. None where ``explore`` is all."""
@@ -158,7 +158,7 @@ Such a field is finite as long as the others are, so the check for NaN leaves it
 
 
 def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[..., Any]:
-    """Returns ``jax.value_and_grad(loss, has_aux=has_aux)``, kept as a function of its own in a compiled update."""
+    """Returns ``jax.value_and_grad(loss, has_aux=has_aux)``, in a form that XLA runs faster on a CPU."""
     return outlined(jax.value_and_grad(loss, has_aux=has_aux))
 
 
@@ -166,14 +166,48 @@ def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[
 def descend(
     params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: optax.GradientTransformation, rate: Any
 ) -> tuple[PyTree, PyTree]:
-    """Returns the parameters and optimizer state after one step of ``rate`` against ``gradients``.
+    """Returns the parameters and the optimizer state after one step of ``rate`` against ``gradients``.
 
-    ``optimizer`` is a transformation without a learning rate (``optax.scale_by_adam()``); the rate is multiplied here,
-    so that it may be a traced value of a schedule.
+    Args:
+        params: what is learned.
+        gradients: of a loss with respect to ``params``.
+        optimizer_state: of ``optimizer``.
+        optimizer: a transformation without a learning rate, such as ``optax.scale_by_adam()``.
+        rate: the learning rate, which may be a traced value of a schedule; or one for each part of ``params``, as a
+            pytree that is a prefix of it.
     """
     direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
-    params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
-    return params, optimizer_state
+    step = lambda rate, part, d: jax.tree.map(lambda p, d: p - rate * d, part, d)  # noqa: E731
+    return jax.tree.map(step, rate, params, direction), optimizer_state
+
+
+def minimize(
+    loss: Callable[..., tuple[Array, Any]],
+    params: PyTree,
+    optimizer_state: PyTree,
+    optimizer: optax.GradientTransformation,
+    rate: Any,
+    *arguments: Any,
+) -> tuple[PyTree, PyTree, Array, Any]:
+    """Takes one gradient step on ``loss(params, *arguments)``, which returns a value and something else.
+
+    Returns the parameters and the optimizer state after the step, the loss, and what it returned beside it.
+    """
+    (value, extra), gradients = value_and_grad(loss, has_aux=True)(params, *arguments)
+    params, optimizer_state = descend(params, gradients, optimizer_state, optimizer, rate)
+    return params, optimizer_state, value, extra
+
+
+def clip(gradients: PyTree, max_value: float | None, max_norm: float | None) -> PyTree:
+    """Returns gradients with every component within ``max_value`` of 0, then scaled to a norm of at most ``max_norm``.
+
+    None stands for no limit.
+    """
+    if max_value is not None:
+        gradients, _ = optax.clip(max_value).update(gradients, optax.EmptyState())
+    if max_norm is not None:
+        gradients, _ = optax.clip_by_global_norm(max_norm).update(gradients, optax.EmptyState())
+    return gradients
 
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
@@ -183,12 +217,12 @@ def weighted_mean(values: Array, weight: Array | None) -> Array:
 
 @one_kernel
 def polyak(target: PyTree, online: PyTree, tau: Any) -> PyTree:
-    """Returns ``(1 - tau) * target + tau * online``, leaf by leaf."""
-    return jax.tree.map(lambda t, o: t + tau * (o - t), target, online)
+    """Returns ``tau * online + (1 - tau) * target``, leaf by leaf."""
+    return optax.incremental_update(online, target, tau)
 
 
 def tau_at(n_updates: Array, tau: float, interval: int) -> Any:
-    """Returns ``tau`` at every ``interval``-th update and 0 at the others, so that :func:`polyak` leaves targets alone.
+    """Returns ``tau`` at every ``interval``-th update and 0 at the others, at which :func:`polyak` keeps the targets.
 
     >>> [float(tau_at(jnp.int32(n), 0.5, 3)) for n in (1, 2, 3, 4)]
     [0.0, 0.0, 0.5, 0.0]
@@ -225,7 +259,7 @@ def averaged_leaves(state: PyTree) -> list[bool]:
 
 
 def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:
-    """Returns ``size`` independent initialisations stacked along a leading axis."""
+    """Returns ``size`` independent initializations stacked along a leading axis."""
     return jax.vmap(init)(jax.random.split(key, size))
 
 

@@ -13,7 +13,7 @@ LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 FORBIDDEN = -1e9
 """Logit of an action that a mask forbids: its probability is exactly 0 in float32, and every gradient stays finite."""
 EDGE = 1.0 - 1e-6
-"""Largest magnitude at which a squashed action is unsquashed: beyond it, float32 knows no slope."""
+"""Largest magnitude at which a squashed action is unsquashed: beyond it, float32 has no slope."""
 
 
 class Normal(NamedTuple):
@@ -30,8 +30,8 @@ class Normal(NamedTuple):
 
     def log_prob(self, value: Array) -> Array:
         """Returns the log-density of ``value``, ``(...)``, in nats."""
-        standardised = (value - self.mean) * jnp.exp(-self.log_std)
-        return jnp.sum(-0.5 * jnp.square(standardised) - self.log_std - LOG_SQRT_2PI, axis=-1)
+        standardized = (value - self.mean) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * jnp.square(standardized) - self.log_std - LOG_SQRT_2PI, axis=-1)
 
     def entropy(self) -> Array:
         """Returns the differential entropy, ``(...)``, in nats."""
@@ -79,7 +79,7 @@ class Categorical(NamedTuple):
     """One choice among several; the last axis of the logits is the choices."""
 
     logits: Array
-    """Unnormalised log-probabilities, ``(..., n)``; :data:`FORBIDDEN` where a choice is not allowed."""
+    """Unnormalized log-probabilities, ``(..., n)``; :data:`FORBIDDEN` where a choice is not allowed."""
 
     def sample(self, key: Array) -> Array:
         """Returns one choice, ``int32 (...)``, by the Gumbel trick."""

@@ -1,16 +1,21 @@
-"""Schedules: numbers that change over a run, as frozen dataclasses of its progress.
+"""Schedules: hyper-parameters as functions of the progress of a run.
 
-A schedule is called with ``progress`` in [0, 1] and returns the value there; it works on Python numbers and on traced
-arrays alike. Being data, it is saved with a model, compared, and printed.
+A schedule is called with ``progress`` in [0, 1], a Python number or a traced array, and returns the value.
+:class:`Linear` and :class:`Exponential` are saved with a model. Any other function that JAX can trace is a schedule too; a
+file mentions its name only, so it must be given again to ``load``::
+
+    rejeu.SAC("MlpPolicy", env, learning_rate=lambda progress: 3e-4 * jnp.cos(progress * jnp.pi / 2))
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 
@@ -39,7 +44,7 @@ class Linear:
 
 @dataclass(frozen=True)
 class Exponential:
-    """A geometric path from ``start`` to ``end``: the same factor for every equal stretch of the run.
+    """A geometric path from ``start`` to ``end``: the same factor for equal parts of the run.
 
     >>> round(Exponential(1.0, 0.01)(0.5), 6)
     0.1
@@ -62,7 +67,8 @@ class Exponential:
         return self.start * (self.end / self.start) ** done
 
 
-Schedule = Linear | Exponential
+Schedule = Callable[[Any], Any]
+"""A function from the progress in [0, 1] to a value: :class:`Linear`, :class:`Exponential` or one of your own."""
 SCHEDULES: dict[str, type[Linear] | type[Exponential]] = {"linear": Linear, "exponential": Exponential}
 
 
@@ -71,16 +77,23 @@ def at(value: float | Schedule, progress: Any) -> Any:
     return value if isinstance(value, int | float) else value(progress)
 
 
-def parse(name: str, value: Any) -> float | Schedule:
-    """Returns a number or a schedule from what a user or a file may give.
+def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
+    """Returns a number or a schedule from what a user or a file gives.
 
-    Accepted: a number, a schedule, ``"lin_3e-4"`` (RL Zoo's spelling of a line to zero), or the JSON form
-    ``{"schedule": "linear", "start": 1e-3, "end": 0}``.
+    Accepted: a number, a schedule, ``"lin_3e-4"`` (RL Zoo's notation for a line to zero), the JSON form
+    ``{"schedule": "linear", "start": 1e-3, "end": 0}``, or any function of the progress that JAX can trace.
 
     Raises:
-        TypeError: for anything else, a Python function among them: it could not be saved with the model.
-        ValueError: for a number that is not finite.
+        TypeError: for anything else.
+        ValueError: for a number that is not finite, or a value below ``least`` at the beginning or the end.
     """
+    parsed = _parse(name, value)
+    if min(float(at(parsed, end)) for end in (0.0, 1.0)) < least:
+        raise ValueError(f"{name}={value!r} must not fall below {least:g}")
+    return parsed
+
+
+def _parse(name: str, value: Any) -> float | Schedule:
     if isinstance(value, Linear | Exponential):
         return value
     if isinstance(value, bool):
@@ -96,20 +109,43 @@ def parse(name: str, value: Any) -> float | Schedule:
             fields = {key: float(number) for key, number in value.items() if key != "schedule"}
             return SCHEDULES[value["schedule"]](**fields)
     except (TypeError, ValueError) as error:
-        raise type(error)(f"{name}={value!r} is no schedule: {error}") from None
+        raise type(error)(f"{name}={value!r} is not a schedule: {error}") from None
+    if callable(value):
+        check_function(name, value)
+        return value
     raise TypeError(
-        f"{name}={value!r} must be a number, rejeu.Linear(start, end), rejeu.Exponential(start, end) or 'lin_<number>'"
-        + ("; a function cannot be saved with the model" if callable(value) else "")
+        f"{name}={value!r} must be a number, rejeu.Linear(start, end), rejeu.Exponential(start, end), 'lin_<number>' or "
+        "a function of the progress from 0 to 1"
     )
 
 
-def to_json(schedule: Schedule) -> dict[str, Any]:
+def check_function(name: str, function: Schedule) -> None:
+    """Checks that a function of the user's own is a schedule.
+
+    Raises:
+        TypeError: if JAX cannot trace it, or it returns something other than one number.
+        ValueError: if it takes the remaining progress, as in Stable-Baselines3.
+    """
+    if "progress_remaining" in inspect.signature(function).parameters:
+        raise ValueError(
+            f"{name}: functions are called with the progress, which runs from 0 to 1, and this one takes "
+            "progress_remaining; give lambda progress: function(1 - progress)"
+        )
+    try:
+        result = jax.eval_shape(function, jax.ShapeDtypeStruct((), jnp.float32))
+    except jax.errors.JAXTypeError as error:
+        raise TypeError(f"{name}: the function must use jax.numpy, without if and float(): {error}") from None
+    if getattr(result, "shape", None) != ():
+        raise TypeError(f"{name}: the function must return one number, got {result}")
+
+
+def to_json(schedule: Any) -> dict[str, Any]:
     """Returns the JSON form that :func:`parse` reads."""
     name = next(key for key, kind in SCHEDULES.items() if isinstance(schedule, kind))
     return {"schedule": name, **asdict(schedule)}
 
 
-def _check_numbers(schedule: Schedule) -> None:
+def _check_numbers(schedule: Any) -> None:
     if not (math.isfinite(schedule.start) and math.isfinite(schedule.end)):
         raise ValueError(f"start={schedule.start} and end={schedule.end} must be finite")
     if not 0 < schedule.fraction <= 1:

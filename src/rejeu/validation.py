@@ -9,7 +9,7 @@ import inspect
 import itertools
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, TypeVar
 
@@ -46,7 +46,53 @@ def number(key: str, value: Any, least: float = -math.inf, above: float = -math.
     return float(value)
 
 
-def nested(key: str, kind: type[C], value: Any) -> C:
+def flag(key: str, value: Any) -> bool:
+    """Returns ``value`` if it is True or False.
+
+    Raises:
+        TypeError: if it is not.
+    """
+    if not isinstance(value, bool):
+        raise TypeError(f"{key}={value!r} must be True or False")
+    return value
+
+
+def convert(
+    config: Any, keys: str | tuple[str, ...], converter: Callable[..., Any], optional: bool = False, **limits: Any
+) -> None:
+    """Replaces fields of a frozen dataclass by ``converter(key, value, **limits)``; for use in ``__post_init__``.
+
+    Args:
+        config: the dataclass under construction.
+        keys: the names of the fields.
+        converter: :func:`whole`, :func:`number`, :func:`flag`, or another function of that form.
+        optional: whether None stays None.
+        limits: passed to the converter.
+    """
+    for key in (keys,) if isinstance(keys, str) else keys:
+        value = getattr(config, key)
+        if not (optional and value is None):
+            assign(config, **{key: converter(key, value, **limits)})
+
+
+def assign(config: Any, **values: Any) -> None:
+    """Sets fields of a frozen dataclass; for use in ``__post_init__``."""
+    for key, value in values.items():
+        object.__setattr__(config, key, value)
+
+
+def choice(key: str, value: Any, among: tuple[str, ...]) -> str:
+    """Returns ``value`` if it is one of the texts ``among``.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if value not in among:
+        raise ValueError(f"{key}={value!r} must be {' or '.join(map(repr, among))}")
+    return value
+
+
+def nested(key: str, value: Any, kind: type[C]) -> C:
     """Returns a sub-configuration of class ``kind`` from itself or from a mapping of its fields."""
     if isinstance(value, kind):
         return value
@@ -75,9 +121,9 @@ ELSEWHERE = {
     "hidden_sizes": "the widths of the layers are policy_kwargs=dict(net_arch=[64, 64])",
     "net_arch": "it is in policy_kwargs: policy_kwargs=dict(net_arch=[64, 64]), or --set policy_kwargs.net_arch=[64,64]",
     "use_sde": "state-dependent exploration (use_sde) is for PPO and A2C with continuous actions",
-    "features_extractor_class": "networks of your own are given as policy_kwargs=dict(torso=...)",
-    "features_extractor_kwargs": "networks of your own are given as policy_kwargs=dict(torso=...)",
-    "optimizer_class": "the optimizer is Adam; its step size is learning_rate",
+    "features_extractor_class": "networks of your own are given as policy_kwargs=dict(encoder=..., torso=..., head=...)",
+    "features_extractor_kwargs": "networks of your own are given as policy_kwargs=dict(encoder=..., torso=..., head=...)",
+    "optimizer_class": "the optimizer is called optimizer: optimizer='adamw', or an Optax optimizer",
     "optimize_memory_usage": "observations are stored once anyway",
     "n_envs": "give make_vector(id, n_envs=...) as env, or --envs",
     "total_timesteps": "it is an argument of learn(), or --steps",

@@ -11,7 +11,8 @@ import pytest
 from scipy import stats
 
 import rejeu
-from rejeu.algorithms import ddpg, ddpg_discrete
+from rejeu.algorithms import ddpg
+from rejeu.algorithms.ddpg import discrete as ddpg_discrete
 from rejeu.core import TD_ERROR, Clock, Transition
 from tests.environments import Sampled
 from tests.numpy_networks import Adam, assert_equal_layers, follow, forward, layers, softmax

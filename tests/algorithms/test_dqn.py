@@ -14,7 +14,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import dqn
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core import TD_ERROR, Clock, Transition, clip
 from rejeu.io.checkpoint import tree_to_arrays
 from rejeu.schedules import at
 from tests.bit_flipping import BitFlipping
@@ -123,17 +123,17 @@ def test_update_reports_td_errors_of_the_batch_it_learnt_from():
 
 def test_gradients_are_clipped_by_value_first_and_then_by_norm():
     gradients = {"a": jnp.array([30.0, -400.0]), "b": jnp.array([[0.0]])}
-    by_value = dqn.clipped(gradients, 40.0, None)
+    by_value = clip(gradients, 40.0, None)
     np.testing.assert_allclose(by_value["a"], [30.0, -40.0])
-    both = dqn.clipped(gradients, 40.0, 10.0)  # (30, -40) has the norm 50
+    both = clip(gradients, 40.0, 10.0)  # (30, -40) has the norm 50
     np.testing.assert_allclose(both["a"], [6.0, -8.0], rtol=1e-5)
-    np.testing.assert_array_equal(dqn.clipped({"a": jnp.zeros(2)}, None, 1.0)["a"], [0.0, 0.0])
+    np.testing.assert_array_equal(clip({"a": jnp.zeros(2)}, None, 1.0)["a"], [0.0, 0.0])
 
 
 def test_gradients_within_the_limits_stay_as_they_are():
     gradient = {"a": jnp.array([3.0, -4.0])}
-    np.testing.assert_array_equal(dqn.clipped(gradient, None, None)["a"], gradient["a"])
-    np.testing.assert_array_equal(dqn.clipped(gradient, 4.0, 6.0)["a"], gradient["a"])
+    np.testing.assert_array_equal(clip(gradient, None, None)["a"], gradient["a"])
+    np.testing.assert_array_equal(clip(gradient, 4.0, 6.0)["a"], gradient["a"])
 
 
 # The dueling network.
@@ -203,14 +203,14 @@ def test_exploit_takes_the_first_of_the_highest_values():
 def test_linear_epsilon_reaches_its_end_at_the_fraction():
     """From 0.9 by 0.8 over 0.2 of the run: a quarter of the way at 0.05, the end from 0.2 on."""
     settings = {"exploration_initial_eps": 0.9, "exploration_final_eps": 0.1, "exploration_fraction": 0.2}
-    epsilon = dqn.epsilon_schedule(dqn.Config(**settings))
+    epsilon = dqn.Config(**settings).epsilon
     assert [at(epsilon, p) for p in (0.0, 0.05, 0.2, 1.0)] == pytest.approx([0.9, 0.7, 0.1, 0.1])
 
 
 def test_exponential_epsilon_falls_by_one_factor_an_episode():
     """As the exercise has it: epsilon is multiplied by (end / start)^(1 / n) after each of n episodes."""
     settings = {"exploration_initial_eps": 0.9, "exploration_final_eps": 0.01, "exploration_fraction": 1.0}
-    epsilon = dqn.epsilon_schedule(dqn.Config(exploration_schedule="exponential", **settings))
+    epsilon = dqn.Config(exploration_schedule="exponential", **settings).epsilon
     expected, n = 0.9, 450
     for episode in range(n):
         assert at(epsilon, episode / n) == pytest.approx(expected, rel=1e-6)
@@ -408,7 +408,7 @@ def test_other_action_spaces_are_refused_with_what_to_use(space, instead):
         ({"target_update_interval": 0}, "target_update_interval=0 must be"),
         ({"max_grad_norm": 0}, "max_grad_norm=0 must be"),
         ({"clip_grad_value": -1}, "clip_grad_value=-1 must be"),
-        ({"loss": "absolute"}, "loss='absolute' must be one of huber, squared"),
+        ({"loss": "absolute"}, "loss='absolute' must be 'huber' or 'squared'"),
         ({"action_noise": rejeu.NormalActionNoise([0.0], [0.1])}, "no meaning for Discrete actions"),
     ],
 )

@@ -191,7 +191,7 @@ def test_what_is_learnt_from_is_what_the_memory_of_each_episode_says(kind, share
     that the step left, at a time limit the true one."""
     config, _, state = made(kind, shared)
     rollout = drawn_rollout(network=state.network)
-    data, started = jax.jit(recurrent_ppo.samples, static_argnums=2)(state.network, rollout, config.gae_lambda)
+    data, started = jax.jit(recurrent_ppo.unrolled_samples, static_argnums=2)(state.network, rollout, config.gae_lambda)
     log_prob, value, advantage = by_hand(state.network, rollout, config.gae_lambda)
     np.testing.assert_allclose(data.log_prob, log_prob, atol=2e-5)
     np.testing.assert_allclose(data.value, value, atol=2e-5)
@@ -288,7 +288,7 @@ def test_the_gradient_reaches_through_time(kind):
     """Along random directions in all weights, float64 differences of an independent loss agree with the gradient."""
     config, _, state = made(kind, ent_coef=0.1)
     rollout = drawn_rollout(seed=1, network=state.network)
-    data, started = recurrent_ppo.samples(state.network, rollout, config.gae_lambda)
+    data, started = recurrent_ppo.unrolled_samples(state.network, rollout, config.gae_lambda)
     rng = np.random.default_rng(5)
     moved = jax.tree.map(lambda x: x + rng.normal(0, 0.05, x.shape).astype(np.float32), state.network)
     slope = jax.grad(lambda n: recurrent_ppo.loss(n, (data, started, rollout.carry), config, CLOCK)[0])(moved)

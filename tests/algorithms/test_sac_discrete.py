@@ -11,7 +11,8 @@ import pytest
 from scipy import stats
 
 import rejeu
-from rejeu.algorithms import sac, sac_discrete
+from rejeu.algorithms import sac
+from rejeu.algorithms.sac import discrete as sac_discrete
 from rejeu.core import TD_ERROR, Clock, Transition
 from tests.environments import Sampled
 from tests.numpy_networks import Adam, assert_equal_layers, follow, forward, layers, softmax

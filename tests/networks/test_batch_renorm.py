@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu.networks.batch_renorm import BatchRenorm, RenormalisedMLP, RenormalisedNetwork, with_statistics
+from rejeu.networks.batch_renorm import BatchRenorm, RenormalizedMLP, RenormalizedNetwork, with_statistics
 from rejeu.spaces import Leaf
 
 WIDTH, BATCH = 3, 6
@@ -156,7 +156,7 @@ def numpy_torso(torso, norms, x, method):
 
 @pytest.mark.usefixtures("strict_dtypes")
 def test_a_torso_renormalises_its_input_and_each_layer_after_the_nonlinearity():
-    torso = RenormalisedMLP(jax.random.PRNGKey(0), WIDTH, (5, 4), "relu", warm_up=1)
+    torso = RenormalizedMLP(jax.random.PRNGKey(0), WIDTH, (5, 4), "relu", warm_up=1)
     norms = [NumpyRenorm(norm) for norm in torso.norms]
     for seed in range(3):
         x = batch(seed, mean=2.0)
@@ -168,7 +168,7 @@ def test_a_torso_renormalises_its_input_and_each_layer_after_the_nonlinearity():
 def test_with_statistics_takes_the_statistics_of_one_network_and_the_weights_of_the_other():
     leaf = Leaf("", "continuous", (WIDTH,), "float32")
     one, other = (
-        RenormalisedNetwork(jax.random.PRNGKey(seed), (leaf,), None, 2, (4,), "relu", warm_up=0) for seed in (0, 1)
+        RenormalizedNetwork(jax.random.PRNGKey(seed), (leaf,), None, 2, (4,), "relu", warm_up=0) for seed in (0, 1)
     )
     _, other = other.train(batch(0, mean=3.0))
     joined = with_statistics(one, other)

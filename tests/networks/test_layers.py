@@ -13,7 +13,7 @@ from scipy import special
 
 from rejeu import spaces
 from rejeu.core import ensemble
-from rejeu.networks import ACTIVATIONS, MLP, Actor, LayerNorm, Linear, PolicyConfig, product
+from rejeu.networks import ACTIVATIONS, MLP, LayerNorm, Linear, Network, PolicyConfig, product
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 KEY = jax.random.PRNGKey(0)
@@ -99,7 +99,7 @@ def test_activations_equal_their_formulas(name):
 
 def test_a_row_of_a_batch_is_computed_as_if_alone():
     leaves = spaces.leaves(gym.spaces.Box(-1.0, 1.0, (3,)))
-    actor = Actor(KEY, leaves, 2, [8], PolicyConfig(layer_norm=True))
+    actor = Network(KEY, leaves, 2, [8], PolicyConfig(layer_norm=True))
     x = jax.random.normal(KEY, (5, 3))
     np.testing.assert_allclose(actor(x)[2:3], actor(x[2:3]), atol=1e-6)
 

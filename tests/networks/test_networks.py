@@ -22,12 +22,12 @@ from rejeu.networks import (
     CNN,
     NATURE,
     SMALL,
-    Actor,
     Convolution,
-    Critic,
     Encoder,
     Linear,
+    Network,
     PolicyConfig,
+    QNetwork,
     action_values,
     channels_last,
     convolutions,
@@ -80,8 +80,8 @@ def make(shape, space=VECTOR):
     shape = PolicyConfig(**shape)
 
     def init(key):
-        actor = Actor(key, leaves(space), 4, shape.actor_widths((6, 4)), shape)
-        return actor, Critic(key, leaves(space), 3, shape.critic_widths((6, 4)), shape)
+        actor = Network(key, leaves(space), 4, shape.actor_widths((6, 4)), shape)
+        return actor, QNetwork(key, leaves(space), 3, shape.critic_widths((6, 4)), shape)
 
     return filled(jax.eval_shape(init, jax.random.PRNGKey(0)))
 
@@ -194,7 +194,7 @@ def test_plain_networks_keep_the_names_of_their_parameters():
 
 def test_action_values_are_those_of_each_critic():
     shape = PolicyConfig(**DOCUMENT)
-    init = lambda key: Critic(key, leaves(VECTOR), 3, shape.critic_widths(()), shape)  # noqa: E731
+    init = lambda key: QNetwork(key, leaves(VECTOR), 3, shape.critic_widths(()), shape)  # noqa: E731
     critics = filled(jax.eval_shape(lambda key: ensemble(init, key, 3), jax.random.PRNGKey(0)))
     together = jax.jit(action_values)(critics, OBS, ACTION)
     for i in range(3):

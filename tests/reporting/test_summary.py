@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 import rejeu
 from rejeu.core import AVERAGED, ensemble
-from rejeu.networks import Actor, Critic, PolicyConfig
+from rejeu.networks import Network, PolicyConfig, QNetwork
 from rejeu.reporting.summary import describe, draw, n_parameters
 from rejeu.spaces import leaves
 from tests.environments import Sampled
@@ -38,9 +38,9 @@ FIGURE_OF_THE_ACTOR = """
 
 
 class State(eqx.Module):
-    actor: Actor
-    critics: Critic
-    target_critics: Critic = eqx.field(metadata=AVERAGED)
+    actor: Network
+    critics: QNetwork
+    target_critics: QNetwork = eqx.field(metadata=AVERAGED)
     n_updates: jax.Array
 
 
@@ -49,8 +49,8 @@ def state(shape, n_observations=3, space=None, n_outputs=4):
     obs = leaves(space or spaces.Box(-1, 1, (n_observations,), np.float32))
 
     def init(key):
-        actor = Actor(key, obs, n_outputs, shape.actor_widths((64, 64)), shape)
-        critics = ensemble(lambda k: Critic(k, obs, 4, shape.critic_widths((64, 64)), shape), key, 2)
+        actor = Network(key, obs, n_outputs, shape.actor_widths((64, 64)), shape)
+        critics = ensemble(lambda k: QNetwork(k, obs, 4, shape.critic_widths((64, 64)), shape), key, 2)
         return State(actor, critics, critics, jax.numpy.int32(0))
 
     return jax.eval_shape(init, jax.random.PRNGKey(0)), obs

@@ -29,7 +29,7 @@ from rejeu.loops import finite
 from rejeu.loops.learner import Learner, PackedState
 from rejeu.loops.run import Progress, Run, initial_run
 from rejeu.loops.training_call import TrainingCall
-from rejeu.normalization import normalised
+from rejeu.normalization import normalized
 from rejeu.reporting.history import History
 from rejeu.reporting.logging import Logger
 
@@ -202,7 +202,7 @@ class BaseAgent(ABC):
         algorithm = self.algorithm.make(self.config, observation_space, action_space)
         if self.config.normalize is not None:
             explorer = exploration.make(algorithm, noise)
-            algorithm = normalised(algorithm, explorer, self.obs_leaves, self.config.normalize, self.config.gamma)
+            algorithm = normalized(algorithm, explorer, self.obs_leaves, self.config.normalize, self.config.gamma)
         self.learner = Learner(algorithm, noise, self.config.nonfinite == "skip")
 
     def n_threads(self, n_envs: int) -> int:

@@ -102,7 +102,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
     try:
         saved = convert(header, AgentHeader)
         said = _with_widths(saved.config, kind)
-        config = configs.rebuild(kind, said, _custom(changes))
+        config = configs.rebuild(kind, said, configs.own_changes(said, changes))
         largest = max(spaces.MAX_NUMBERS, room)
         observation_space = spaces.rebuild(saved.observation_space, largest)
         check_policy(saved.policy, observation_space)
@@ -162,14 +162,6 @@ def check_sizes(config: Any, room: int) -> None:
     for key, value in [*numbers.items(), *((key, max(layers, default=0)) for key, layers in widths.items())]:
         if value > largest:
             raise CheckpointError(f"{key}={value} is larger than all that the file holds; it has other networks")
-
-
-def _custom(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns only torso and goal strategy among the changes; a file with a custom one cannot be checked without it."""
-    policy, replay = changes.get("policy_kwargs"), changes.get("replay_buffer_kwargs")
-    torso = {"torso": policy["torso"]} if isinstance(policy, Mapping) and "torso" in policy else {}
-    is_own = isinstance(replay, Mapping) and callable(replay.get("goal_selection_strategy"))
-    return ({"policy_kwargs": torso} if torso else {}) | ({"replay_buffer_kwargs": replay} if is_own else {})
 
 
 A = TypeVar("A", bound=BaseAgent)

@@ -15,7 +15,7 @@ Stable-Baselines3, whose default is PyTorch's, names its ``RMSpropTFLike`` for s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,62 +24,61 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic import (
     ActorCritic,
     OnPolicyConfig,
     Samples,
     action_kind,
-    check_flag,
     check_value_rate,
+    clip_and_descend,
     entropy_of,
     explained_variance,
     explorer_of,
-    is_value,
     masked_mean,
     samples,
-    standardised,
+    standardized,
 )
 from rejeu.algorithms.config import with_widths
-from rejeu.algorithms.ppo import descend
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_action, leaves
-from rejeu.validation import number
-
-RMSPROP_DECAY = 0.99
-"""Share of RMSprop's running mean of squared gradients that stays at each step (the paper's alpha)."""
+from rejeu.validation import convert, flag, number
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """Hyper-parameters of A2C; the defaults are Stable-Baselines3's, but for the kind of RMSprop (see the top)."""
+    """Hyper-parameters of A2C; the defaults are Stable-Baselines3's, except for the variant of RMSprop (see above)."""
 
     learning_rate: float | Schedule = 7e-4
-    """Step size of the optimizer; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
-    ``"lin_7e-4"``. Raising it learns faster until it diverges."""
+    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    ``"lin_7e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
     n_steps: int = 5
-    """Steps of each environment between two updates. Raising it estimates the gradient better and updates more rarely."""
+    """Steps of each environment between two updates. A larger number estimates the gradient better and updates less
+    often."""
     gae_lambda: float = 1.0
-    """Mixes advantages of all lengths, in [0, 1]: 0 trusts the value after one step, 1 sums all rewards of the rollout.
-    Raising it has less bias and more variance."""
+    """Lambda of generalized advantage estimation, in [0, 1]: 0 bootstraps after one step, 1 sums all rewards of the
+    rollout. A larger value has less bias and more variance."""
     normalize_advantage: bool = False
-    """Scale the advantages of every rollout to mean 0 and standard deviation 1."""
+    """Normalize the advantages of every rollout to mean 0 and standard deviation 1."""
     use_rms_prop: bool = True
     """Use RMSprop as the paper does; False uses Adam."""
     rms_prop_eps: float = 1e-5
-    """Added to RMSprop's mean of squared gradients before the root is taken, and to Adam's root itself. Raising it shortens
-    the steps of rarely used weights."""
+    """Epsilon of RMSprop, added before the square root, and of Adam, added after it."""
+
+    optimizer: Any = None
+    """As for the other algorithms, such as ``"adamw"`` or ``optax.lamb``. None follows ``use_rms_prop``."""
 
     name: ClassVar[str] = "A2C"
 
     def __post_init__(self) -> None:
         OnPolicyConfig.__post_init__(self)
-        check_flag("use_rms_prop", self.use_rms_prop)
-        object.__setattr__(self, "rms_prop_eps", number("rms_prop_eps", self.rms_prop_eps, above=0))
+        convert(self, "use_rms_prop", flag)
+        convert(self, "rms_prop_eps", number, above=0)
 
 
 class State(eqx.Module):
-    """Everything that A2C learns, every leaf an array."""
+    """Everything that A2C learns; every leaf is an array."""
 
     network: ActorCritic
     optimizer: PyTree
@@ -88,7 +87,7 @@ class State(eqx.Module):
 
 
 class Losses(NamedTuple):
-    """What a rollout came to, each ``float32[]``."""
+    """The losses of a rollout, each ``float32[]``."""
 
     policy_loss: Array
     value_loss: Array
@@ -105,12 +104,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
     check_value_rate(config, obs_leaves)
     shape = with_widths(config, obs_leaves).policy_kwargs
-    eps = config.rms_prop_eps
-    optimizer = (
-        optax.scale_by_rms(RMSPROP_DECAY, eps, initial_scale=1.0)
-        if config.use_rms_prop
-        else optax.scale_by_adam(eps=eps)
-    )
+    optimizer = optimizer_of(config)
 
     def init(key: Array) -> State:
         network = ActorCritic(key, obs_leaves, kind, shape, config.use_sde)
@@ -125,10 +119,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
         if config.normalize_advantage:
-            data = data._replace(advantage=standardised(data.advantage, data.valid))
+            data = data._replace(advantage=standardized(data.advantage, data.valid))
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.network, data, config, clock)
-        network, optimizer_state = descend(
-            state.network, state.optimizer, gradients, is_value(state.network), optimizer, config, clock
+        network, optimizer_state = clip_and_descend(
+            state.network, gradients, state.optimizer, optimizer, config, clock.progress
         )
         metrics = losses._asdict()
         metrics["explained_variance"] = explained_variance(data.value, data.target, data.valid)
@@ -143,8 +137,15 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
 
 
+def optimizer_of(config: Config) -> optax.GradientTransformation:
+    """Returns the optimizer of a configuration: RMSprop, unless it chooses another."""
+    if config.optimizer is None and config.use_rms_prop:
+        return optax.scale_by_rms(optimizers.RMSPROP_DECAY, config.rms_prop_eps, initial_scale=1.0)
+    return optimizers.make(config.optimizer or "adam", eps=config.rms_prop_eps)
+
+
 def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
-    """Returns the whole loss of a rollout, and its parts (see the top of this file)."""
+    """Returns the total loss of a rollout and its parts (see the docstring of this module)."""
     distribution, value = network.both(batch.obs)
     log_prob = distribution.log_prob(batch.action)
     policy_loss = -masked_mean(batch.advantage * log_prob, batch.valid)

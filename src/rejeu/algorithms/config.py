@@ -1,83 +1,93 @@
-"""How hyper-parameters are declared, checked, documented and saved.
+"""The hyper-parameters of off-policy algorithms, and configurations as JSON.
 
-A configuration is a frozen dataclass whose every field carries an attribute docstring; the command line, ``help()`` and
-the documentation are made from it. It accepts what Stable-Baselines3 users write, keeps it in one hashable form, and
-turns into JSON and back.
+A configuration is a frozen, hashable dataclass. Each field has an attribute docstring, from which ``help()``, the command
+line and the documentation are generated. Values are given in the form of Stable-Baselines3 and converted when the
+configuration is created.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import optax
+
 from rejeu import normalization, schedules
+from rejeu.algorithms import optimizers
 from rejeu.buffers.hindsight import HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.errors import CheckpointError
 from rejeu.exploration import noise as action_noises
-from rejeu.loops import finite
 from rejeu.networks import PolicyConfig, Widths, reads_image, settled
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
-from rejeu.validation import C, build, nested, number, whole
+from rejeu.validation import C, assign, build, choice, convert, flag, nested, number, whole
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
-"""Names for ``replay_buffer_class`` and what configures each."""
+"""The replay buffers by name, and the configuration of each."""
+OWN = "own"
+"""Key of the name by which a file mentions an object of the user's own."""
+OWN_MODULES = ("encoder", "torso", "head")
+"""Settings of ``policy_kwargs`` that are modules of the user's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyConfig:
-    """What every algorithm that learns from replayed experience can be told."""
+    """The hyper-parameters of every algorithm with a replay buffer."""
 
     learning_rate: float | Schedule = 3e-4
-    """Step size of Adam for every network; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
-    ``"lin_3e-4"``. Raising it learns faster until it diverges."""
+    """Step size of every network's optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    ``"lin_3e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
     buffer_size: int = 1_000_000
-    """Most steps that the replay buffer keeps, over all environments; the oldest make room. Raising it remembers longer
-    and takes memory in proportion."""
+    """Maximum number of steps in the replay buffer, over all environments. The oldest are overwritten. Memory is
+    proportional to it."""
     learning_starts: int = 100
-    """Environment steps of uniformly random actions before learning begins."""
+    """Environment steps with uniformly random actions before learning starts."""
     batch_size: int = 256
-    """Transitions per gradient step. Raising it gives a steadier, dearer step."""
+    """Transitions per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
     tau: float = 0.005
-    """Share of the online network that flows into the target network at each gradient step, in (0, 1]."""
+    """Coefficient of the soft update of the target network (Polyak averaging), in (0, 1]."""
     gamma: float = 0.99
-    """Discount factor, in [0, 1]. Raising it looks further ahead."""
+    """Discount factor, in [0, 1]."""
     train_freq: int | tuple[int, Literal["step", "episode"]] = 1
-    """Learn every so many environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
-    environments together, whatever their number."""
+    """Update every ``train_freq`` environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
+    environments together."""
     gradient_steps: int = 1
-    """Gradient steps each time; -1 means as many as environment steps were taken since the last time."""
-    action_noise: action_noises.Noise | float | str | None = None
+    """Gradient steps per update; -1 takes as many as there were environment steps since the last update."""
+    action_noise: Any = None
     """Noise added to the actions of the training policy: a standard deviation for actions in [-1, 1] such as 0.1,
-    ``"ou(0.2)"``, or an object such as ``NormalActionNoise(mean, sigma)``. None for none."""
+    ``"ou(0.2)"``, an object such as ``NormalActionNoise(mean, sigma)``, or one of your own. None for no noise."""
     replay_buffer_class: str = "ReplayBuffer"
     """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not."""
     replay_buffer_kwargs: HindsightConfig | None = None
     """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``."""
     n_steps: int = 1
-    """Rewards summed before bootstrapping: n-step returns. Raising it spreads rewards faster, off-policy with some bias."""
+    """Number of rewards summed before bootstrapping (n-step returns). Larger values propagate rewards faster, with some
+    off-policy bias."""
     priorities: PriorityConfig | None = None
-    """Draw steps by their TD error: ``dict(alpha=0.6, beta=0.4)`` or ``{}`` for the defaults. None draws uniformly."""
+    """Prioritized experience replay: ``dict(alpha=0.6, beta=0.4)``, or ``{}`` for the defaults. None samples uniformly."""
     frame_stack: int | None = None
-    """Observations are stacks of this many frames along the first axis; only the newest is stored and stacks are built
-    when sampled, so the replay buffer takes that many times less memory. None stores observations as they are."""
+    """Number of frames that observations stack along the first axis. The replay buffer then stores each frame once and
+    builds the stacks when it samples. None stores observations as they are."""
     normalize: NormalizationConfig | None = None
-    """Scale observations and rewards by what has been seen: True, or a dict with ``norm_obs``, ``norm_reward``,
-    ``clip_obs``, ``clip_reward``. The statistics are learnt and saved with the agent, which takes raw observations."""
-    nonfinite: finite.Nonfinite = "stop"
-    """What to do when an update leaves a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
-    it and saves the batch, or ``"skip"`` that update as if its batch had never been drawn, and count it."""
+    """Normalize observations and rewards by running statistics: True, or a dict with ``norm_obs``, ``norm_reward``,
+    ``clip_obs``, ``clip_reward``. The statistics are saved with the agent, which takes raw observations."""
+    nonfinite: Literal["stop", "skip"] = "stop"
+    """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
+    it and saves the batch, or ``"skip"`` that update and count it."""
     overlap: bool = True
-    """Step the environments while the newest update is computed: an action then follows the update of the step before the
-    last, in a fixed order, so that runs repeat exactly. False waits for the newest weights before every action; slower."""
+    """Step the environments while the update is computed: an action then uses the weights of the update before the last, in
+    a fixed order, so that runs are reproducible. False waits for the newest weights before every action and is slower."""
+    optimizer: Any = "adam"
+    """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, an Optax
+    optimizer such as ``optax.lamb``, or one that was created with the learning rate 1, which is then ``learning_rate``."""
     policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
-    (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``) or a ``torso`` of your
-    own."""
+    (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``), or modules of your own
+    as ``encoder``, ``torso`` and ``head``."""
 
     name: ClassVar[str] = ""
     hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
@@ -86,58 +96,26 @@ class OffPolicyConfig:
     """The same where the observation is an image."""
 
     def __post_init__(self) -> None:
-        put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
-        put("learning_rate", schedules.parse("learning_rate", self.learning_rate))
-        if min(schedules.at(self.learning_rate, 0.0), schedules.at(self.learning_rate, 1.0)) < 0:
-            raise ValueError(f"learning_rate={self.learning_rate!r} must not fall below 0: the agent would unlearn")
-        for key in ("buffer_size", "batch_size"):
-            put(key, whole(key, getattr(self, key), least=1))
-        put("learning_starts", whole("learning_starts", self.learning_starts, least=0))
-        put("tau", number("tau", self.tau, above=0, most=1))
-        put("gamma", number("gamma", self.gamma, least=0, most=1))
-        put("train_freq", _train_freq(self.train_freq))
-        put("gradient_steps", whole("gradient_steps", self.gradient_steps, least=-1))
-        if self.gradient_steps == 0:
-            raise ValueError(
-                "gradient_steps=0 would never learn; use 1 or more, or -1 for as many as environment steps"
-            )
+        convert(self, "learning_rate", schedules.parse, least=0)
+        convert(self, "optimizer", optimizers.parse)
+        convert(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1)
+        convert(self, "frame_stack", whole, least=1, optional=True)
+        convert(self, "learning_starts", whole, least=0)
+        convert(self, "tau", number, above=0, most=1)
+        convert(self, "gamma", number, least=0, most=1)
+        convert(self, "train_freq", train_freq)
+        convert(self, "gradient_steps", gradient_steps)
+        convert(self, "overlap", flag)
+        convert(self, "priorities", nested, kind=PriorityConfig, optional=True)
+        assign(self, normalize=normalization.parse(self.normalize), action_noise=action_noises.parse(self.action_noise))
+        convert(self, "nonfinite", choice, among=("stop", "skip"))
+        convert(self, "policy_kwargs", nested, kind=PolicyConfig)
+        convert(self, "replay_buffer_class", buffer_name)
+        convert(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
         if self.batch_size > self.buffer_size:
             raise ValueError(
                 f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "
                 f"try buffer_size={max(10 * self.batch_size, 10_000)} or batch_size={self.buffer_size}"
-            )
-        put("action_noise", action_noises.parse(self.action_noise))
-        put("n_steps", whole("n_steps", self.n_steps, least=1))
-        if not isinstance(self.overlap, bool):
-            raise ValueError(f"overlap={self.overlap!r} must be True or False")
-        if self.priorities is not None:
-            put("priorities", nested("priorities", PriorityConfig, self.priorities))
-        if self.frame_stack is not None:
-            put("frame_stack", whole("frame_stack", self.frame_stack, least=1))
-        put("normalize", normalization.parse(self.normalize))
-        put("nonfinite", finite.parse(self.nonfinite))
-        put("policy_kwargs", nested("policy_kwargs", PolicyConfig, self.policy_kwargs))
-        self._parse_replay()
-
-    def _parse_replay(self) -> None:
-        kind = self.replay_buffer_class
-        key = (
-            "ReplayBuffer" if kind is None else kind if isinstance(kind, str) else getattr(kind, "__name__", repr(kind))
-        )
-        if key not in REPLAY_BUFFERS:
-            raise ValueError(f"replay_buffer_class={key!r} is unknown; choose one of {', '.join(REPLAY_BUFFERS)}")
-        settings = REPLAY_BUFFERS[key]
-        object.__setattr__(self, "replay_buffer_class", key)
-        if settings is None:
-            if self.replay_buffer_kwargs:
-                raise ValueError(
-                    f"replay_buffer_kwargs={self.replay_buffer_kwargs!r} has no meaning for {key}; "
-                    "did you forget replay_buffer_class=HerReplayBuffer?"
-                )
-            object.__setattr__(self, "replay_buffer_kwargs", None)
-        else:
-            object.__setattr__(
-                self, "replay_buffer_kwargs", nested("replay_buffer_kwargs", settings, self.replay_buffer_kwargs or {})
             )
 
     @property
@@ -147,27 +125,53 @@ class OffPolicyConfig:
 
 
 def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any]) -> C:
-    """Returns the configuration of a file with some settings changed; of ``policy_kwargs`` only those that are named.
+    """Returns the configuration of a file with some settings changed; of ``policy_kwargs`` only the given ones.
 
     Raises:
-        CheckpointError: if the file names a ``torso`` of the user's own and none is given.
+        CheckpointError: if the file mentions an object of the user's own, such as a ``torso``, and none is given.
     """
     merged = {**saved, **changes}
     policy, old = changes.get("policy_kwargs"), saved.get("policy_kwargs")
     if isinstance(policy, Mapping) and isinstance(old, Mapping):
         replaced = ("pi", "qf", "vf") if "net_arch" in policy else ()
         merged["policy_kwargs"] = {key: value for key, value in old.items() if key not in replaced} | dict(policy)
-    policy = merged.get("policy_kwargs")
-    if isinstance(policy, Mapping) and isinstance(torso := policy.get("torso"), str):
+    for keys, name in own_names(merged):
+        argument = f"{keys[-1]}={name}"
+        for key in keys[-2::-1]:
+            argument = f"{key}=dict({argument})"
         raise CheckpointError(
-            f"its networks have a torso of your own, {torso[:40]!r}, and no file holds code; give it again: "
-            f"load(path, policy_kwargs=dict(torso={torso[:40]}))"
+            f"its {keys[-1]} is your own, {name!r}, and no file holds code; give it again: load(path, {argument})"
         )
     return build(kind, merged)
 
 
+def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yields the path and the name of each object of the user's own that the configuration of a file mentions."""
+    for key, value in saved.items():
+        if isinstance(value, Mapping) and set(value) == {OWN}:
+            yield (key,), str(value[OWN])[:40]
+        elif key in OWN_MODULES and isinstance(value, str):  # as older files mention a torso
+            yield (key,), value[:40]
+        elif isinstance(value, Mapping):
+            yield from (((key, *keys), name) for keys, name in own_names(value))
+
+
+def own_changes(saved: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns of changed settings only those that replace objects of the user's own, which a file cannot do without."""
+    mentioned = {keys[0] for keys, _ in own_names(saved)} - {"policy_kwargs"}
+    policy = changes.get("policy_kwargs")
+    modules = {key: policy[key] for key in OWN_MODULES if key in policy} if isinstance(policy, Mapping) else {}
+    own = {key: value for key, value in changes.items() if key in mentioned}
+    return own | ({"policy_kwargs": modules} if modules else {})
+
+
+def is_own(value: Any) -> bool:
+    """Returns whether a setting is code of the user's own, which a file can only mention."""
+    return callable(value) or isinstance(value, optax.GradientTransformation | action_noises.NoiseProcess)
+
+
 def with_widths(config: C, leaves: tuple[Leaf, ...]) -> C:
-    """Returns a configuration whose ``policy_kwargs`` say the widths of hidden layers that were left to the default.
+    """Returns a configuration whose ``policy_kwargs`` give the widths of hidden layers that were left to the default.
 
     These depend on the observation, whose ``leaves`` are given.
     """
@@ -179,29 +183,60 @@ def with_widths(config: C, leaves: tuple[Leaf, ...]) -> C:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """Returns a configuration as plain JSON values, which :func:`build` makes it from again.
+    """Returns a configuration as plain JSON values, from which :func:`build` makes it again.
 
-    A ``torso`` of the user's own is named only, and must be given again (:func:`rebuild`).
+    Objects of the user's own, such as a ``torso``, are only mentioned, and must be given again (:func:`rebuild`).
     """
-    return {field.name: _value_to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    return {field.name: value_to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
-def _value_to_json(value: Any) -> Any:
-    if isinstance(value, schedules.Linear | schedules.Exponential):
+def value_to_json(value: Any) -> Any:
+    """Returns the JSON form of the value of a setting."""
+    if type(value) in schedules.SCHEDULES.values():
         return schedules.to_json(value)
-    if isinstance(value, action_noises.Noise):
+    if type(value) in action_noises.NOISES.values():
         return action_noises.to_json(value)
-    if callable(value) and not isinstance(value, tuple):
-        return getattr(value, "__name__", type(value).__name__)
+    if is_own(value):
+        return {OWN: optimizers.name(value)}
     if dataclasses.is_dataclass(value):
         return to_json(value)
     return list(value) if isinstance(value, tuple) else value
 
 
-def _train_freq(value: Any) -> int | tuple[int, Literal["step", "episode"]]:
+def buffer_name(key: str, value: Any) -> str:
+    """Returns the name of a replay buffer from its name, its class or None."""
+    if value is None:
+        return "ReplayBuffer"
+    name = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
+    if name not in REPLAY_BUFFERS:
+        raise ValueError(f"{key}={name!r} is unknown; choose one of {', '.join(REPLAY_BUFFERS)}")
+    return name
+
+
+def buffer_settings(key: str, value: Any, buffer: str) -> Any:
+    """Returns the settings of the replay buffer of that name, None for one without settings."""
+    kind = REPLAY_BUFFERS[buffer]
+    if kind is not None:
+        return nested(key, value or {}, kind)
+    if value:
+        raise ValueError(
+            f"{key}={value!r} does not apply to {buffer}; did you forget replay_buffer_class=HerReplayBuffer?"
+        )
+    return None
+
+
+def gradient_steps(key: str, value: Any) -> int:
+    """Returns a number of gradient steps: at least 1, or -1 for as many as environment steps."""
+    if value == 0:
+        raise ValueError(f"{key}=0 would never learn; use 1 or more, or -1 for as many as environment steps")
+    return whole(key, value, least=-1)
+
+
+def train_freq(key: str, value: Any) -> int | tuple[int, Literal["step", "episode"]]:
+    """Returns a frequency in steps, or ``(n, "episode")``."""
     if isinstance(value, tuple | list) and len(value) == 2 and value[1] in ("step", "episode"):
-        count = whole("train_freq", value[0], least=1)
+        count = whole(key, value[0], least=1)
         return count if value[1] == "step" else (count, "episode")
     if isinstance(value, int | float):
-        return whole("train_freq", value, least=1)
-    raise ValueError(f"train_freq={value!r} must be a whole number of steps, or (n, 'step') or (n, 'episode')")
+        return whole(key, value, least=1)
+    raise ValueError(f"{key}={value!r} must be a whole number of steps, or (n, 'step') or (n, 'episode')")

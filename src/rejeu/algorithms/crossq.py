@@ -1,7 +1,7 @@
-"""CrossQ: SAC without target networks, steadied by batch renormalisation instead, with wide critics.
+"""CrossQ: SAC without target networks, stabilized by batch renormalization instead, with wide critics.
 
 Source: Bhatt et al. 2024, "CrossQ: Batch Normalization in Deep Reinforcement Learning for Greater Sample Efficiency and
-Simplicity" (arXiv 1902.05605). Batch normalisation fails in a critic that sees ``(s, a)`` in one pass and ``(s', a')``,
+Simplicity" (arXiv 1902.05605). Batch normalization fails in a critic that sees ``(s, a)`` in one pass and ``(s', a')``,
 which are distributed otherwise, in another. Here they go through together and share their statistics. With policy
 ``pi``, critics ``Q_i``, temperature ``alpha`` and discount ``d`` (0 where the MDP terminated)::
 
@@ -9,7 +9,7 @@ which are distributed otherwise, in another. Here they go through together and s
     [Q_i(s, a), Q_i(s', a')]    = one training pass of both halves through Q_i
     y                           = r + d (min_i Q_i(s', a') - alpha log pi(a' | s')),      not differentiated
     J_Q                         = sum_i mean (Q_i(s, a) - y)^2 / 2
-    J_pi                        = mean (alpha log pi(a | s) - min_i Q_i(s, a)),           a ~ pi(. | s), reparameterised
+    J_pi                        = mean (alpha log pi(a | s) - min_i Q_i(s, a)),           a ~ pi(. | s), reparameterized
 
 and every ``policy_delay``-th time, after the critics, the actor takes a step and with it the temperature, whose loss is
 SAC's (:mod:`rejeu.algorithms.sac`). A network goes by the batch's statistics, and its running ones move on, only while
@@ -21,37 +21,28 @@ As in Stable-Baselines3 Contrib, the critics are 1024 wide by default, where the
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.algorithms.sac import LOG_STD_RANGE, initial_temperature, temperature_loss
-from rejeu.core import (
-    TD_ERROR,
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    descend,
-    ensemble,
-    value_and_grad,
-    weighted_mean,
-)
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.sac import temperature
+from rejeu.algorithms.sac.continuous import LOG_STD_RANGE
+from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of, temperature_step
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
 from rejeu.distributions import TanhNormal
 from rejeu.networks import PolicyConfig, Widths
-from rejeu.networks.batch_renorm import RenormalisedNetwork, with_statistics
+from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
-from rejeu.validation import number, whole
+from rejeu.validation import convert, whole
 
 ACTOR_LAYERS = (256, 256)
 """Default widths of the actor."""
@@ -62,24 +53,17 @@ ADAM_B1 = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OffPolicyConfig):
+class Config(EntropyConfig):
     """Hyper-parameters of CrossQ; the defaults are those of Stable-Baselines3 Contrib."""
 
     learning_rate: float | Schedule = 1e-3
-    """Step size of Adam for every network; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
-    ``"lin_1e-3"``."""
+    """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    ``"lin_1e-3"`` or a function of the progress from 0 to 1."""
     policy_delay: int = 3
-    """Gradient steps of the critics to one of actor and temperature. Raising it computes less."""
+    """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
     renorm_warmup_steps: int = 100_000
-    """Training passes through each layer that are normalised by the batch alone, before its renormalisation begins; the
+    """Training passes through each layer that are normalized by the batch alone, before its renormalization begins; the
     actor's count is ``policy_delay`` times slower."""
-    n_critics: int = 2
-    """Number of critics; the least of their values is the target."""
-    ent_coef: float | str = "auto"
-    """Temperature of the entropy bonus: ``"auto"`` learns it from 1, ``"auto_0.1"`` from 0.1, a number fixes it.
-    Raising it explores more."""
-    target_entropy: float | str = "auto"
-    """Entropy in nats that the automatic temperature steers to; ``"auto"`` is minus the number of action dimensions."""
     # A class variable in place of the inherited field takes the field away: CrossQ(tau=...) is then an unknown setting.
     tau: ClassVar[float] = 1.0  # type: ignore[misc]
 
@@ -88,21 +72,17 @@ class Config(OffPolicyConfig):
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
 
     def __post_init__(self) -> None:
-        OffPolicyConfig.__post_init__(self)
-        initial_temperature(self.ent_coef)
-        if self.target_entropy != "auto":
-            object.__setattr__(self, "target_entropy", number("target_entropy", self.target_entropy))
-        for key in ("policy_delay", "n_critics"):
-            object.__setattr__(self, key, whole(key, getattr(self, key), least=1))
-        object.__setattr__(self, "renorm_warmup_steps", whole("renorm_warmup_steps", self.renorm_warmup_steps, least=0))
+        EntropyConfig.__post_init__(self)
+        convert(self, "policy_delay", whole, least=1)
+        convert(self, "renorm_warmup_steps", whole, least=0)
         check_shape(self.policy_kwargs)
 
 
 class State(eqx.Module):
     """Everything that CrossQ learns, every leaf an array; the networks hold their running statistics."""
 
-    actor: RenormalisedNetwork
-    critics: RenormalisedNetwork
+    actor: RenormalizedNetwork
+    critics: RenormalizedNetwork
     """All critics, stacked along a leading axis."""
     log_alpha: Array
     actor_optimizer: PyTree
@@ -123,88 +103,78 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     Raises:
         ValueError: if the action space is not a finite Box.
-        TypeError: if the observation space holds something that is no array.
+        TypeError: if the observation space holds something that is not an array.
     """
-    box = check_box_action(action_space, "CrossQ")
-    obs_leaves, action_dim, shape = leaves(observation_space), action_dimension(box), config.policy_kwargs
-    target_entropy = -float(action_dim) if config.target_entropy == "auto" else float(config.target_entropy)
-    optimizer, alpha_descent = optax.scale_by_adam(b1=ADAM_B1), optax.scale_by_adam()
+    action_dim = action_dimension(check_box_action(action_space, config.name))
+    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
+    target_entropy = config.entropy_target(-float(action_dim))
+    optimizer = optimizers.make(config.optimizer, b1=ADAM_B1)
 
-    def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalisedNetwork:
+    def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalizedNetwork:
         warm_up = config.renorm_warmup_steps
-        return RenormalisedNetwork(key, obs_leaves, n_actions, n_outputs, widths, shape.activation_fn, warm_up)
+        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, widths, shape.activation_fn, warm_up)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
         actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(ACTOR_LAYERS))
         widths = shape.critic_widths(CRITIC_LAYERS)
         critics = ensemble(lambda k: network(k, action_dim, 1, widths), critics_key, config.n_critics)
-        log_alpha = jnp.log(jnp.float32(initial_temperature(config.ent_coef)))
+        log_alpha, alpha_optimizer = temperature.initial(config)
         return State(
             actor=actor,
             critics=critics,
             log_alpha=log_alpha,
             actor_optimizer=optimizer.init(actor),
             critics_optimizer=optimizer.init(critics),
-            alpha_optimizer=alpha_descent.init(log_alpha),
+            alpha_optimizer=alpha_optimizer,
             actor_loss=jnp.float32(0.0),
             entropy=jnp.float32(0.0),
             key=update_key,
             n_updates=jnp.int32(0),
         )
 
-    def explore(actor: RenormalisedNetwork, obs: PyTree, key: Array, clock: Clock) -> Array:
+    def explore(actor: RenormalizedNetwork, obs: PyTree, key: Array, clock: Clock) -> Array:
         return distribution(actor(obs)).sample(key)
 
-    def exploit(actor: RenormalisedNetwork, obs: PyTree) -> Array:
+    def exploit(actor: RenormalizedNetwork, obs: PyTree) -> Array:
         return distribution(actor(obs)).mode()
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate = at(config.learning_rate, clock.progress)
-        alpha = jnp.exp(state.log_alpha)
+        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
         next_action, next_log_prob = distribution(state.actor(batch.next_obs)).sample_and_log_prob(target_key)
-        (critic_loss, (values, target, trained)), gradients = value_and_grad(critics_loss, has_aux=True)(
-            state.critics, batch, next_action, alpha * next_log_prob
+        critics, critics_optimizer, critic_loss, (values, target, trained) = minimize(
+            critics_loss,
+            state.critics,
+            state.critics_optimizer,
+            optimizer,
+            rate,
+            batch,
+            next_action,
+            alpha * next_log_prob,
         )
-        critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
         critics, n_updates = with_statistics(critics, trained), state.n_updates + 1
 
         def delayed(state: State) -> State:
-            (policy_loss, (log_prob, trained)), gradients = value_and_grad(actor_loss, has_aux=True)(
-                state.actor, critics, alpha, batch.obs, actor_key
+            actor, actor_optimizer, policy_loss, (log_prob, trained) = minimize(
+                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
             )
-            actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
-            log_alpha, alpha_optimizer = state.log_alpha, state.alpha_optimizer
-            if isinstance(config.ent_coef, str):
-                gradient = jax.grad(temperature_loss)(log_alpha, log_prob, target_entropy)
-                log_alpha, alpha_optimizer = descend(log_alpha, gradient, alpha_optimizer, alpha_descent, rate)
-            return eqx.tree_at(
-                lambda s: (s.actor, s.actor_optimizer, s.log_alpha, s.alpha_optimizer, s.actor_loss, s.entropy),
+            log_alpha, alpha_optimizer = temperature_step(
+                state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
+            )
+            return dataclasses.replace(
                 state,
-                (
-                    with_statistics(actor, trained),
-                    actor_optimizer,
-                    log_alpha,
-                    alpha_optimizer,
-                    policy_loss,
-                    -jnp.mean(log_prob),
-                ),
+                actor=with_statistics(actor, trained),
+                actor_optimizer=actor_optimizer,
+                log_alpha=log_alpha,
+                alpha_optimizer=alpha_optimizer,
+                actor_loss=policy_loss,
+                entropy=-jnp.mean(log_prob),
             )
 
-        state = eqx.tree_at(
-            lambda s: (s.critics, s.critics_optimizer, s.n_updates), state, (critics, critics_optimizer, n_updates)
-        )
+        state = dataclasses.replace(state, critics=critics, critics_optimizer=critics_optimizer, n_updates=n_updates)
         state = jax.lax.cond(n_updates % config.policy_delay == 0, delayed, lambda s: s, state)
-        metrics = {
-            "critic_loss": critic_loss,
-            "actor_loss": state.actor_loss,
-            "ent_coef": alpha,
-            "entropy": state.entropy,
-            "q_value": jnp.mean(values),
-            TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
-        }
-        return state, metrics
+        return state, metrics_of(critic_loss, state.actor_loss, alpha, state.entropy, values, target)
 
     def values(state: State, obs: PyTree, action: Array | None) -> Array:
         return jax.vmap(lambda critic: critic(obs, action)[:, 0])(state.critics)
@@ -213,23 +183,25 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
 
 def check_shape(shape: PolicyConfig) -> None:
-    """Raises ``ValueError`` for network shapes other than plain layers: CrossQ puts its normalisation between them."""
+    """Raises ``ValueError`` for network shapes other than plain layers: CrossQ puts its normalization between them."""
     given = {
         "layer_norm": shape.layer_norm,
+        "encoder": shape.encoder is not None,
+        "head": shape.head is not None,
         "architecture": shape.architecture != "mlp",
         "torso": shape.torso is not None,
         "branches": shape.has_branches,
     }
     if refused := [key for key, present in given.items() if present]:
         raise ValueError(
-            f"CrossQ renormalises layers of its own; its policy_kwargs take net_arch and activation_fn, not "
+            f"CrossQ renormalizes layers of its own; its policy_kwargs take net_arch and activation_fn, not "
             f"{', '.join(refused)}: leave that out, or use SAC or TQC"
         )
 
 
 def joint_values(
-    critics: RenormalisedNetwork, batch: Transition, next_action: Array
-) -> tuple[Array, Array, RenormalisedNetwork]:
+    critics: RenormalizedNetwork, batch: Transition, next_action: Array
+) -> tuple[Array, Array, RenormalizedNetwork]:
     """Returns the values of ``(s, a)`` and of ``(s', a')``, ``(n_critics, batch)`` each, from one pass of both.
 
     The critics are in training; they are returned as they are after having seen the batch.
@@ -242,7 +214,7 @@ def joint_values(
 
 
 def td_target(next_values: Array, next_entropy_cost: Array, batch: Transition) -> Array:
-    """Returns what the critics should say of the batch, ``(batch,)``; nothing is differentiated.
+    """Returns the TD targets, ``(batch,)``, without gradient.
 
     Args:
         next_values: of ``(s', a')`` by each critic, ``(n_critics, batch)``.
@@ -253,8 +225,8 @@ def td_target(next_values: Array, next_entropy_cost: Array, batch: Transition) -
 
 
 def critics_loss(
-    critics: RenormalisedNetwork, batch: Transition, next_action: Array, next_entropy_cost: Array
-) -> tuple[Array, tuple[Array, Array, RenormalisedNetwork]]:
+    critics: RenormalizedNetwork, batch: Transition, next_action: Array, next_entropy_cost: Array
+) -> tuple[Array, tuple[Array, Array, RenormalizedNetwork]]:
     """Returns half the squared TD error, averaged over the batch and summed over critics.
 
     With it come the values ``(n_critics, batch)``, the target ``(batch,)`` and the critics that have seen the batch.
@@ -273,8 +245,8 @@ def distribution(outputs: Array) -> TanhNormal:
 
 
 def actor_loss(
-    actor: RenormalisedNetwork, critics: RenormalisedNetwork, alpha: Array, obs: PyTree, key: Array
-) -> tuple[Array, tuple[Array, RenormalisedNetwork]]:
+    actor: RenormalizedNetwork, critics: RenormalizedNetwork, alpha: Array, obs: PyTree, key: Array
+) -> tuple[Array, tuple[Array, RenormalizedNetwork]]:
     """Returns the soft policy loss, the critics judging by their running statistics.
 
     With it come the log-probabilities of the actions drawn, ``(batch,)``, and the actor that has seen the batch.

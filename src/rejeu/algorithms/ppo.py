@@ -1,4 +1,4 @@
-"""Proximal policy optimisation: several epochs over each rollout, the policy held near the one that collected it.
+"""Proximal policy optimization: several epochs on each rollout, with the policy kept near the one that collected it.
 
 Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms" (arXiv 1707.06347, equations 7 and 9), with the
 advantages of Schulman et al. 2016 (see :mod:`rejeu.algorithms.actor_critic.gae`). With the policy ``pi``, the policy
@@ -9,13 +9,13 @@ advantages of Schulman et al. 2016 (see :mod:`rejeu.algorithms.actor_critic.gae`
     J_V      = mean (V(s) - R)^2;     with value clipping V is V_old + clip(V - V_old, -epsilon_V, epsilon_V)
     loss     = J_pi + vf_coef J_V - ent_coef mean entropy(pi(. | s))
 
-Advantages are standardised in each minibatch; gradients are clipped to a norm; weights begin orthogonal: the details of
+Advantages are standardized in each minibatch; gradients are clipped to a norm; weights begin orthogonal: the details of
 Huang et al. 2022, "The 37 Implementation Details of PPO". As in Stable-Baselines3, value clipping bounds the value
 rather than taking the greater of two losses. Unlike there, log-probabilities and values of the rollout are computed at its
-end in one pass, a last minibatch that is not full counts only what it holds, and Box actions live in [-1, 1] whatever the
-environment's bounds are, so that one initial standard deviation suits all.
+end in one pass, a last, smaller minibatch is padded and the padding is not counted, and Box actions are in [-1, 1] whatever
+the environment's bounds are, so that one initial standard deviation suits all.
 
-Updates stop early where the policy has moved further than ``1.5 target_kl``, measured on a minibatch by the estimate
+Updates stop early if the policy has moved further than ``1.5 target_kl``, measured on a minibatch by the estimate
 ``mean((ratio - 1) - log ratio)`` (Schulman 2020, "Approximating KL Divergence").
 """
 
@@ -33,32 +33,32 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu import schedules
+from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic import (
     ActorCritic,
     OnPolicyConfig,
     Samples,
     action_kind,
     check_value_rate,
-    clipped,
+    clip_and_descend,
     entropy_of,
     explained_variance,
     explorer_of,
-    is_value,
     masked_mean,
     samples,
-    standardised,
+    standardized,
 )
 from rejeu.algorithms.config import with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_action, leaves
-from rejeu.validation import number, whole
+from rejeu.validation import convert, number, whole
 
 ADAM_EPSILON = 1e-5
 """Added to Adam's denominator, as in the authors' code."""
 KL_FACTOR = 1.5
-"""How many times ``target_kl`` the policy may move before the epochs stop."""
+"""Multiple of ``target_kl`` at which the epochs stop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,34 +66,27 @@ class Config(OnPolicyConfig):
     """Hyper-parameters of PPO; the defaults are Stable-Baselines3's."""
 
     batch_size: int = 64
-    """Steps per gradient step. Raising it gives a steadier, dearer step."""
+    """Steps per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
     n_epochs: int = 10
-    """Passes over every rollout. Raising it learns more from each, until the clipping stops it."""
+    """Passes over every rollout."""
     clip_range: float | Schedule = 0.2
-    """How far the ratio of probabilities may move for gain, epsilon above. Raising it takes larger, riskier steps."""
+    """Clip range of the ratio of probabilities, epsilon above. A larger value takes larger, riskier steps."""
     clip_range_vf: float | Schedule | None = None
-    """How far the value may move in one update, in the reward's unit. None leaves it free."""
+    """Clip range of the value in one update, in the unit of rewards. None: no clipping."""
     target_kl: float | None = None
-    """Stops the epochs once the policy has moved 1.5 times this far, in nats. None never stops."""
+    """Stops the epochs once the KL divergence exceeds 1.5 times this value, in nats. None never stops."""
 
     name: ClassVar[str] = "PPO"
 
     def __post_init__(self) -> None:
         OnPolicyConfig.__post_init__(self)
-        put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
-        for key in ("batch_size", "n_epochs"):
-            put(key, whole(key, getattr(self, key), least=1))
-        for key in ("clip_range", "clip_range_vf"):
-            value = getattr(self, key)
-            if key == "clip_range" or value is not None:
-                put(key, schedules.parse(key, value))
-                if min(schedules.at(getattr(self, key), end) for end in (0.0, 1.0)) < 0:
-                    raise ValueError(f"{key}={value!r} must not fall below 0")
-        if self.target_kl is not None:
-            put("target_kl", number("target_kl", self.target_kl, above=0))
+        convert(self, ("batch_size", "n_epochs"), whole, least=1)
+        convert(self, "clip_range", schedules.parse, least=0)
+        convert(self, "clip_range_vf", schedules.parse, least=0, optional=True)
+        convert(self, "target_kl", number, above=0, optional=True)
 
     def steps_per_gradient(self, n_envs: int) -> int:
-        """Returns how many steps of ``n_envs`` environments one gradient is taken on."""
+        """Returns the number of steps of ``n_envs`` environments per gradient step."""
         return min(self.batch_size, self.n_steps * n_envs)
 
     def learns_from_part(self, n: int, n_envs: int) -> bool:
@@ -101,7 +94,7 @@ class Config(OnPolicyConfig):
         return n >= self.batch_size
 
     def gradient_steps(self, n: int) -> int:
-        """Returns how many gradient steps a rollout of ``n`` steps is worth, if nothing stops them early."""
+        """Returns the number of gradient steps on a rollout of ``n`` steps, if nothing stops them early."""
         return self.n_epochs * -(-n // self.batch_size)
 
     @property
@@ -111,27 +104,27 @@ class Config(OnPolicyConfig):
 
 
 class State(eqx.Module):
-    """Everything that PPO learns, every leaf an array."""
+    """Everything that PPO learns; every leaf is an array."""
 
     network: Any
-    """Policy and value, an :class:`ActorCritic` or, with a memory, a ``RecurrentActorCritic``."""
+    """Policy and value, an :class:`ActorCritic` or, with memory, a ``RecurrentActorCritic``."""
     optimizer: PyTree
     key: Array
     n_updates: Array
     """Gradient steps so far, ``int32[]``."""
     n_rollouts: Array
-    """Rollouts learnt from so far, ``int32[]``."""
+    """Rollouts learned from, ``int32[]``."""
 
 
 class Losses(NamedTuple):
-    """What a minibatch came to, each ``float32[]``."""
+    """The losses of a minibatch, each ``float32[]``."""
 
     policy_loss: Array
     value_loss: Array
     entropy: Array
     approx_kl: Array
     clip_fraction: Array
-    """Share of the ratios beyond the clip range."""
+    """Fraction of the ratios outside the clip range."""
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
@@ -144,7 +137,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
     check_value_rate(config, obs_leaves)
     shape = with_widths(config, obs_leaves).policy_kwargs
-    optimizer = optax.scale_by_adam(eps=ADAM_EPSILON)
+    optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
@@ -194,7 +187,7 @@ def metrics_of(
     config: Config,
     clock: Clock,
 ) -> Metrics:
-    """Returns what is reported of an update."""
+    """Returns the metrics of an update."""
     metrics = losses._asdict()
     metrics["gradient_steps"] = n_steps.astype(jnp.float32)
     metrics["explained_variance"] = explained_variance(value, target, valid)
@@ -205,7 +198,7 @@ def metrics_of(
 
 
 def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
-    """Returns for every epoch an order of all steps at random, the valid ones first, ``int32 (n_epochs, n + padding)``."""
+    """Returns a random order of all steps for every epoch, the valid ones first, ``int32 (n_epochs, n + padding)``."""
     drawn = jax.random.uniform(key, (n_epochs, valid.shape[0])) + jnp.where(valid, 0.0, 2.0)[None]
     return jnp.pad(jnp.argsort(drawn, axis=1).astype(jnp.int32), ((0, 0), (0, n_padding)))
 
@@ -230,11 +223,10 @@ def epochs(
         n_minibatches: of all epochs, ``int32[]``.
         optimizer: without a learning rate.
         config: the hyper-parameters.
-        clock: where the run stands.
+        clock: the progress of the run.
     """
-    value_flags = is_value(network)
 
-    def goes_on(carry: tuple[Array, Array, Any, PyTree, Losses]) -> Array:
+    def continues(carry: tuple[Array, Array, Any, PyTree, Losses]) -> Array:
         i, stopped, *_ = carry
         return (i < n_minibatches) & ~stopped
 
@@ -243,7 +235,7 @@ def epochs(
     ) -> tuple[Array, Array, Any, PyTree, Losses]:
         i, stopped, network, optimizer_state, sums = carry
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(network, minibatch(i), config, clock)
-        after, after_state = descend(network, optimizer_state, gradients, value_flags, optimizer, config, clock)
+        after, after_state = clip_and_descend(network, gradients, optimizer_state, optimizer, config, clock.progress)
         if config.target_kl is not None:
             stopped = losses.approx_kl > KL_FACTOR * config.target_kl
             after, after_state = jax.tree.map(
@@ -253,22 +245,22 @@ def epochs(
 
     zero = Losses(*[jnp.float32(0)] * len(Losses._fields))
     begin = (jnp.int32(0), jnp.bool(False), network, optimizer_state, zero)
-    i, stopped, network, optimizer_state, sums = jax.lax.while_loop(goes_on, step, begin)
+    i, stopped, network, optimizer_state, sums = jax.lax.while_loop(continues, step, begin)
     return network, optimizer_state, i - stopped, jax.tree.map(lambda total: total / jnp.maximum(i, 1), sums)
 
 
 def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
-    """Returns the whole loss of a minibatch, and its parts (see the top of this file)."""
+    """Returns the total loss of a minibatch and its parts (see the docstring of this module)."""
     distribution, value = network.both(batch.obs)
     return loss_of(distribution, value, batch, config, clock)
 
 
 def loss_of(distribution: Any, value: Array, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
-    """Returns the same from what the network made of the observations."""
+    """Returns the same from the outputs of the network."""
     log_prob = distribution.log_prob(batch.action)
-    advantage = standardised(batch.advantage, batch.valid) if config.normalize_advantage else batch.advantage
+    advantage = standardized(batch.advantage, batch.valid) if config.normalize_advantage else batch.advantage
     clip = at(config.clip_range, clock.progress)
-    # Padding may hold anything: a ratio that overflows there would turn the gradient to NaN, though it is not counted.
+    # Padding may hold anything: a ratio that overflows there would make the gradient NaN, although it does not count.
     log_ratio = jnp.where(batch.valid, log_prob - batch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
     policy_loss = masked_mean(surrogate(ratio, advantage, clip), batch.valid)
@@ -286,30 +278,3 @@ def loss_of(distribution: Any, value: Array, batch: Samples, config: Config, clo
 def surrogate(ratio: Array, advantage: Array, clip: Any) -> Array:
     """Returns the clipped policy loss of each step (arXiv 1707.06347, equation 7, negated)."""
     return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
-
-
-def descend(
-    network: ActorCritic,
-    optimizer_state: PyTree,
-    gradients: ActorCritic,
-    value_flags: ActorCritic,
-    optimizer: optax.GradientTransformation,
-    config: OnPolicyConfig,
-    clock: Clock,
-) -> tuple[ActorCritic, PyTree]:
-    """Returns network and optimizer state after one step against the clipped gradients.
-
-    Where the value has a learning rate of its own it also has a norm of its own; as Adam treats every weight by itself,
-    that makes two optimizers of one.
-    """
-    rate = at(config.learning_rate, clock.progress)
-    if config.critic_learning_rate is None:
-        gradients, _ = clipped(gradients, config.max_grad_norm)
-        direction, optimizer_state = optimizer.update(gradients, optimizer_state, network)
-        return jax.tree.map(lambda p, d: p - rate * d, network, direction), optimizer_state
-    value_rate = at(config.critic_learning_rate, clock.progress)
-    of_value, of_policy = eqx.partition(gradients, value_flags)
-    gradients = eqx.combine(clipped(of_value, config.max_grad_norm)[0], clipped(of_policy, config.max_grad_norm)[0])
-    direction, optimizer_state = optimizer.update(gradients, optimizer_state, network)
-    step = lambda p, d, is_value: p - (value_rate if is_value else rate) * d  # noqa: E731
-    return jax.tree.map(step, network, direction, value_flags), optimizer_state

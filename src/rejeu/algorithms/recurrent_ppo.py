@@ -1,7 +1,7 @@
-"""PPO with a memory: a recurrent cell between the observation and the hidden layers.
+"""PPO with memory: a recurrent cell between the encoder and the hidden layers.
 
-For environments that do not show all of their state. The policy's memory is begun anew with every episode. Learning
-unrolls the cell over the whole rollout of each environment, from what it remembered at its beginning, and differentiates
+For partially observable environments. The policy's memory is reset at the start of every episode. Learning
+unrolls the cell over the whole rollout of each environment, from its memory at the start, and differentiates
 through all of it; a minibatch is a share of the environments with all their steps, so ``n_steps`` is also the length over
 which the gradient remembers. Losses and advantages are PPO's (see :mod:`rejeu.algorithms.ppo`); the value of a successor
 is read with the memory that the step left.
@@ -20,11 +20,10 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import ppo
+from rejeu.algorithms import optimizers, ppo
 from rejeu.algorithms.actor_critic import (
     HIDDEN_GAIN,
     ActionKind,
@@ -33,44 +32,43 @@ from rejeu.algorithms.actor_critic import (
     Distribution,
     Samples,
     action_kind,
-    check_flag,
+    flat,
     orthogonal,
     unmasked,
+    with_advantages,
 )
-from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew
-from rejeu.networks import Encoder
+from rejeu.networks import make_encoder
 from rejeu.prng import nth
 from rejeu.spaces import Leaf, check_action, leaves
-from rejeu.validation import nested, whole
+from rejeu.validation import choice, convert, flag, nested, whole
 
 
 @dataclass(frozen=True)
 class RecurrentConfig(ActorCriticConfig):
-    """The shape of policy and value networks with a memory."""
+    """The settings of policy and value networks with memory."""
 
     cell: Literal["lstm", "gru"] = "lstm"
-    """Which recurrent cell remembers."""
+    """The recurrent cell."""
     lstm_hidden_size: int = 256
-    """Numbers that it remembers; of an LSTM twice as many. Raising it remembers more and is slower."""
+    """Size of its hidden state; an LSTM has a cell state of the same size."""
     shared_lstm: bool = False
     """Policy and value read the same memory; otherwise each has its own."""
 
     def __post_init__(self) -> None:
         ActorCriticConfig.__post_init__(self)
-        if self.cell not in ("lstm", "gru"):
-            raise ValueError(f"cell={self.cell!r} must be 'lstm' or 'gru'")
-        object.__setattr__(self, "lstm_hidden_size", whole("lstm_hidden_size", self.lstm_hidden_size, least=1))
-        check_flag("shared_lstm", self.shared_lstm)
+        convert(self, "cell", choice, among=("lstm", "gru"))
+        convert(self, "lstm_hidden_size", whole, least=1)
+        convert(self, "shared_lstm", flag)
         if self.share_layers and not self.shared_lstm:
-            raise ValueError("share_layers=True needs shared_lstm=True: layers cannot share what reads two memories")
+            raise ValueError("share_layers=True needs shared_lstm=True: shared layers need a shared memory")
         if self.shared_lstm and not self.share_features_extractor:
             raise ValueError(
-                "policy_kwargs: shared_lstm=True leaves share_features_extractor=False without meaning: one memory reads "
-                "through one encoder; leave out one"
+                "policy_kwargs: shared_lstm=True conflicts with share_features_extractor=False: one memory has "
+                "one encoder; leave out one"
             )
 
 
@@ -79,10 +77,10 @@ class Config(ppo.Config):
     """Hyper-parameters of recurrent PPO; the defaults are those of Stable-Baselines3's contributions."""
 
     n_steps: int = 128
-    """Steps of each environment between two updates, and the length over which gradients remember."""
+    """Steps of each environment between two updates, and the length over which gradients are propagated."""
     batch_size: int = 128
-    """Steps per gradient step, rounded to whole environments with all their steps. Raising it gives a steadier, dearer
-    step."""
+    """Steps per gradient step, rounded to complete environments with all their steps. Larger batches reduce the variance of
+    the gradient at a higher cost."""
     policy_kwargs: RecurrentConfig = dataclasses.field(default_factory=RecurrentConfig)
     """Shape of the networks: ``lstm_hidden_size``, ``cell`` (``"lstm"`` or ``"gru"``), ``shared_lstm``, and what PPO
     takes."""
@@ -90,12 +88,12 @@ class Config(ppo.Config):
     name: ClassVar[str] = "RecurrentPPO"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "policy_kwargs", nested("policy_kwargs", RecurrentConfig, self.policy_kwargs))
+        convert(self, "policy_kwargs", nested, kind=RecurrentConfig)
         ppo.Config.__post_init__(self)
         if self.critic_learning_rate is not None:
             raise ValueError("critic_learning_rate: policy and value read through one encoder here; leave it out")
         if self.use_sde:
-            raise ValueError("use_sde: state-dependent noise is not for policies with a memory; leave it out")
+            raise ValueError("use_sde: state-dependent noise is not available for policies with memory; leave it out")
         if self.n_episodes is not None:
             raise ValueError(
                 "n_episodes: a recurrent policy learns from rollouts of equal length; give n_steps and leave it out"
@@ -114,7 +112,7 @@ class Config(ppo.Config):
         return n // n_envs * envs_per_batch(self, self.n_steps, n_envs) >= self.batch_size
 
     def steps_per_gradient(self, n_envs: int) -> int:
-        """Returns how many steps of ``n_envs`` environments one gradient is taken on."""
+        """Returns the number of steps of ``n_envs`` environments per gradient step."""
         return self.n_steps * envs_per_batch(self, self.n_steps, n_envs)
 
 
@@ -154,7 +152,7 @@ class Cell(eqx.Module):
         return self.recurrent.shape[0]
 
     def empty(self, n: int) -> tuple[Array, ...]:
-        """Returns the memory of ``n`` episodes that have not begun, ``(n, size)`` each."""
+        """Returns the memory at the start of ``n`` episodes, ``(n, size)`` each."""
         return tuple(jnp.zeros((n, self.size), jnp.float32) for _ in range(2 if self.kind == "lstm" else 1))
 
     def project(self, x: Array) -> Array:
@@ -181,8 +179,8 @@ Memory = tuple[tuple[Array, ...], ...]
 class RecurrentActorCritic(eqx.Module):
     """Observation and memory to a distribution over actions and to a value."""
 
-    encoder: Encoder
-    value_encoder: Encoder | None
+    encoder: Any
+    value_encoder: Any
     """Of the value's cell; None where the policy's is shared."""
     cells: tuple[Cell, ...]
     """The policy's, and the value's where it has its own."""
@@ -192,9 +190,9 @@ class RecurrentActorCritic(eqx.Module):
     def __init__(self, key: Array, leaves: tuple[Leaf, ...], action: ActionKind, shape: RecurrentConfig) -> None:
         """Draws the weights."""
         encoder_key, cell_key, reader_key = jax.random.split(key, 3)
-        encoder = Encoder(leaves, encoder_key)
+        encoder = make_encoder(encoder_key, leaves, shape)
         value_key = jax.random.fold_in(encoder_key, 1)
-        value_encoder = None if shape.share_features_extractor else Encoder(leaves, value_key)
+        value_encoder = None if shape.share_features_extractor else make_encoder(value_key, leaves, shape)
         if shape.ortho_init:
             encoder = orthogonal(encoder, encoder_key, HIDDEN_GAIN)
             value_encoder = orthogonal(value_encoder, value_key, HIDDEN_GAIN)
@@ -204,7 +202,7 @@ class RecurrentActorCritic(eqx.Module):
         keys = jax.random.split(cell_key, n_cells)
         self.cells = tuple(Cell(keys[i], self.encoder.n_features, size, shape.cell) for i in range(n_cells))
         remembered = Leaf("", "continuous", (size,), "float32")
-        self.readers = ActorCritic(reader_key, (remembered,), action, shape)
+        self.readers = ActorCritic(reader_key, (remembered,), action, dataclasses.replace(shape, encoder=None))
 
     @property
     def log_std(self) -> Array | None:
@@ -212,11 +210,11 @@ class RecurrentActorCritic(eqx.Module):
         return self.readers.log_std
 
     def empty(self, n: int) -> Memory:
-        """Returns the memory of ``n`` episodes that have not begun."""
+        """Returns the memory at the start of ``n`` episodes."""
         return tuple(cell.empty(n) for cell in self.cells)
 
     def remember(self, memory: Memory, obs: PyTree, ended: Array) -> Memory:
-        """Returns the memory after observations ``(n, ...)``; begun anew where ``ended``, ``bool (n,)``."""
+        """Returns the memory after observations ``(n, ...)``; reset where ``ended``, ``bool (n,)``."""
         features = self.features(unmasked(obs)[0])
         memory = renew(ended, self.empty(ended.shape[0]), memory)
         parts = zip(self.cells, memory, features, strict=True)
@@ -273,7 +271,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     check_action(action_space, config.name)
     obs_leaves, kind = leaves(observation_space), action_kind(action_space)
     shape = with_widths(config, obs_leaves).policy_kwargs
-    optimizer = optax.scale_by_adam(eps=ADAM_EPSILON)
+    optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
@@ -300,7 +298,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         n_steps, n_envs = rollout.reward.shape
-        data, started = samples(state.network, rollout, config.gae_lambda)
+        data, started = unrolled_samples(state.network, rollout, config.gae_lambda)
         size = envs_per_batch(config, n_steps, n_envs)
         n_batches = -(-n_envs // size)
         orders = shuffled(nth(state.key, state.n_rollouts), jnp.ones((n_envs,), bool), config.n_epochs, -n_envs % size)
@@ -333,22 +331,17 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, recall, state_value=value)
 
 
-def samples(network: RecurrentActorCritic, rollout: Rollout, gae_lambda: float) -> tuple[Samples, Array]:
-    """Returns the steps of a rollout, leaves ``(steps, n_envs, ...)``, and where episodes began with one."""
+def unrolled_samples(network: RecurrentActorCritic, rollout: Rollout, gae_lambda: float) -> tuple[Samples, Array]:
+    """Returns the steps of a rollout, leaves ``(steps, n_envs, ...)``, and where an episode starts with a step."""
     shape = rollout.reward.shape
     started = jnp.concatenate([rollout.started[None], rollout.ended[:-1]])
-    after = network.unroll(rollout.carry, rollout.obs, started)
-    flat = lambda tree: jax.tree.map(lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), tree)  # noqa: E731
-    mask = unmasked(rollout.obs)[1]
-    distribution = network.policy(flat(after), None if mask is None else flat(mask))
-    value = network.value(flat(after)).reshape(shape)
+    memory = flat(network.unroll(rollout.carry, rollout.obs, started))
+    mask = flat(unmasked(rollout.obs)[1])
+    log_prob = network.policy(memory, mask).log_prob(flat(rollout.action))
     never = jnp.zeros((shape[0] * shape[1],), bool)
-    next_value = network.value(network.remember(flat(after), flat(rollout.next_obs), never)).reshape(shape)
-    last = jnp.concatenate([~rollout.valid[1:], jnp.ones_like(rollout.valid[:1])])
-    advantage = advantages(rollout.reward, value, next_value, rollout.discount, rollout.ended | last, gae_lambda)
-    log_prob = distribution.log_prob(flat(rollout.action)).reshape(shape)
-    data = Samples(rollout.obs, rollout.action, log_prob, value, advantage, advantage + value, rollout.valid)
-    return data, started
+    next_value = network.value(network.remember(memory, flat(rollout.next_obs), never))
+    evaluated = [x.reshape(shape) for x in (log_prob, network.value(memory), next_value)]
+    return with_advantages(rollout, *evaluated, gae_lambda), started
 
 
 def loss(
@@ -356,9 +349,6 @@ def loss(
 ) -> tuple[Array, Losses]:
     """Returns PPO's loss of environments with all their steps, and its parts."""
     batch, started, memory = minibatch
-    shape = started.shape
-    flat = lambda tree: jax.tree.map(lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), tree)  # noqa: E731
     after = flat(network.unroll(memory, batch.obs, started))
-    mask = unmasked(batch.obs)[1]
-    distribution = network.policy(after, None if mask is None else flat(mask))
+    distribution = network.policy(after, flat(unmasked(batch.obs)[1]))
     return loss_of(distribution, network.value(after), flat(batch._replace(obs=())), config, clock)

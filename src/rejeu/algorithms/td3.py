@@ -1,31 +1,33 @@
-"""Twin delayed deep deterministic policy gradient: DDPG with two critics, smoothed targets and a slower actor.
+"""Twin delayed deep deterministic policy gradient: DDPG with two critics, smoothed targets and delayed actor updates.
 
 Source: Fujimoto et al. 2018, "Addressing Function Approximation Error in Actor-Critic Methods" (arXiv 1802.09477). With
-actor ``mu``, critics ``Q_i``, their slowly moving targets ``mu'`` and ``Q'_i``, and discount ``d`` (0 where the MDP
+actor ``mu``, critics ``Q_i``, target networks ``mu'`` and ``Q'_i``, and discount ``d`` (0 where the MDP
 terminated)::
 
     a'     = clip(mu'(s') + clip(eps, -c, c), -1, 1),    eps ~ N(0, sigma)
     y      = r + d min_i Q'_i(s', a')
     J_Q    = sum_i mean (Q_i(s, a) - y)^2
-    J_mu   = -mean Q_1(s, mu(s))                          every policy_delay-th update, with the moves of all targets
+    J_mu   = -mean Q_1(s, mu(s))                          every policy_delay-th update, with the targets' updates
 
 Everything else is as in :mod:`rejeu.algorithms.ddpg`, Stable-Baselines3's order of steps included.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
-from rejeu.algorithms.ddpg import HIDDEN_LAYERS, actor_loss, policy
+from rejeu.algorithms.ddpg.continuous import actor_loss, explore, policy
+from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS
 from rejeu.core import (
     AVERAGED,
     TD_ERROR,
@@ -37,16 +39,16 @@ from rejeu.core import (
     copy,
     descend,
     ensemble,
+    minimize,
     polyak,
     value_and_grad,
     weighted_mean,
 )
-from rejeu.networks import Actor, Critic, Widths, action_values
+from rejeu.networks import Network, QNetwork, Widths, action_values
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
-from rejeu.validation import number, whole
-from rejeu.xla import outlined
+from rejeu.validation import convert, number, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +56,16 @@ class Config(OffPolicyConfig):
     """Hyper-parameters of TD3; the defaults are those of Stable-Baselines3."""
 
     learning_rate: float | Schedule = 1e-3
-    """Step size of Adam for every network; a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)`` or
-    ``"lin_1e-3"``."""
+    """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    ``"lin_1e-3"`` or a function of the progress from 0 to 1."""
     policy_delay: int = 2
-    """Gradient steps of the critics to one of the actor and the targets."""
+    """Gradient steps of the critics per step of the actor and update of the targets."""
     target_policy_noise: float = 0.2
     """Standard deviation of the noise on the target's actions, in the scale of actions in [-1, 1]."""
     target_noise_clip: float = 0.5
     """Largest size of that noise."""
     n_critics: int = 2
-    """Number of critics; the least of their values is the target."""
+    """Number of critics; the target is the minimum of their values."""
 
     name: ClassVar[str] = "TD3"
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
@@ -71,26 +73,24 @@ class Config(OffPolicyConfig):
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
-        for key in ("policy_delay", "n_critics"):
-            object.__setattr__(self, key, whole(key, getattr(self, key), least=1))
-        for key in ("target_policy_noise", "target_noise_clip"):
-            object.__setattr__(self, key, number(key, getattr(self, key), least=0))
+        convert(self, ("policy_delay", "n_critics"), whole, least=1)
+        convert(self, ("target_policy_noise", "target_noise_clip"), number, least=0)
 
 
 class State(eqx.Module):
-    """Everything that TD3 learns, every leaf an array."""
+    """Everything that TD3 learns; every leaf is an array."""
 
-    actor: Actor
-    critics: Critic
+    actor: Network
+    critics: QNetwork
     """All critics, stacked along a leading axis."""
-    target_actor: Actor = eqx.field(metadata=AVERAGED)
-    target_critics: Critic = eqx.field(metadata=AVERAGED)
+    target_actor: Network = eqx.field(metadata=AVERAGED)
+    target_critics: QNetwork = eqx.field(metadata=AVERAGED)
     actor_optimizer: PyTree
     critics_optimizer: PyTree
     actor_loss: Array
-    """Of the actor's last step, ``float32[]``: there is none in between."""
+    """Loss of the actor's last step, ``float32[]``."""
     key: Array
-    """Root of the randomness of the updates, ``uint32[2]``; never changes."""
+    """Root of the random numbers of the updates, ``uint32[2]``; never changes."""
     n_updates: Array
     """Gradient steps of the critics taken, ``int32[]``."""
 
@@ -100,21 +100,17 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     Raises:
         ValueError: if the action space is not a finite Box.
-        TypeError: if the observation space holds something that is no array.
+        TypeError: if the observation space holds something that is not an array.
     """
-    box = check_box_action(action_space, "TD3")
-    obs_leaves, action_dim = leaves(observation_space), action_dimension(box)
-    shape = with_widths(config, obs_leaves).policy_kwargs
-    optimizer = optax.scale_by_adam()
+    action_dim = action_dimension(check_box_action(action_space, config.name))
+    obs_leaves = leaves(observation_space)
+    shape, optimizer = with_widths(config, obs_leaves).policy_kwargs, optimizers.make(config.optimizer)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor = Actor(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        critics = ensemble(
-            lambda k: Critic(k, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape),
-            critics_key,
-            config.n_critics,
-        )
+        widths = shape.critic_widths(HIDDEN_LAYERS)
+        actor = Network(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
+        critics = ensemble(lambda k: QNetwork(k, obs_leaves, action_dim, widths, shape), critics_key, config.n_critics)
         return State(
             actor=actor,
             critics=critics,
@@ -127,42 +123,30 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             n_updates=jnp.int32(0),
         )
 
-    def explore(actor: Actor, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return policy(actor, obs)
-
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        rate = at(config.learning_rate, clock.progress)
-        next_action = smoothed_action(
-            state.target_actor,
-            batch.next_obs,
-            nth(state.key, state.n_updates),
-            config.target_policy_noise,
-            config.target_noise_clip,
-        )
+        key, rate = nth(state.key, state.n_updates), at(config.learning_rate, clock.progress)
+        sigma, limit = config.target_policy_noise, config.target_noise_clip
+        next_action = smoothed_action(state.target_actor, batch.next_obs, key, sigma, limit)
         target = td_target(state.target_critics, batch, next_action)
-        (loss, values), gradients = value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
-        critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
+        critics, critics_optimizer, loss, values = minimize(
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+        )
         n_updates = state.n_updates + 1
 
         def delayed(state: State) -> State:
             first_critic = jax.tree.map(lambda leaf: leaf[0], critics)
             policy_loss, gradients = value_and_grad(actor_loss)(state.actor, first_critic, batch.obs)
             actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
-            return eqx.tree_at(
-                lambda s: (s.actor, s.actor_optimizer, s.actor_loss, s.target_actor, s.target_critics),
+            return dataclasses.replace(
                 state,
-                (
-                    actor,
-                    actor_optimizer,
-                    policy_loss,
-                    polyak(state.target_actor, actor, config.tau),
-                    polyak(state.target_critics, critics, config.tau),
-                ),
+                actor=actor,
+                actor_optimizer=actor_optimizer,
+                actor_loss=policy_loss,
+                target_actor=polyak(state.target_actor, actor, config.tau),
+                target_critics=polyak(state.target_critics, critics, config.tau),
             )
 
-        state = eqx.tree_at(
-            lambda s: (s.critics, s.critics_optimizer, s.n_updates), state, (critics, critics_optimizer, n_updates)
-        )
+        state = dataclasses.replace(state, critics=critics, critics_optimizer=critics_optimizer, n_updates=n_updates)
         state = jax.lax.cond(n_updates % config.policy_delay == 0, delayed, lambda s: s, state)
         metrics = {
             "critic_loss": loss,
@@ -179,22 +163,20 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values)
 
 
-@outlined
-def smoothed_action(target_actor: Actor, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:
+def smoothed_action(target_actor: Network, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:
     """Returns the target actor's actions with clipped noise, in [-1, 1], ``(batch, action_dim)``."""
     action = policy(target_actor, next_obs)
     noise = jnp.clip(sigma * jax.random.normal(key, action.shape), -clip, clip)
     return jnp.clip(action + noise, -1.0, 1.0)
 
 
-@outlined
-def td_target(target_critics: Critic, batch: Transition, next_action: Array) -> Array:
-    """Returns what the critics should say of the batch, ``(batch,)``."""
+def td_target(target_critics: QNetwork, batch: Transition, next_action: Array) -> Array:
+    """Returns the TD targets, ``(batch,)``."""
     next_value = jnp.min(action_values(target_critics, batch.next_obs, next_action), axis=0)
     return batch.reward + batch.discount * next_value
 
 
-def critics_loss(critics: Critic, batch: Transition, target: Array) -> tuple[Array, Array]:
+def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
     """Returns the mean squared TD errors summed over the critics, and the values, ``(n_critics, batch)``."""
     values = action_values(critics, batch.obs, batch.action)
     return jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values

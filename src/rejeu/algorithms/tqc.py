@@ -1,13 +1,13 @@
-"""Truncated quantile critics: SAC whose critics learn the distribution of the return and forget its upper tail.
+"""Truncated quantile critics: SAC whose critics learn the distribution of the return and whose targets drop its upper tail.
 
 Source: Kuznetsov et al. 2020, "Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional
-Quantile Critics" (arXiv 2005.04269). Each of N critics gives M quantiles ``z_n(s, a)`` of the return; their targets
-``z'_n`` follow slowly. With policy ``pi``, temperature ``alpha`` and discount ``d`` (0 where the MDP terminated)::
+Quantile Critics" (arXiv 2005.04269). Each of N critics gives M quantiles ``z_n(s, a)`` of the return; the target
+critics give ``z'_n``. With policy ``pi``, temperature ``alpha`` and discount ``d`` (0 where the MDP terminated)::
 
     z_(1) <= z_(2) <= ...   = all N M quantiles z'_n(s', a') together, in order,      a' ~ pi(. | s')
     y_i         = r + d (z_(i) - alpha log pi(a' | s')),                              i = 1 .. N (M - dropped)
     J_Z         = sum_n mean rho(y_i - z_n(s, a)),                                    the quantile Huber loss
-    J_pi        = mean (alpha log pi(a | s) - mean of all quantiles z_n(s, a)),       a ~ pi(. | s), reparameterised
+    J_pi        = mean (alpha log pi(a | s) - mean of all quantiles z_n(s, a)),       a ~ pi(. | s), reparameterized
 
 Policy, temperature, targets and the order of the steps are SAC's (:mod:`rejeu.algorithms.sac`). As there, the critics'
 losses are summed, which gives each the gradient of its own; Stable-Baselines3 Contrib takes their mean.
@@ -20,70 +20,44 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms import optimizers
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.algorithms.sac import HIDDEN_LAYERS, State, initial_temperature, policy, temperature_loss
-from rejeu.core import (
-    TD_ERROR,
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    copy,
-    descend,
-    ensemble,
-    polyak,
-    tau_at,
-    value_and_grad,
-    weighted_mean,
-)
-from rejeu.networks import Actor, Critic
+from rejeu.algorithms.sac.continuous import exploit, explore, policy
+from rejeu.algorithms.sac.state import HIDDEN_LAYERS, State, initial_state, next_state
+from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of, temperature_step
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.networks import Network, QNetwork
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
-from rejeu.validation import number, whole
-from rejeu.xla import outlined
+from rejeu.validation import convert, whole
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OffPolicyConfig):
+class Config(EntropyConfig):
     """Hyper-parameters of TQC; the defaults are those of Stable-Baselines3 Contrib."""
 
     n_quantiles: int = 25
-    """Quantiles that each critic predicts. Raising it describes the return more finely, at its price."""
+    """Quantiles that each critic predicts. A larger number describes the return more finely at a higher cost."""
     top_quantiles_to_drop_per_net: int = 2
-    """Quantiles that each critic's share of the target loses at the top. Raising it is more pessimistic."""
-    n_critics: int = 2
-    """Number of critics, whose quantiles are pooled."""
-    ent_coef: float | str = "auto"
-    """Temperature of the entropy bonus: ``"auto"`` learns it from 1, ``"auto_0.1"`` from 0.1, a number fixes it.
-    Raising it explores more."""
-    target_entropy: float | str = "auto"
-    """Entropy in nats that the automatic temperature steers to; ``"auto"`` is minus the number of action dimensions."""
+    """Number of the largest quantiles per critic that the target drops. A larger number is more pessimistic."""
     target_update_interval: int = 1
-    """Gradient steps between two moves of the target critics."""
+    """Gradient steps between two updates of the target critics."""
 
     name: ClassVar[str] = "TQC"
 
     def __post_init__(self) -> None:
-        OffPolicyConfig.__post_init__(self)
-        initial_temperature(self.ent_coef)
-        if self.target_entropy != "auto":
-            object.__setattr__(self, "target_entropy", number("target_entropy", self.target_entropy))
-        for key in ("n_quantiles", "n_critics", "target_update_interval"):
-            object.__setattr__(self, key, whole(key, getattr(self, key), least=1))
-        dropped = whole("top_quantiles_to_drop_per_net", self.top_quantiles_to_drop_per_net, least=0)
-        if dropped >= self.n_quantiles:
+        EntropyConfig.__post_init__(self)
+        convert(self, ("n_quantiles", "target_update_interval"), whole, least=1)
+        convert(self, "top_quantiles_to_drop_per_net", whole, least=0)
+        if self.top_quantiles_to_drop_per_net >= self.n_quantiles:
             raise ValueError(
-                f"top_quantiles_to_drop_per_net={dropped} would leave nothing of n_quantiles={self.n_quantiles}; "
-                f"use at most {self.n_quantiles - 1}"
+                f"top_quantiles_to_drop_per_net={self.top_quantiles_to_drop_per_net} would leave nothing of "
+                f"n_quantiles={self.n_quantiles}; use at most {self.n_quantiles - 1}"
             )
-        object.__setattr__(self, "top_quantiles_to_drop_per_net", dropped)
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
@@ -91,82 +65,41 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     Raises:
         ValueError: if the action space is not a finite Box.
-        TypeError: if the observation space holds something that is no array.
+        TypeError: if the observation space holds something that is not an array.
     """
-    box = check_box_action(action_space, "TQC")
-    obs_leaves, action_dim, shape = leaves(observation_space), action_dimension(box), config.policy_kwargs
-    target_entropy = -float(action_dim) if config.target_entropy == "auto" else float(config.target_entropy)
+    action_dim = action_dimension(check_box_action(action_space, config.name))
+    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
+    target_entropy = config.entropy_target(-float(action_dim))
     n_kept = config.n_critics * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
-    optimizer = optax.scale_by_adam()
+    optimizer = optimizers.make(config.optimizer)
+
+    def critic(key: Array) -> QNetwork:
+        widths = shape.critic_widths(HIDDEN_LAYERS)
+        return QNetwork(key, obs_leaves, action_dim, widths, shape, config.n_quantiles)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor = Actor(actor_key, obs_leaves, 2 * action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        widths = shape.critic_widths(HIDDEN_LAYERS)
-        critics = ensemble(
-            lambda k: Critic(k, obs_leaves, action_dim, widths, shape, config.n_quantiles),
-            critics_key,
-            config.n_critics,
-        )
-        log_alpha = jnp.log(jnp.float32(initial_temperature(config.ent_coef)))
-        return State(
-            actor=actor,
-            critics=critics,
-            target_critics=copy(critics),
-            log_alpha=log_alpha,
-            actor_optimizer=optimizer.init(actor),
-            critics_optimizer=optimizer.init(critics),
-            alpha_optimizer=optimizer.init(log_alpha),
-            key=update_key,
-            n_updates=jnp.int32(0),
-        )
-
-    def explore(actor: Actor, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return policy(actor, obs).sample(key)
-
-    def exploit(actor: Actor, obs: PyTree) -> Array:
-        return policy(actor, obs).mode()
+        actor = Network(actor_key, obs_leaves, 2 * action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
+        return initial_state(actor, ensemble(critic, critics_key, config.n_critics), update_key, config, optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate = at(config.learning_rate, clock.progress)
-        alpha = jnp.exp(state.log_alpha)
+        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
         target = td_target(state.actor, state.target_critics, alpha, batch, target_key, n_kept)
-        (critic_loss, quantiles), gradients = value_and_grad(critics_loss, has_aux=True)(state.critics, batch, target)
-        critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
-        (policy_loss, log_prob), gradients = value_and_grad(actor_loss, has_aux=True)(
-            state.actor, critics, alpha, batch.obs, actor_key
+        critics, critics_optimizer, critic_loss, quantiles = minimize(
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
         )
-        actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
-
-        log_alpha, alpha_optimizer = state.log_alpha, state.alpha_optimizer
-        if isinstance(config.ent_coef, str):
-            gradient = jax.grad(temperature_loss)(log_alpha, log_prob, target_entropy)
-            log_alpha, alpha_optimizer = descend(log_alpha, gradient, alpha_optimizer, optimizer, rate)
-
-        n_updates = state.n_updates + 1
-        tau = tau_at(n_updates, config.tau, config.target_update_interval)
-        state = State(
-            actor=actor,
-            critics=critics,
-            target_critics=polyak(state.target_critics, critics, tau),
-            log_alpha=log_alpha,
-            actor_optimizer=actor_optimizer,
-            critics_optimizer=critics_optimizer,
-            alpha_optimizer=alpha_optimizer,
-            key=state.key,
-            n_updates=n_updates,
+        actor, actor_optimizer, policy_loss, log_prob = minimize(
+            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
         )
-        values = jnp.mean(quantiles, axis=-1)
-        metrics = {
-            "critic_loss": critic_loss,
-            "actor_loss": policy_loss,
-            "ent_coef": alpha,
-            "entropy": -jnp.mean(log_prob),
-            "q_value": jnp.mean(values),
-            TD_ERROR: jnp.mean(jnp.abs(values - jnp.mean(target, axis=-1)[None]), axis=0),
-        }
-        return state, metrics
+        log_alpha, alpha_optimizer = temperature_step(
+            state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
+        )
+        state = next_state(
+            state, config, actor, critics, log_alpha, actor_optimizer, critics_optimizer, alpha_optimizer
+        )
+        values, expected = jnp.mean(quantiles, axis=-1), jnp.mean(target, axis=-1)
+        return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, expected)
 
     def values(state: State, obs: PyTree, action: Array | None) -> Array:
         assert action is not None
@@ -175,7 +108,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 
-def action_quantiles(critics: Critic, obs: PyTree, action: Array) -> Array:
+def action_quantiles(critics: QNetwork, obs: PyTree, action: Array) -> Array:
     """Returns the quantiles that each of the stacked critics gives, ``(n_critics, batch, n_quantiles)``, unordered."""
     return jax.vmap(lambda critic: critic(obs, action))(critics)
 
@@ -190,21 +123,22 @@ def truncate(quantiles: Array, n_kept: int) -> Array:
     return -jax.lax.top_k(-pooled, n_kept)[0]
 
 
-@outlined
-def td_target(actor: Actor, target_critics: Critic, alpha: Array, batch: Transition, key: Array, n_kept: int) -> Array:
+def td_target(
+    actor: Network, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array, n_kept: int
+) -> Array:
     """Returns samples of the return that the critics should predict, ``(batch, n_kept)``."""
     next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
     kept = truncate(action_quantiles(target_critics, batch.next_obs, next_action), n_kept)
     return batch.reward[:, None] + batch.discount[:, None] * (kept - (alpha * next_log_prob)[:, None])
 
 
-def critics_loss(critics: Critic, batch: Transition, target: Array) -> tuple[Array, Array]:
+def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
     """Returns the quantile Huber loss, averaged over the batch and summed over critics, and the critics' quantiles."""
     quantiles = action_quantiles(critics, batch.obs, batch.action)
     return jnp.sum(weighted_mean(quantile_huber_loss(quantiles, target), batch.weight)), quantiles
 
 
-def actor_loss(actor: Actor, critics: Critic, alpha: Array, obs: PyTree, key: Array) -> tuple[Array, Array]:
+def actor_loss(actor: Network, critics: QNetwork, alpha: Array, obs: PyTree, key: Array) -> tuple[Array, Array]:
     """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)``.
 
     The value of an action is the mean of all quantiles, none left out.

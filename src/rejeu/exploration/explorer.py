@@ -1,7 +1,7 @@
-"""What a loop calls to choose training actions: an algorithm's own exploration, with noise around it by option.
+"""How training actions are chosen: the algorithm's own exploration, optionally with noise.
 
-Noise with memory is a small pytree per environment, the *carry*: it travels beside the algorithm's state, is renewed
-where an episode begins, and is saved with the run.
+The state of noise is a small pytree per environment, the *carry*. It is kept beside the algorithm's state, reset at the
+start of an episode, and saved with the run.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from jax import Array
 
 from rejeu.core import Algorithm, Clock, Explorer, PyTree
 from rejeu.exploration import parameter_space
-from rejeu.exploration.noise import ActionNoise, Noise
+from rejeu.exploration.noise import Noise, NoiseProcess
 from rejeu.exploration.parameter_space import ParameterNoise
 
 
 def make(algorithm: Algorithm, noise: Noise | None) -> Explorer:
-    """Returns how ``algorithm`` explores with ``noise`` (None: as it does by itself).
+    """Returns how ``algorithm`` explores with ``noise`` (None: without noise).
 
-    An algorithm that brings an explorer of its own has seen to noise already.
+    An algorithm with an explorer of its own handles noise itself.
     """
     if algorithm.explorer is not None:
         return algorithm.explorer
@@ -39,7 +39,7 @@ def plain(algorithm: Algorithm) -> Explorer:
     return Explorer(lambda actor, n_envs: (), act)
 
 
-def with_action_noise(algorithm: Algorithm, noise: ActionNoise) -> Explorer:
+def with_action_noise(algorithm: Algorithm, noise: NoiseProcess) -> Explorer:
     """Returns exploration by ``noise`` on actions in [-1, 1]; the carry is the noise's state."""
 
     def act(carry: PyTree, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, PyTree]:
@@ -48,7 +48,7 @@ def with_action_noise(algorithm: Algorithm, noise: ActionNoise) -> Explorer:
         carry, action = noise.perturb(carry, algorithm.explore(actor, obs, action_key, clock), noise_key)
         return jnp.clip(action, -1.0, 1.0), carry
 
-    return Explorer(lambda actor, n_envs: jnp.asarray(noise.init(n_envs)), act)
+    return Explorer(lambda actor, n_envs: jax.tree.map(jnp.asarray, noise.init(n_envs)), act)
 
 
 def with_parameter_noise(algorithm: Algorithm, noise: ParameterNoise) -> Explorer:

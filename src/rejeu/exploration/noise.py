@@ -1,9 +1,10 @@
 """Noise added to actions in [-1, 1]: frozen settings, and pure functions over a small state per environment.
 
-Everything here is in the scale in which algorithms act, where every action dimension runs from -1 to 1. What is meant
-in the environment's own units, over ``[low, high]``, converts by the half width ``h = (high - low) / 2``: means,
-``sigma`` and ``drift`` are divided by ``h``, the strength of the repulsive boundary by ``h^2``; ``theta`` and ``dt``
-stay.
+Everything here is in the scale of the algorithms' actions, where every dimension ranges from -1 to 1. Values in the
+environment's units, over ``[low, high]``, convert by the half width ``h = (high - low) / 2``: means, ``sigma`` and
+``drift`` are divided by ``h``, the strength of the repulsive boundary by ``h^2``; ``theta`` and ``dt`` stay the same.
+
+Noise of your own is an object with the two methods of :class:`NoiseProcess`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, InitVar, asdict, dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -23,14 +24,42 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from rejeu.exploration.parameter_space import ParameterNoise
+from rejeu.validation import assign
+
+
+@runtime_checkable
+class NoiseProcess(Protocol):
+    """What ``action_noise`` needs: any object with these two methods.
+
+    For example noise that alternates its sign from step to step::
+
+        class Alternating:
+            def init(self, n_envs):
+                return jnp.ones(n_envs)
+
+            def perturb(self, state, action, key):
+                return -state, action + 0.1 * state[:, None]
+
+        rejeu.TD3("MlpPolicy", env, action_noise=Alternating())
+
+    A model file mentions only the name of its class, so it must be given again to ``load``.
+    """
+
+    def init(self, n_envs: int) -> Any:
+        """Returns the state of ``n_envs`` processes at the start of an episode: a pytree of arrays ``(n_envs, ...)``."""
+
+    def perturb(self, state: Any, action: Array, key: Array) -> tuple[Any, Array]:
+        """Returns the state after one step, and ``action`` ``(n_envs, action_dim)`` with noise.
+
+        ``key`` is a JAX random key. The result is clipped to [-1, 1]. JAX traces the function.
+        """
 
 
 class ActionNoise(ABC):
-    """Noise on actions in [-1, 1]. Abstract.
+    """Noise on actions in [-1, 1], with the settings of Stable-Baselines3's. Abstract.
 
-    The object holds settings only: agents keep the processes of their environments themselves. Called by hand it runs one
-    process of its own, as Stable-Baselines3's noise does, which is no part of its settings: equality, files and agents
-    know nothing of it.
+    The object holds settings only: agents keep the state of each environment. Called by hand it runs a process
+    of its own, as Stable-Baselines3's noise does, which does not affect equality, files or agents.
 
     >>> noise = NormalActionNoise(mean=[0.0, 0.0], sigma=0.2)
     >>> noise.reset(seed=0)
@@ -64,7 +93,7 @@ class ActionNoise(ABC):
             action: the policy's action in [-1, 1], a number or ``(action_dim,)``. The noise depends on it only with a
                 repulsive boundary.
 
-        What is returned is not clipped: take ``np.clip(action + noise(action), -1, 1)``, scaled to the environment's range.
+        The result is not clipped: use ``np.clip(action + noise(action), -1, 1)``, scaled to the environment's range.
         """
         if self._by_hand is None:
             self.reset()
@@ -72,19 +101,19 @@ class ActionNoise(ABC):
         return self._by_hand(self, action)
 
     def reset(self, seed: int | None = None) -> None:
-        """Puts the process that :meth:`__call__` runs to the start of an episode.
+        """Resets the process of :meth:`__call__` to the start of an episode.
 
         Args:
             seed: also restarts its random numbers; None lets them continue.
         """
         if self._by_hand is None or seed is not None:
-            object.__setattr__(self, "_by_hand", _ByHand(np.random.default_rng(seed)))
+            assign(self, _by_hand=_ByHand(np.random.default_rng(seed)))
         assert self._by_hand is not None
         self._by_hand.state = None
 
 
 class _ByHand:
-    """One process that is stepped by hand, in NumPy, so that looking at noise does not start JAX's device."""
+    """A process stepped by hand, in NumPy, which does not start JAX's device."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -110,7 +139,7 @@ class NormalActionNoise(ActionNoise):
     sigma: tuple[float, ...]
     """Standard deviation per action dimension, at least 0; a single number serves all of them."""
     dtype: InitVar[Any] = np.float32
-    """Accepted for Stable-Baselines3's sake; the noise is always float32."""
+    """Accepted for compatibility with Stable-Baselines3; the noise is always float32."""
 
     def __post_init__(self, dtype: Any) -> None:
         _check_dtype(self, dtype)
@@ -156,20 +185,20 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
     initial_noise: tuple[float, ...] = (0.0,)
     """Where the process starts each episode; None starts at 0."""
     dtype: InitVar[Any] = np.float32
-    """Accepted for Stable-Baselines3's sake; the noise is always float32."""
+    """Accepted for compatibility with Stable-Baselines3; the noise is always float32."""
     _: KW_ONLY
     drift: tuple[float, ...] = (0.0,)
     """Steady push on the process per unit of time, after its value is used: it then hovers about
     ``mean + drift / theta``."""
     repulsive: tuple[float, ...] = (0.0,)
-    """Strength of the repulsive boundary, at least 0; 0 or None for none. Raising it keeps actions further inside. A
+    """Strength of the repulsive boundary, at least 0; 0 or None for none. A larger value keeps actions further inside. A
     strength ``s`` for actions in ``[low, high]`` is ``4 s / (high - low)^2`` here: 1e-4 over [-2, 2] is 2.5e-5."""
 
     def __post_init__(self, dtype: Any) -> None:
         _check_dtype(self, dtype)
         for key in ("initial_noise", "repulsive"):
             if getattr(self, key) is None:
-                object.__setattr__(self, key, (0.0,))
+                assign(self, **{key: (0.0,)})
         _as_tuples(self, "mean", "sigma", "initial_noise", "drift", "repulsive")
         if not 0 <= self.theta < math.inf:
             raise ValueError(f"{type(self).__name__}: theta={self.theta!r} must be a number of at least 0")
@@ -207,7 +236,8 @@ def barrier_slope(action: Any) -> Any:
     return 3.0 * math.pi * (0.5 * math.pi * action) ** 5
 
 
-Noise = NormalActionNoise | OrnsteinUhlenbeckActionNoise | ParameterNoise
+Noise = NoiseProcess | ParameterNoise
+"""Noise on actions, also of your own, or on parameters."""
 NOISES: dict[str, type[NormalActionNoise] | type[OrnsteinUhlenbeckActionNoise] | type[ParameterNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -216,15 +246,15 @@ NOISES: dict[str, type[NormalActionNoise] | type[OrnsteinUhlenbeckActionNoise] |
 
 
 WRITTEN = re.compile(r"([a-z-]+)\s*\(([^()]*)\)")
-"""Noise as a text, such as ``ou(0.2)``."""
+"""Noise as a string, such as ``ou(0.2)``."""
 
 
 def parse(value: Any) -> Noise | str | None:
-    """Returns noise settings from themselves, from None, from a number or a text, or from their JSON form.
+    """Returns noise settings from themselves, from None, from a number or a string, or from their JSON form.
 
-    A number is the standard deviation of Gaussian noise; a text is ``"normal(0.1)"``, ``"ou(0.2)"``, ``"ou(0.2, theta=0.3)"``
-    or ``"parameter(0.1)"``. How many dimensions the actions have is not known here, so noise on actions stays a text until
-    :func:`for_actions`. The JSON form is ``{"noise": "normal", ...}``.
+    A number is the standard deviation of Gaussian noise; a string is ``"normal(0.1)"``, ``"ou(0.2)"``,
+    ``"ou(0.2, theta=0.3)"`` or ``"parameter(0.1)"``. The number of action dimensions is not known here, so noise on
+    actions stays a string until :func:`for_actions`. The JSON form is ``{"noise": "normal", ...}``.
 
     Raises:
         TypeError: for anything else.
@@ -233,7 +263,7 @@ def parse(value: Any) -> Noise | str | None:
     >>> parse(0.1), parse("parameter(0.2)").initial_sigma
     ('normal(0.1)', 0.2)
     """
-    if value is None or isinstance(value, Noise):
+    if value is None or (isinstance(value, Noise) and not isinstance(value, type)):
         return value
     if isinstance(value, Mapping) and value.get("noise") in NOISES:
         fields = {key: setting for key, setting in value.items() if key != "noise"}
@@ -245,17 +275,18 @@ def parse(value: Any) -> Noise | str | None:
         noise = read(text, 1)
         return noise if isinstance(noise, ParameterNoise) else text
     raise TypeError(
-        f"action_noise={value!r} must be None, a standard deviation such as 0.1, a text such as 'ou(0.2)', or one of "
-        f"{', '.join(kind.__name__ for kind in NOISES.values())}, such as NormalActionNoise(mean=[0, 0], sigma=[0.1, 0.1])"
+        f"action_noise={value!r} must be None, a standard deviation such as 0.1, a string such as 'ou(0.2)', one of "
+        f"{', '.join(kind.__name__ for kind in NOISES.values())}, such as NormalActionNoise(mean=[0, 0], sigma=[0.1, 0.1]), "
+        "or an object with the methods init and perturb (see rejeu.exploration.noise.NoiseProcess)"
     )
 
 
 def read(text: str, n: int) -> Noise:
-    """Returns what a text stands for, for actions of ``n`` dimensions.
+    """Returns the noise that a string describes, for actions of ``n`` dimensions.
 
     Raises:
         TypeError: for an unknown kind or setting.
-        ValueError: for what is no number or out of range.
+        ValueError: for a value that is not a number or out of range.
 
     >>> read("ou(0.2, theta=0.3)", 2).theta
     0.3
@@ -276,23 +307,23 @@ def read(text: str, n: int) -> Noise:
         try:
             settings[name] = float(number)
         except ValueError:
-            raise ValueError(f"action_noise={text!r}: {number.strip()!r} is no number") from None
+            raise ValueError(f"action_noise={text!r}: {number.strip()!r} is not a number") from None
         if name == "adaptation_interval":
             settings[name] = int(settings[name])
     return kind(**settings)
 
 
 def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -> Noise | None:
-    """Returns noise for these actions: what :func:`parse` left a text gets as many dimensions as they have.
+    """Returns noise for these actions: a string from :func:`parse` gets as many dimensions as they have.
 
     >>> for_actions("normal(0.1)", spaces.Box(-1, 1, (2,)))
     NormalActionNoise(mean=(0.0, 0.0), sigma=(0.1, 0.1))
     """
-    assert not isinstance(noise, float | int)  # parse has made a text of it
+    assert not isinstance(noise, float | int)  # parse turns numbers into strings
     return read(noise, math.prod(action_space.shape or (1,))) if isinstance(noise, str) else noise
 
 
-def to_json(noise: Noise) -> dict[str, Any]:
+def to_json(noise: Any) -> dict[str, Any]:
     """Returns the JSON form that :func:`parse` reads."""
     name = next(key for key, kind in NOISES.items() if isinstance(noise, kind))
     return {"noise": name, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()}}
@@ -310,7 +341,7 @@ def check_fits(noise: Noise | None, action_space: spaces.Space) -> None:
             f"{type(noise).__name__} adds to continuous actions and the action space is {action_space}; use "
             "action_noise=ParameterNoise(), or None"
         )
-    if len(noise.mean) != math.prod(action_space.shape):
+    if isinstance(noise, ActionNoise) and len(noise.mean) != math.prod(action_space.shape):
         raise ValueError(
             f"action_noise has {len(noise.mean)} dimensions and the actions have {math.prod(action_space.shape)}; "
             f"try {type(noise).__name__}(mean=[0.0] * {math.prod(action_space.shape)}, sigma={noise.sigma[0]})"
@@ -336,6 +367,6 @@ def _as_tuples(noise: Any, *keys: str) -> None:
     for key, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: {key}={getattr(noise, key)!r} must be finite")
-        object.__setattr__(noise, key, tuple(np.broadcast_to(array, n).tolist()))
+        assign(noise, **{key: tuple(np.broadcast_to(array, n).tolist())})
     if min(noise.sigma) < 0:
         raise ValueError(f"{name}: sigma={noise.sigma} must not be negative")

@@ -11,11 +11,11 @@ steered so that the two policies differ by a set amount in what they do, over th
     sigma       <- sigma adaptation      if d <= target
                    sigma / adaptation    otherwise
 
-What normalises activations is not perturbed, as in the paper. Departures: ``z`` is added to the parameters as they are
-at each step rather than to a copy taken when the episode began, so that ``d`` measures the noise and not what was
-learnt meanwhile; ``d`` is taken over the episode's own states rather than a batch of the replay buffer; and an episode
-counts as one adaptation for each ``adaptation_interval`` of its steps (at least one), so that long episodes adapt as
-fast as short ones.
+Normalization layers are not perturbed, as in the paper (:data:`NORMALIZATION_LAYERS`). Departures from the paper: ``z``
+is added to the current parameters at each step rather than to a copy from the start of the episode, so that ``d``
+measures the noise and not what was learned meanwhile; ``d`` is taken over the states of the episode rather than a batch
+of the replay buffer; and an episode counts as one adaptation per ``adaptation_interval`` steps (at least one), so that
+long episodes adapt as fast as short ones.
 """
 
 from __future__ import annotations
@@ -29,6 +29,18 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.core import Algorithm, Clock, PyTree
+from rejeu.networks import LayerNorm
+from rejeu.networks.batch_renorm import BatchRenorm
+from rejeu.validation import convert, number, whole
+
+NORMALIZATION_LAYERS: tuple[type[eqx.Module], ...] = (
+    LayerNorm,
+    BatchRenorm,
+    eqx.nn.LayerNorm,
+    eqx.nn.RMSNorm,
+    eqx.nn.GroupNorm,
+)
+"""Layers whose parameters are not perturbed."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +64,12 @@ class ParameterNoise:
 
     def __post_init__(self) -> None:
         for key, least in (("initial_sigma", 0.0), ("target_distance", 0.0), ("adaptation", 1.0)):
-            value = getattr(self, key)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value < math.inf:
-                raise ValueError(f"ParameterNoise: {key}={value!r} must be a finite number of at least {least:g}")
-            object.__setattr__(self, key, float(value))
-        interval = self.adaptation_interval
-        if isinstance(interval, bool) or not isinstance(interval, int) or interval < 1:
-            raise ValueError(f"ParameterNoise: adaptation_interval={interval!r} must be a whole number of at least 1")
+            convert(self, key, number, least=least)
+        convert(self, "adaptation_interval", whole, least=1)
 
 
 class State(eqx.Module):
-    """What parameter noise remembers, every leaf an array; one row per environment, but for ``sigma``."""
+    """The state of parameter noise; every leaf is an array with one row per environment, except ``sigma``."""
 
     perturbation: list[Array]
     """Added to the leaves of the actor that are perturbed, in order; each ``(n_envs, ...)``."""
@@ -157,17 +164,19 @@ def perturb(actor: PyTree, perturbation: list[Array]) -> PyTree:
 
 
 def perturbed_leaves(actor: PyTree) -> list[int]:
-    """Returns the positions of the leaves that are perturbed: floating, and under no attribute named after a norm."""
-    with_paths = jax.tree_util.tree_leaves_with_path(actor)
-    return [
-        i
-        for i, (path, leaf) in enumerate(with_paths)
-        if jnp.issubdtype(leaf.dtype, jnp.floating) and "norm" not in jax.tree_util.keystr(path).lower()
-    ]
+    """Returns the positions of the leaves that are perturbed: floating-point numbers outside normalization layers."""
+    positions: list[int] = []
+    n = 0
+    for node in jax.tree.leaves(actor, is_leaf=lambda node: isinstance(node, NORMALIZATION_LAYERS)):
+        leaves = jax.tree.leaves(node)
+        if not isinstance(node, NORMALIZATION_LAYERS) and jnp.issubdtype(leaves[0].dtype, jnp.floating):
+            positions.append(n)
+        n += len(leaves)
+    return positions
 
 
 def preferences(actor: PyTree, obs: PyTree) -> Array:
-    """Returns what a network for discrete actions says of each, ``(batch, n_actions)``: values or logits."""
+    """Returns what a network for discrete actions gives for each, ``(batch, n_actions)``: values or logits."""
     return actor(obs)
 
 

@@ -1,11 +1,10 @@
-"""Neural networks: layers, and the actor and critics that algorithms put together from them.
+"""Neural networks: layers, and the networks that algorithms build from them.
 
-A network is an encoder (observation to features, images by convolution), a torso (hidden layers) and one linear head.
-The torso is a perceptron, a net of branches, SimBa or a module of the user's. Every network is an ``equinox.Module``
-whose leaves are all arrays; what is static (names, shapes of observations) is hashable. Inputs carry one batch axis.
+A network is an encoder (observation to features, images by convolution), a torso (hidden layers) and a linear head. Each
+of the three may be a module of the user's own. Every network is an ``equinox.Module`` whose leaves are arrays; static
+fields (names, shapes of observations) are hashable. Inputs have one batch axis.
 """
 
-from rejeu.networks.actor_and_critic import Actor, Critic, action_values
 from rejeu.networks.encoder import (
     CNN,
     NATURE,
@@ -13,16 +12,20 @@ from rejeu.networks.encoder import (
     Convolution,
     Convolutions,
     Encoder,
+    OwnEncoder,
     channels_last,
     convolutions,
     encode_leaf,
     image_shape,
+    make_encoder,
     n_features,
     reads_image,
 )
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
-from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled
-from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_torso, own_torso
+from rejeu.networks.network import Network, QNetwork, action_values
+from rejeu.networks.own import OwnModule, own_module
+from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled, split_net_arch
+from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_head, make_torso
 
 __all__ = [
     "ACTIVATIONS",
@@ -31,15 +34,17 @@ __all__ = [
     "MLP",
     "NATURE",
     "SMALL",
-    "Actor",
     "Branches",
     "Convolution",
     "Convolutions",
-    "Critic",
     "Encoder",
     "LayerNorm",
     "Linear",
+    "Network",
+    "OwnEncoder",
+    "OwnModule",
     "PolicyConfig",
+    "QNetwork",
     "ResidualBlock",
     "SimBa",
     "Torso",
@@ -50,10 +55,13 @@ __all__ = [
     "encode_leaf",
     "image_shape",
     "joined_width",
+    "make_encoder",
+    "make_head",
     "make_torso",
     "n_features",
-    "own_torso",
+    "own_module",
     "product",
     "reads_image",
     "settled",
+    "split_net_arch",
 ]

@@ -1,4 +1,4 @@
-"""Batch renormalisation: batch normalisation that does in training what it will do in use.
+"""Batch renormalization: batch normalization that does in training what it will do in use.
 
 Source: Ioffe 2017, "Batch Renormalization" (arXiv 1702.03275, algorithm 1). With mean and standard deviation ``m_B``,
 ``s_B`` of the batch, the running ones ``m``, ``s``, and clip bounds ``r_max``, ``d_max``::
@@ -8,7 +8,7 @@ Source: Ioffe 2017, "Batch Renormalization" (arXiv 1702.03275, algorithm 1). Wit
     y = scale (x - m) / s + offset                                                              in use
 
 Where nothing is clipped the two give the same, but in training the gradient flows through the batch's statistics.
-During the warm-up ``r = 1`` and ``d = 0``: plain batch normalisation. Running statistics move a hundredth of the way to
+During the warm-up ``r = 1`` and ``d = 0``: plain batch normalization. Running statistics move a hundredth of the way to
 the batch's at every training step; the paper keeps ``s``, we keep its square, as CrossQ's authors do.
 
 The running statistics are arrays of the network like its weights, but they learn from what passes, not by gradient:
@@ -46,12 +46,12 @@ D_MAX = 5.0
 
 
 class BatchRenorm(eqx.Module):
-    """Normalises each feature over the batch axis."""
+    """Normalizes each feature over the batch axis."""
 
     scale: Array
-    """``(width,)``, learnt."""
+    """``(width,)``, learned."""
     offset: Array
-    """``(width,)``, learnt."""
+    """``(width,)``, learned."""
     mean: Array
     """Running mean of the input, ``(width,)``."""
     variance: Array
@@ -60,7 +60,7 @@ class BatchRenorm(eqx.Module):
     """Training steps so far, ``float32[]`` so that it may stand among what is differentiated. It stops growing at 2^24,
     long after the warm-up."""
     warm_up: int = eqx.field(static=True)
-    """Training steps of plain batch normalisation at the beginning."""
+    """Training steps of plain batch normalization at the beginning."""
 
     def __init__(self, width: int, warm_up: int) -> None:
         self.scale = jnp.ones((width,), jnp.float32)
@@ -71,20 +71,20 @@ class BatchRenorm(eqx.Module):
         self.warm_up = warm_up
 
     def __call__(self, x: Array) -> Array:
-        """Normalises ``(batch, width)`` by the running statistics."""
+        """Normalizes ``(batch, width)`` by the running statistics."""
         mean, variance = lax.stop_gradient((self.mean, self.variance))
         factor = self.scale * lax.rsqrt(variance + EPSILON)
         return x * factor[None] + (self.offset - mean * factor)[None]
 
     def train(self, x: Array) -> tuple[Array, BatchRenorm]:
-        """Normalises ``(batch, width)`` by its own statistics, corrected; returns also the layer that has seen it."""
+        """Normalizes ``(batch, width)`` by its own statistics, corrected; returns also the layer that has seen it."""
         batch_mean = jnp.mean(x, axis=0)
-        centred = x - batch_mean[None]
-        batch_variance = jnp.mean(jnp.square(centred), axis=0)
+        centered = x - batch_mean[None]
+        batch_variance = jnp.mean(jnp.square(centered), axis=0)
         batch_deviation = jnp.sqrt(batch_variance + EPSILON)
         ratio, shift = lax.stop_gradient(self._correction(batch_mean, batch_deviation))
         factor = self.scale * ratio / batch_deviation
-        y = centred * factor[None] + (self.scale * shift + self.offset)[None]
+        y = centered * factor[None] + (self.scale * shift + self.offset)[None]
         moved = lax.stop_gradient(
             (
                 MOMENTUM * self.mean + (1.0 - MOMENTUM) * batch_mean,
@@ -103,8 +103,8 @@ class BatchRenorm(eqx.Module):
         return jnp.where(warm, ratio, 1.0), jnp.where(warm, shift, 0.0)
 
 
-class RenormalisedMLP(eqx.Module):
-    """Hidden layers: a renormalisation of the input, then each a linear map, a nonlinearity and a renormalisation."""
+class RenormalizedMLP(eqx.Module):
+    """Hidden layers: a renormalization of the input, then each a linear map, a nonlinearity and a renormalization."""
 
     layers: tuple[Linear, ...]
     norms: tuple[BatchRenorm, ...]
@@ -125,7 +125,7 @@ class RenormalisedMLP(eqx.Module):
             x = norm(ACTIVATIONS[self.activation](layer(x)))
         return x
 
-    def train(self, x: Array) -> tuple[Array, RenormalisedMLP]:
+    def train(self, x: Array) -> tuple[Array, RenormalizedMLP]:
         """Does the same by the batch's statistics; returns also the torso that has seen it."""
         x, norm = self.norms[0].train(x)
         norms = [norm]
@@ -135,11 +135,11 @@ class RenormalisedMLP(eqx.Module):
         return x, eqx.tree_at(lambda torso: torso.norms, self, tuple(norms))
 
 
-class RenormalisedNetwork(eqx.Module):
-    """Observation, and for a critic the action, to numbers: encoder, renormalised hidden layers, one linear head."""
+class RenormalizedNetwork(eqx.Module):
+    """Observation, and for a critic the action, to numbers: encoder, renormalized hidden layers, one linear head."""
 
     encoder: Encoder
-    torso: RenormalisedMLP
+    torso: RenormalizedMLP
     head: Linear
 
     def __init__(
@@ -156,7 +156,7 @@ class RenormalisedNetwork(eqx.Module):
         encoder_key, torso_key, head_key = jax.random.split(key, 3)
         self.encoder = Encoder(leaves, encoder_key)
         sizes = (self.encoder.n_features + (action_dim or 0), *widths)
-        self.torso = RenormalisedMLP(torso_key, sizes[0], widths, activation, warm_up)
+        self.torso = RenormalizedMLP(torso_key, sizes[0], widths, activation, warm_up)
         self.head = Linear(head_key, sizes[-1], n_outputs)
 
     def __call__(self, obs: PyTree, action: Array | None = None) -> Array:
@@ -166,7 +166,7 @@ class RenormalisedNetwork(eqx.Module):
         """
         return self.head(self.torso(self._features(obs, action)))
 
-    def train(self, obs: PyTree, action: Array | None = None) -> tuple[Array, RenormalisedNetwork]:
+    def train(self, obs: PyTree, action: Array | None = None) -> tuple[Array, RenormalizedNetwork]:
         """Does the same by the batch's statistics; returns also the network that has seen it."""
         hidden, torso = self.torso.train(self._features(obs, action))
         return self.head(hidden), eqx.tree_at(lambda network: network.torso, self, torso)

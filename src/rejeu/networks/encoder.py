@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,8 @@ from jax import Array
 
 from rejeu.core import PyTree
 from rejeu.networks.layers import Linear
+from rejeu.networks.own import own_module
+from rejeu.networks.shape import PolicyConfig
 from rejeu.spaces import Leaf
 
 
@@ -32,7 +34,7 @@ SMALL = Convolutions(((32, 4, 2), (64, 3, 1)), 256)
 
 
 CHUNK = 256
-"""Most images that go through convolutions at once: one of 84 by 84 pixels takes 1.2 MB on the way."""
+"""Most images that go through convolutions at once: one of 84 by 84 pixels takes 1.2 MB of temporary memory."""
 
 
 class Convolution(eqx.Module):
@@ -154,6 +156,39 @@ class Encoder(eqx.Module):
             for leaf, x in zip(self.leaves, jax.tree.leaves(obs), strict=True)
         ]
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+
+
+class OwnEncoder(eqx.Module):
+    """An encoder of the user's own."""
+
+    leaves: tuple[Leaf, ...] = eqx.field(static=True)
+    module: Any
+    n_features: int = eqx.field(static=True)
+
+    def __init__(self, key: Array, leaves: tuple[Leaf, ...], make: Callable[[Array, tuple[Leaf, ...]], Any]) -> None:
+        """Builds ``make(key, leaves)``.
+
+        Raises:
+            TypeError: if that is no module which maps observations to vectors.
+        """
+        self.leaves = leaves
+        role = f"encoder={getattr(make, '__name__', repr(make))}"
+        example = self.arrange([jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves])
+        self.module, self.n_features = own_module(role, make(key, leaves), example)
+
+    def __call__(self, obs: PyTree) -> Array:
+        """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
+        return self.module(self.arrange(jax.tree.leaves(obs)))
+
+    def arrange(self, arrays: list[Any]) -> Any:
+        """Returns what the module is called with: an array, or for a Dict or Tuple space a dict from path to array."""
+        paths = [leaf.path for leaf in self.leaves]
+        return arrays[0] if paths == [""] else dict(zip(paths, arrays, strict=True))
+
+
+def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:
+    """Returns the encoder of these leaves: rejeu's own, or the module of the user's."""
+    return Encoder(leaves, key) if shape.encoder is None else OwnEncoder(key, leaves, shape.encoder)
 
 
 def reads_image(leaves: tuple[Leaf, ...]) -> bool:

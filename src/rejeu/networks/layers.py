@@ -70,7 +70,7 @@ product.defvjp(_product_forward, _product_backward)
 
 
 class LayerNorm(eqx.Module):
-    """Layer normalisation over the last axis (Ba et al. 2016, arXiv 1607.06450)."""
+    """Layer normalization over the last axis (Ba et al. 2016, arXiv 1607.06450)."""
 
     scale: Array
     """``(width,)``."""
@@ -84,9 +84,9 @@ class LayerNorm(eqx.Module):
     def __call__(self, x: Array) -> Array:
         """Returns ``x`` with mean 0 and variance 1 along its last axis, scaled and shifted."""
         mean = jnp.mean(x, axis=-1, keepdims=True)
-        centred = x - mean
-        variance = jnp.mean(jnp.square(centred), axis=-1, keepdims=True)
-        return centred * jax.lax.rsqrt(variance + 1e-5) * self.scale[None] + self.offset[None]
+        centered = x - mean
+        variance = jnp.mean(jnp.square(centered), axis=-1, keepdims=True)
+        return centered * jax.lax.rsqrt(variance + 1e-5) * self.scale[None] + self.offset[None]
 
 
 class MLP(eqx.Module):

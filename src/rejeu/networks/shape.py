@@ -1,4 +1,4 @@
-"""What shape a user wants an agent's networks to have (``policy_kwargs``), checked."""
+"""The settings of the networks (``policy_kwargs``)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any, Literal, NamedTuple
 from jax import Array
 
 from rejeu.networks.layers import ACTIVATIONS
+from rejeu.spaces import Leaf
+from rejeu.validation import assign, choice, convert, flag, whole
 
 
 class Widths(NamedTuple):
@@ -37,7 +39,7 @@ class PolicyConfig:
     """Nonlinearity after each hidden layer: relu, tanh, elu, gelu, silu, leaky_relu or sigmoid. A function or class
     of that name (``jax.nn.relu``, ``torch.nn.ReLU``) is accepted too."""
     layer_norm: bool = False
-    """Normalise each hidden layer before its nonlinearity: steadier critics, above all at high learning rates."""
+    """Normalize each hidden layer before its nonlinearity: steadier critics, above all at high learning rates."""
     architecture: Literal["mlp", "simba"] = "mlp"
     """``simba``: residual blocks with layer norm (arXiv 2410.09754) in place of plain layers; ``net_arch`` then holds
     one number a block, all equal, and is made from ``n_blocks`` and ``width`` where it is None."""
@@ -56,43 +58,33 @@ class PolicyConfig:
     """Widths between the common layers and the critics' values."""
     actor_layers: tuple[int, ...] = ()
     """Widths between the common layers and the actor's outputs."""
+    encoder: Callable[[Array, tuple[Leaf, ...]], Any] | None = None
+    """Encoder of your own in every network, such as another CNN: ``encoder(key, leaves)`` returns an ``equinox.Module``
+    that maps an observation to a vector; see ``docs/networks.md``. A model file keeps its name only."""
     torso: Callable[[Array, int], Any] | None = None
     """Hidden layers of your own in every network: ``torso(key, n_inputs)`` returns an ``equinox.Module`` that maps
-    ``(batch, n_inputs)`` to ``(batch, n_outputs)`` and has the static attribute ``n_outputs``. A model file keeps its
-    name only: give it again to ``load``."""
+    ``(n_inputs,)`` to ``(n_outputs,)``, or batches of these. A model file keeps its name only: give it again to
+    ``load``."""
+    head: Callable[[Array, int, int], Any] | None = None
+    """Last layer of your own in every network: ``head(key, n_inputs, n_outputs)`` returns an ``equinox.Module``
+    likewise."""
 
     def __post_init__(self) -> None:
-        put = lambda key, value: object.__setattr__(self, key, value)  # noqa: E731
-        arch = self.net_arch
-        if isinstance(arch, Mapping):
-            if unknown := set(arch) - {"pi", "qf"}:
-                raise ValueError(f"net_arch has the unknown keys {sorted(unknown)}; expected 'pi' and 'qf'")
-            for key in ("pi", "qf"):
-                if key in arch and getattr(self, key) is None:
-                    put(key, arch[key])
-            put("net_arch", None)
-        for key in ("net_arch", "pi", "qf"):
-            put(key, _widths(key, getattr(self, key)))
-        for key in BRANCHES:
-            put(key, _widths(key, getattr(self, key)) or ())
-        for key in ("n_blocks", "width"):
-            value = getattr(self, key)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{key}={value!r} must be a whole number of at least 1")
-        name = self.activation_fn if isinstance(self.activation_fn, str) else self.activation_fn.__name__
-        if name.lower() not in ACTIVATIONS:
-            raise ValueError(f"activation_fn={name!r} is unknown; choose one of {', '.join(ACTIVATIONS)}")
-        put("activation_fn", name.lower())
-        if not isinstance(self.layer_norm, bool):
-            raise TypeError(f"layer_norm={self.layer_norm!r} must be True or False")
+        if isinstance(self.net_arch, Mapping):
+            split_net_arch(self, {"pi": "pi", "qf": "qf"})
+        convert(self, ("net_arch", "pi", "qf"), layer_widths, optional=True)
+        convert(self, BRANCHES, layer_widths)
+        convert(self, ("n_blocks", "width"), whole, least=1)
+        convert(self, "activation_fn", activation_name)
+        convert(self, "layer_norm", flag)
+        convert(self, "architecture", choice, among=("mlp", "simba"))
         self._check_shape()
 
     def _check_shape(self) -> None:
         """Raises where settings contradict each other: there is one way to shape a network at a time."""
-        if self.architecture not in ("mlp", "simba"):
-            raise ValueError(f"architecture={self.architecture!r} must be 'mlp' or 'simba'")
-        if self.torso is not None and not callable(self.torso):
-            raise TypeError(f"torso={self.torso!r} must be a class or function: torso(key, n_inputs) -> equinox.Module")
+        for key in ("encoder", "torso", "head"):
+            if (module := getattr(self, key)) is not None and not callable(module):
+                raise TypeError(f"{key}={module!r} must be a class or function that returns an equinox.Module")
         arch = [key for key in ("net_arch", "pi", "qf") if getattr(self, key) is not None]
         branches = [key for key in BRANCHES if getattr(self, key)]
         simba = ["architecture='simba'"] * (self.architecture == "simba")
@@ -101,7 +93,7 @@ class PolicyConfig:
         pairs = [(branches, arch), (branches, simba), (simba, norm)]
         for one, other in pairs + [(own, others) for others in (arch, branches, simba, norm)]:
             if one and other:
-                raise ValueError(f"policy_kwargs: {one[0]} leaves {other[0]} without meaning; give one of the two")
+                raise ValueError(f"policy_kwargs: {one[0]} conflicts with {other[0]}; give one of the two")
         if simba and any(len(set(getattr(self, key))) != 1 for key in arch):
             raise ValueError(
                 f"architecture='simba' has one width throughout: {arch[0]}={list(getattr(self, arch[0]))} must hold "
@@ -133,7 +125,7 @@ class PolicyConfig:
 
 
 def settled(shape: Mapping[str, Any], widths: Widths) -> dict[str, Any]:
-    """Returns settings that say which ``widths`` the settings ``shape`` leave to the default.
+    """Returns the settings of widths that the settings ``shape`` leave to the default ``widths``.
 
     There are none where the hidden layers are of another kind: branches, SimBa or the user's own.
     """
@@ -145,9 +137,32 @@ def settled(shape: Mapping[str, Any], widths: Widths) -> dict[str, Any]:
     return {key: width for key, width in zip(("pi", "qf"), widths, strict=True) if shape.get(key) is None}
 
 
-def _widths(key: str, value: Any) -> tuple[int, ...] | None:
+def split_net_arch(config: Any, fields: Mapping[str, str]) -> None:
+    """Moves the entries of a ``net_arch`` that is a mapping to the fields of these names.
+
+    Raises:
+        ValueError: for an unknown entry.
+    """
+    arch = dict(config.net_arch)
+    if unknown := set(arch) - set(fields):
+        expected = " and ".join(map(repr, fields))
+        raise ValueError(f"net_arch has the unknown keys {sorted(unknown)}; expected {expected}")
+    given = {field: arch.get(key) for key, field in fields.items() if getattr(config, field) is None}
+    assign(config, net_arch=None, **given)
+
+
+def activation_name(key: str, value: Any) -> str:
+    """Returns the name of an activation function, from the name or from a function or class of that name."""
+    name = value if isinstance(value, str) else value.__name__
+    if name.lower() not in ACTIVATIONS:
+        raise ValueError(f"{key}={name!r} is unknown; choose one of {', '.join(ACTIVATIONS)}")
+    return name.lower()
+
+
+def layer_widths(key: str, value: Any) -> tuple[int, ...]:
+    """Returns the widths of hidden layers."""
     if value is None:
-        return None
+        return ()
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise TypeError(f"{key}={value!r} must be a list of layer widths, such as [256, 256]")
     if not all(isinstance(width, int) and not isinstance(width, bool) and width > 0 for width in value):

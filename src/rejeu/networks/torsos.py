@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, ShapeDtypeStruct
 
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear
+from rejeu.networks.own import own_module
 from rejeu.networks.shape import PolicyConfig
 
 
@@ -74,7 +75,7 @@ class SimBa(eqx.Module):
     """A linear embedding, residual blocks and a final layer norm.
 
     Source: Lee et al. 2024, "SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement Learning" (arXiv
-    2410.09754). The paper's running normalisation of observations is not part of it: give the agent ``normalize=True`` if
+    2410.09754). The paper's running normalization of observations is not part of it: give the agent ``normalize=True`` if
     their scales differ much. Nor is there a layer norm at the entrance, which would mix the units of unlike observations.
     Weights are drawn as in all our layers rather than as the authors draw them.
     """
@@ -105,19 +106,19 @@ Torso = MLP | Branches | SimBa | Any
 def make_torso(
     key: Array, n_features: int, action_dim: int | None, widths: Sequence[int], shape: PolicyConfig
 ) -> tuple[Torso, int]:
-    """Returns the hidden layers that ``shape`` asks for, and how many numbers come out of them.
+    """Returns the hidden layers that ``shape`` describes, and the number of their outputs.
 
     Args:
-        key: draws their weights.
+        key: for the weights.
         n_features: length of the encoded observation.
         action_dim: of a critic that is given actions; None for a network without.
-        widths: what ``shape.actor_widths`` or ``shape.critic_widths`` said.
-        shape: which kind of torso.
+        widths: what ``shape.actor_widths`` or ``shape.critic_widths`` returned.
+        shape: the kind of hidden layers.
     """
     n_inputs = n_features + (action_dim or 0)
     if shape.torso is not None:
-        torso = own_torso(shape.torso, key, n_inputs)
-        return torso, torso.n_outputs
+        role = f"torso={name_of(shape.torso)}"
+        return own_module(role, shape.torso(key, n_inputs), ShapeDtypeStruct((n_inputs,), jnp.float32))
     if shape.has_branches:
         branches = Branches(key, n_features, action_dim, widths, shape)
         return branches, (joined_width(n_features, action_dim, shape), *shape.common_layers, *widths)[-1]
@@ -126,25 +127,22 @@ def make_torso(
     return MLP(key, n_inputs, widths, shape.activation_fn, shape.layer_norm), (n_inputs, *widths)[-1]
 
 
-def own_torso(make: Callable[[Array, int], Any], key: Array, n_inputs: int) -> Any:
-    """Returns the user's module, checked: all that it holds must be learnable or static.
+def make_head(key: Array, n_inputs: int, n_outputs: int, shape: PolicyConfig) -> Any:
+    """Returns the last layer of a network: a linear one, or the module of the user's own.
 
     Raises:
-        TypeError: if it is no ``equinox.Module``, has no ``n_outputs``, or has leaves that are no float32 arrays.
+        TypeError: if the user's module does not map ``n_inputs`` numbers to ``n_outputs``.
     """
-    torso = make(key, n_inputs)
-    name = getattr(make, "__name__", repr(make))
-    if not isinstance(torso, eqx.Module):
-        raise TypeError(f"torso={name} made {type(torso).__name__}, expected an equinox.Module")
-    n_outputs = getattr(torso, "n_outputs", None)
-    if not isinstance(n_outputs, int) or n_outputs < 1:
-        raise TypeError(f"torso={name} needs the attribute n_outputs: int = eqx.field(static=True), got {n_outputs!r}")
-    for path, leaf in jax.tree_util.tree_leaves_with_path(torso):
-        if not isinstance(leaf, jax.Array) or leaf.dtype != jnp.float32:
-            kind = f"array of {leaf.dtype}" if isinstance(leaf, jax.Array) else type(leaf).__name__
-            where = jax.tree_util.keystr(path, simple=True, separator=".")
-            raise TypeError(
-                f"torso={name} holds {where}, which is of type {kind} and cannot be learnt; declare that field "
-                "eqx.field(static=True)"
-            )
-    return torso
+    if shape.head is None:
+        return Linear(key, n_inputs, n_outputs)
+    role = f"head={name_of(shape.head)}"
+    example = ShapeDtypeStruct((n_inputs,), jnp.float32)
+    head, n = own_module(role, shape.head(key, n_inputs, n_outputs), example)
+    if n != n_outputs:
+        raise TypeError(f"{role} must have {n_outputs} outputs, got {n}")
+    return head
+
+
+def name_of(function: Any) -> str:
+    """Returns the name of a function or class for messages."""
+    return getattr(function, "__name__", repr(function))

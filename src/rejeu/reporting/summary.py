@@ -26,7 +26,7 @@ from rejeu import normalization
 from rejeu.algorithms.actor_critic import ActorCritic
 from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
 from rejeu.core import averaged_fields
-from rejeu.networks import MLP, Actor, Branches, Critic, SimBa, convolutions
+from rejeu.networks import MLP, Branches, Network, QNetwork, SimBa, convolutions
 from rejeu.spaces import Leaf
 
 ARROW = " -> "
@@ -59,7 +59,7 @@ def n_parameters(network: Any) -> int:
 
 def n_members(network: Any) -> int | None:
     """Returns the number of members of an ensemble, None for a single network."""
-    if isinstance(network, Actor | Critic) and len(network.head.bias.shape) == 2:
+    if isinstance(network, Network | QNetwork) and len(network.head.bias.shape) == 2:
         return network.head.bias.shape[0]
     return None
 
@@ -82,12 +82,12 @@ def draw(network: Any, reach: int = 0) -> str:
     if isinstance(network, RecurrentActorCritic):
         cells = [f"state [{cell.kind} {cell.size}]" for cell in network.cells]
         return draw_policy_and_value(network.readers, cells[0], cells[-1])
-    if not isinstance(network, Actor | Critic):
+    if not isinstance(network, Network | QNetwork):
         return f"({type(network).__name__})"
     output = network.head.bias.shape[-1]
     if isinstance(network.torso, Branches):
         return draw_branches(network.torso, output, reach)
-    return draw_torso("state, action" if isinstance(network, Critic) else "state", network.torso, output)
+    return draw_torso("state, action" if isinstance(network, QNetwork) else "state", network.torso, output)
 
 
 def draw_policy_and_value(network: ActorCritic, policy_entrance: str, value_entrance: str) -> str:
@@ -140,7 +140,7 @@ def branches_width(torso: Branches) -> int:
 
 def branch_width(network: Any) -> int:
     """Returns the width of a network's branches in characters, 0 without branches."""
-    is_branched = isinstance(network, Actor | Critic) and isinstance(network.torso, Branches)
+    is_branched = isinstance(network, Network | QNetwork) and isinstance(network.torso, Branches)
     return branches_width(network.torso) if is_branched else 0
 
 

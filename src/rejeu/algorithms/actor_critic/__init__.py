@@ -1,7 +1,7 @@
-"""What the on-policy algorithms share: their hyper-parameters, the network of policy and value, and how it acts.
+"""What the on-policy algorithms share: hyper-parameters, the network of policy and value, GAE, exploration by gSDE.
 
-The network reads an observation into features, and separate or shared hidden layers turn these into the parameters of a
-distribution over actions and into a value. Actions may be Box (a normal distribution, squashed by option), Discrete,
+An encoder maps an observation to features, and separate or shared hidden layers map these to the parameters of a
+distribution over actions and to a value. Actions may be Box (a normal distribution, optionally squashed), Discrete,
 MultiDiscrete or MultiBinary. A policy with memory puts a recurrent cell between the features and the hidden layers.
 """
 
@@ -9,13 +9,13 @@ from rejeu.algorithms.actor_critic.config import (
     HIDDEN_LAYERS,
     ActorCriticConfig,
     OnPolicyConfig,
-    check_flag,
     check_value_rate,
 )
 from rejeu.algorithms.actor_critic.network import (
     HIDDEN_GAIN,
     LOG_STD_RANGE,
     POLICY_GAIN,
+    SDE_EPSILON,
     VALUE_GAIN,
     ActionKind,
     ActorCritic,
@@ -23,19 +23,22 @@ from rejeu.algorithms.actor_critic.network import (
     action_kind,
     is_value,
     orthogonal,
+    sde_log_std,
     unmasked,
 )
+from rejeu.algorithms.actor_critic.state_dependent import explorer_of, sde_explorer
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
-    clipped,
+    clip_and_descend,
     entropy_of,
     explained_variance,
+    flat,
     masked_mean,
     masked_variance,
     samples,
-    standardised,
+    standardized,
+    with_advantages,
 )
-from rejeu.exploration.state_dependent import SDE_EPSILON, explorer_of, sde_explorer, sde_log_std
 
 __all__ = [
     "HIDDEN_GAIN",
@@ -51,12 +54,12 @@ __all__ = [
     "OnPolicyConfig",
     "Samples",
     "action_kind",
-    "check_flag",
     "check_value_rate",
-    "clipped",
+    "clip_and_descend",
     "entropy_of",
     "explained_variance",
     "explorer_of",
+    "flat",
     "is_value",
     "masked_mean",
     "masked_variance",
@@ -64,6 +67,7 @@ __all__ = [
     "samples",
     "sde_explorer",
     "sde_log_std",
-    "standardised",
+    "standardized",
     "unmasked",
+    "with_advantages",
 ]

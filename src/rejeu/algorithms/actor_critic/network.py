@@ -1,4 +1,4 @@
-"""The network of policy and value, for every kind of action."""
+"""The network of policy and value, for every type of action."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from jax import Array
 from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig
 from rejeu.core import Masked, PyTree
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
-from rejeu.exploration.state_dependent import sde_log_std
-from rejeu.networks import Convolution, Encoder, Linear, Torso, make_torso
+from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
 from rejeu.spaces import Leaf
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
 POLICY_GAIN, VALUE_GAIN, HIDDEN_GAIN = 0.01, 1.0, math.sqrt(2.0)
 """Gains of the orthogonal initialisation: a policy that begins nearly the same everywhere explores evenly."""
+
+
+SDE_EPSILON = 1e-6
+"""Added to the variance of state-dependent noise, which is 0 where the hidden layer is."""
 
 
 class ActionKind(NamedTuple):
@@ -58,16 +61,16 @@ Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli
 class ActorCritic(eqx.Module):
     """Observation to a distribution over actions and to a value."""
 
-    encoder: Encoder
+    encoder: Any
     torso: Torso
-    head: Linear
+    head: Any
     log_std: Array | None
     """``(action_dim,)``, with gSDE ``(width, action_dim)``; None where the head gives it or there is none."""
-    value_encoder: Encoder | None
+    value_encoder: Any
     """None where the policy's is shared."""
-    value_torso: Torso | None
+    value_torso: Any
     """None where the policy's is shared."""
-    value_head: Linear
+    value_head: Any
     action: ActionKind = eqx.field(static=True)
     shape: ActorCriticConfig = eqx.field(static=True)
 
@@ -83,23 +86,23 @@ class ActorCritic(eqx.Module):
         keys = jax.random.split(key, 6)
         widths, value_widths = shape.actor_widths(HIDDEN_LAYERS), shape.critic_widths(HIDDEN_LAYERS)
         std = shape.state_dependent_std and action.kind == "box"
-        encoder = Encoder(leaves, keys[0])
+        encoder = make_encoder(keys[0], leaves, shape)
         torso, n_hidden = make_torso(keys[1], encoder.n_features, None, widths, shape)
-        head = Linear(keys[2], n_hidden, action.n_outputs * (2 if std else 1))
-        value_encoder = None if shape.share_features_extractor else Encoder(leaves, keys[3])
+        head = make_head(keys[2], n_hidden, action.n_outputs * (2 if std else 1), shape)
+        value_encoder = None if shape.share_features_extractor else make_encoder(keys[3], leaves, shape)
         value_torso, n_value = (
             (None, n_hidden)
             if shape.share_layers
             else make_torso(keys[4], encoder.n_features, None, value_widths, shape)
         )
-        value_head = Linear(keys[5], n_value, 1)
+        value_head = make_head(keys[5], n_value, 1, shape)
         if shape.ortho_init:
             fresh = jax.random.split(jax.random.fold_in(key, 1), 6)
             encoder, torso = orthogonal(encoder, fresh[0], HIDDEN_GAIN), orthogonal(torso, fresh[1], HIDDEN_GAIN)
             value_encoder = orthogonal(value_encoder, fresh[3], HIDDEN_GAIN)
             value_torso = orthogonal(value_torso, fresh[4], HIDDEN_GAIN)
             head, value_head = orthogonal(head, fresh[2], POLICY_GAIN), orthogonal(value_head, fresh[5], VALUE_GAIN)
-        if std:
+        if std and isinstance(head, Linear):
             bias = head.bias.at[action.n_outputs :].set(shape.log_std_init)
             head = eqx.tree_at(lambda linear: linear.bias, head, bias)
         self.encoder, self.torso, self.head = encoder, torso, head
@@ -159,6 +162,17 @@ class ActorCritic(eqx.Module):
 def unmasked(obs: PyTree) -> tuple[PyTree, Array | None]:
     """Returns an observation and its mask, None where it has none."""
     return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)
+
+
+def sde_log_std(log_std: Array, hidden: Array) -> Array:
+    """Returns the log standard deviation of state-dependent noise at hidden layers ``(batch, width)``.
+
+    The noise is ``hidden @ E`` with a matrix ``E`` of independent normals of standard deviations ``exp(log_std)`` (Raffin et
+    al. 2020, "Smooth Exploration for Robotic Reinforcement Learning", arXiv 2005.05719, equation 8). No gradient reaches
+    the hidden layer this way.
+    """
+    variance = jnp.square(jax.lax.stop_gradient(hidden)) @ jnp.exp(2.0 * log_std)
+    return 0.5 * jnp.log(variance + SDE_EPSILON)
 
 
 def orthogonal(module: Any, key: Array, gain: float) -> Any:

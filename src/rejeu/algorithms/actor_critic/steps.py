@@ -1,21 +1,25 @@
-"""The steps of a rollout as the losses need them, and what losses and updates compute of them."""
+"""The steps of a rollout as the losses take them, and the computations that losses and updates share."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jax import Array
 
+from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.gae import advantages
-from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution
-from rejeu.core import PyTree, Rollout
-from rejeu.distributions import TanhNormal, sum_of
+from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution, is_value
+from rejeu.core import PyTree, Rollout, clip, descend
+from rejeu.distributions import TanhNormal
+from rejeu.schedules import at
 
 
 class Samples(NamedTuple):
-    """The steps of a rollout as the losses need them, leaves ``(batch, ...)``."""
+    """The steps of a rollout as the losses take them, leaves ``(batch, ...)``."""
 
     obs: PyTree
     action: Array
@@ -25,34 +29,36 @@ class Samples(NamedTuple):
     """Of the observation before any update."""
     advantage: Array
     target: Array
-    """What the value should have been: advantage plus value (the lambda-return)."""
+    """Target of the value: advantage plus value (the lambda-return)."""
     valid: Array
     """Whether the step exists, ``bool``."""
 
 
-def samples(network: ActorCritic, rollout: Rollout, gae_lambda: float) -> Samples:
-    """Returns the steps of a rollout in one row, environment by environment within a step, and their advantages.
+def flat(tree: PyTree) -> PyTree:
+    """Returns leaves ``(steps, n_envs, ...)`` as ``(steps * n_envs, ...)``."""
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), tree)
 
-    Values and log-probabilities are computed here, in one pass over all steps, rather than while acting: the network is
-    still the one that acted.
+
+def samples(network: ActorCritic, rollout: Rollout, gae_lambda: float) -> Samples:
+    """Returns the steps of a rollout along one axis, with their advantages.
+
+    Values and log-probabilities are computed here, in one pass over all steps, rather than when acting: the network is
+    still the one that chose the actions.
     """
     shape = rollout.reward.shape
-    flat = jax.tree.map(
-        lambda x: x.reshape(shape[0] * shape[1], *x.shape[2:]), rollout._replace(started=None, carry=())
-    )
-    distribution, value = network.both(flat.obs)
-    next_value = network.value(flat.next_obs)
+    distribution, value = network.both(flat(rollout.obs))
+    next_value = network.value(flat(rollout.next_obs))
+    log_prob = distribution.log_prob(flat(rollout.action))
+    evaluated = [x.reshape(shape) for x in (log_prob, value, next_value)]
+    return flat(with_advantages(rollout, *evaluated, gae_lambda))
+
+
+def with_advantages(rollout: Rollout, log_prob: Array, value: Array, next_value: Array, gae_lambda: float) -> Samples:
+    """Returns the steps of a rollout with what the network gives for them, leaves ``(steps, n_envs, ...)``."""
     last = jnp.concatenate([~rollout.valid[1:], jnp.ones_like(rollout.valid[:1])])
-    advantage = advantages(
-        rollout.reward,
-        value.reshape(shape),
-        next_value.reshape(shape),
-        rollout.discount,
-        rollout.ended | last,
-        gae_lambda,
-    ).reshape(-1)
-    log_prob = distribution.log_prob(flat.action)
-    return Samples(flat.obs, flat.action, log_prob, value, advantage, advantage + value, flat.valid)
+    ends = rollout.ended | last
+    advantage = advantages(rollout.reward, value, next_value, rollout.discount, ends, gae_lambda)
+    return Samples(rollout.obs, rollout.action, log_prob, value, advantage, advantage + value, rollout.valid)
 
 
 def entropy_of(distribution: Distribution, log_prob: Array) -> Array:
@@ -60,13 +66,25 @@ def entropy_of(distribution: Distribution, log_prob: Array) -> Array:
     return -log_prob if isinstance(distribution, TanhNormal) else distribution.entropy()
 
 
-def clipped(gradients: PyTree, most: float | None) -> tuple[PyTree, Array]:
-    """Returns ``gradients`` scaled down to the norm ``most`` if they are longer (None: never), and their norm before."""
-    norm = jnp.sqrt(sum_of([jnp.sum(jnp.square(g)) for g in jax.tree.leaves(gradients)]))
-    if most is None:
-        return gradients, norm
-    factor = jnp.minimum(1.0, most / (norm + 1e-6))
-    return jax.tree.map(lambda g: g * factor, gradients), norm
+def clip_and_descend(
+    network: Any,
+    gradients: Any,
+    optimizer_state: PyTree,
+    optimizer: optax.GradientTransformation,
+    config: OnPolicyConfig,
+    progress: Any,
+) -> tuple[Any, PyTree]:
+    """Returns network and optimizer state after one step against gradients whose norm is limited.
+
+    A value with a learning rate of its own also has a norm of its own.
+    """
+    rate = at(config.learning_rate, progress)
+    if config.critic_learning_rate is None:
+        return descend(network, clip(gradients, None, config.max_grad_norm), optimizer_state, optimizer, rate)
+    belongs_to_value, value_rate = is_value(network), at(config.critic_learning_rate, progress)
+    parts = [clip(part, None, config.max_grad_norm) for part in eqx.partition(gradients, belongs_to_value)]
+    rates = jax.tree.map(lambda own: value_rate if own else rate, belongs_to_value)
+    return descend(network, eqx.combine(*parts), optimizer_state, optimizer, rates)
 
 
 def explained_variance(predicted: Array, target: Array, valid: Array) -> Array:
@@ -85,7 +103,7 @@ def masked_variance(values: Array, valid: Array) -> Array:
     return masked_mean(jnp.square(values - masked_mean(values, valid)), valid)
 
 
-def standardised(values: Array, valid: Array) -> Array:
+def standardized(values: Array, valid: Array) -> Array:
     """Returns ``values`` with mean 0 and standard deviation 1 over the entries where ``valid``.
 
     Where only one is valid, which has no deviation, ``values`` are left as they are.

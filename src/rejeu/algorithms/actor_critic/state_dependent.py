@@ -1,35 +1,18 @@
-"""State-dependent noise (gSDE): a policy's noise that is a function of its last hidden layer and stays for many steps."""
+"""State-dependent noise (gSDE): a policy's noise that is a function of its last hidden layer and is kept for many steps."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from rejeu.algorithms.actor_critic.config import OnPolicyConfig
+from rejeu.algorithms.actor_critic.network import ActionKind, ActorCritic
 from rejeu.core import Clock, Explorer, PyTree
-
-if TYPE_CHECKING:
-    from rejeu.algorithms.actor_critic import ActionKind, ActorCritic, OnPolicyConfig
-
-SDE_EPSILON = 1e-6
-"""Added to the variance of state-dependent noise, which is 0 where the hidden layer is."""
-
-
-def sde_log_std(log_std: Array, hidden: Array) -> Array:
-    """Returns the log standard deviation of state-dependent noise at hidden layers ``(batch, width)``.
-
-    The noise is ``hidden @ E`` with a matrix ``E`` of independent normals of standard deviations ``exp(log_std)`` (Raffin et
-    al. 2020, "Smooth Exploration for Robotic Reinforcement Learning", arXiv 2005.05719, equation 8). No gradient reaches
-    the hidden layer this way.
-    """
-    variance = jnp.square(jax.lax.stop_gradient(hidden)) @ jnp.exp(2.0 * log_std)
-    return 0.5 * jnp.log(variance + SDE_EPSILON)
 
 
 def sde_explorer(n_steps: int) -> Explorer:
-    """Returns exploration by state-dependent noise (gSDE), whose matrix is drawn anew every ``n_steps``, or -1: episode.
+    """Returns exploration by state-dependent noise (gSDE), whose matrix is sampled every ``n_steps``, or -1: in every episode.
 
     The carry is each environment's matrix ``(n_envs, width, action_dim)`` and its age in steps ``int32 (n_envs,)``.
     """
@@ -56,13 +39,13 @@ def sde_explorer(n_steps: int) -> Explorer:
 
 
 def explorer_of(config: OnPolicyConfig, kind: ActionKind) -> Explorer | None:
-    """Returns how the policy explores where that takes more than drawing from its distribution, else None.
+    """Returns exploration by state-dependent noise if the configuration uses it, else None.
 
     Raises:
-        ValueError: for state-dependent noise on actions that are no numbers.
+        ValueError: for state-dependent noise on actions other than Box.
     """
     if not config.use_sde:
         return None
     if kind.kind != "box":
-        raise ValueError("use_sde=True needs Box actions: there is no noise to add to choices; leave it out")
+        raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
     return sde_explorer(config.sde_sample_freq)

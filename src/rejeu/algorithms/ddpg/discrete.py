@@ -1,0 +1,90 @@
+"""Actor and critic for Discrete actions: DDPG whose actor is a classifier.
+
+The actor ``mu(s)`` is a softmax over the actions and the training action is sampled from its probabilities; the critic
+``Q(s)`` gives one value per action. With the target networks ``mu'`` and ``Q'`` the deterministic action of DDPG becomes the
+probability vector, and its value the expectation under it, whose gradient is exact::
+
+    y      = r + d sum_a mu'(a | s') Q'(s', a)
+    J_Q    = mean (Q(s)[a] - y)^2
+    J_mu   = -mean sum_a mu(a | s) Q(s, a) - ent_coef H(mu(. | s))
+
+Nothing in plain DDPG keeps a classifier from becoming certain too early; a small entropy bonus with the fixed coefficient
+``ENTROPY_COEFFICIENT`` does.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.config import with_widths
+from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
+from rejeu.algorithms.sac.discrete import exploit, explore
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
+from rejeu.networks import Network
+from rejeu.schedules import at
+from rejeu.spaces import leaves
+
+ENTROPY_COEFFICIENT = 0.01
+"""Weight of the actor's entropy in nats, in the unit of rewards."""
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
+    """Returns DDPG for Discrete actions."""
+    obs_leaves, n_actions = leaves(observation_space), int(action_space.n)
+    shape, optimizer = with_widths(config, obs_leaves).policy_kwargs, optimizers.make(config.optimizer)
+
+    def init(key: Array) -> State:
+        actor_key, critic_key = jax.random.split(key)
+        actor = Network(actor_key, obs_leaves, n_actions, shape.actor_widths(HIDDEN_LAYERS), shape)
+        critic = Network(critic_key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
+        return initial_state(actor, critic, optimizer)
+
+    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
+        rate = at(config.learning_rate, clock.progress)
+        target = td_target(state.target_actor, state.target_critic, batch)
+        critic, critic_optimizer, loss, values = minimize(
+            critic_loss, state.critic, state.critic_optimizer, optimizer, rate, batch, target
+        )
+        actor, actor_optimizer, policy_loss, entropy = minimize(
+            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critic(batch.obs), batch.obs
+        )
+        metrics = {
+            "critic_loss": loss,
+            "actor_loss": policy_loss,
+            "entropy": entropy,
+            "q_value": jnp.mean(values),
+            TD_ERROR: jnp.abs(values - target),
+        }
+        return next_state(state, config, actor, critic, actor_optimizer, critic_optimizer), metrics
+
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        return state.critic(obs)[None]
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+
+
+def td_target(target_actor: Network, target_critic: Network, batch: Transition) -> Array:
+    """Returns the TD targets, ``(batch,)``."""
+    probabilities = jax.nn.softmax(target_actor(batch.next_obs))
+    return batch.reward + batch.discount * jnp.sum(probabilities * target_critic(batch.next_obs), axis=-1)
+
+
+def critic_loss(critic: Network, batch: Transition, target: Array) -> tuple[Array, Array]:
+    """Returns the mean squared TD error and the values of the actions taken, ``(batch,)``."""
+    values = jnp.take_along_axis(critic(batch.obs), batch.action[:, None], axis=-1)[:, 0]
+    return weighted_mean(jnp.square(values - target), batch.weight), values
+
+
+def actor_loss(actor: Network, values: Array, obs: PyTree) -> tuple[Array, Array]:
+    """Returns minus the expected value less the entropy bonus, and the mean entropy in nats.
+
+    ``values`` are those of all actions, ``(batch, n_actions)``.
+    """
+    log_probabilities = jax.nn.log_softmax(actor(obs))
+    probabilities = jnp.exp(log_probabilities)
+    entropy = jnp.mean(-jnp.sum(probabilities * log_probabilities, axis=-1))
+    return -jnp.mean(jnp.sum(probabilities * values, axis=-1)) - ENTROPY_COEFFICIENT * entropy, entropy

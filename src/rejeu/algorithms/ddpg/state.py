@@ -1,0 +1,67 @@
+"""The hyper-parameters and the state of DDPG, for Box and for Discrete actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.core import AVERAGED, PyTree, copy, polyak, tau_at
+from rejeu.networks import Network, Widths
+from rejeu.schedules import Schedule
+from rejeu.validation import convert, whole
+
+HIDDEN_LAYERS = (400, 300)
+"""Default widths of actor and critic but on images, those of the paper."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(OffPolicyConfig):
+    """Hyper-parameters of DDPG; the defaults are those of Stable-Baselines3."""
+
+    learning_rate: float | Schedule = 1e-3
+    """Step size of both optimizers: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    ``"lin_1e-3"`` or a function of the progress from 0 to 1."""
+    target_update_interval: int = 1
+    """Gradient steps between two updates of both target networks. A larger interval is more stable and slower."""
+
+    name: ClassVar[str] = "DDPG"
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
+
+    def __post_init__(self) -> None:
+        OffPolicyConfig.__post_init__(self)
+        convert(self, "target_update_interval", whole, least=1)
+
+
+class State(eqx.Module):
+    """Everything that DDPG learns; every leaf is an array."""
+
+    actor: Network
+    critic: Any
+    """A :class:`QNetwork`; for Discrete actions a :class:`Network` that gives the values of all actions."""
+    target_actor: Network = eqx.field(metadata=AVERAGED)
+    target_critic: Any = eqx.field(metadata=AVERAGED)
+    actor_optimizer: PyTree
+    critic_optimizer: PyTree
+    n_updates: Array
+    """Gradient steps taken, ``int32[]``."""
+
+
+def initial_state(actor: Network, critic: Any, optimizer: optax.GradientTransformation) -> State:
+    """Returns the state before the first update."""
+    targets = copy(actor), copy(critic)
+    return State(actor, critic, *targets, optimizer.init(actor), optimizer.init(critic), jnp.int32(0))
+
+
+def next_state(state: State, config: Config, actor: Network, critic: Any, *optimizers: PyTree) -> State:
+    """Returns the state after an update: what was learned, the optimizer states, and the targets after a soft update."""
+    n_updates = state.n_updates + 1
+    tau = tau_at(n_updates, config.tau, config.target_update_interval)
+    targets = polyak(state.target_actor, actor, tau), polyak(state.target_critic, critic, tau)
+    return State(actor, critic, *targets, *optimizers, n_updates)

@@ -1,0 +1,84 @@
+"""The optimizers that the setting ``optimizer`` names, and how one of your own is used.
+
+Algorithms keep the learning rate apart, because it may follow a schedule: an optimizer here turns gradients into a
+direction, and :func:`rejeu.core.descend` subtracts ``learning_rate`` times that direction. An Optax optimizer of your own
+is created with the learning rate 1 and used in the same way::
+
+    rejeu.SAC("MlpPolicy", env, optimizer="adamw")
+    rejeu.SAC("MlpPolicy", env, optimizer=optax.lamb)
+    rejeu.SAC("MlpPolicy", env, optimizer=functools.partial(optax.adamw, weight_decay=1e-2))
+    rejeu.SAC("MlpPolicy", env, optimizer=optax.chain(optax.clip(1.0), optax.adabelief(1.0)))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import optax
+
+WEIGHT_DECAY = 1e-4
+"""Decoupled weight decay of ``"adamw"``, which is multiplied by the learning rate as well."""
+RMSPROP_DECAY = 0.99
+"""Share of RMSprop's running mean of squared gradients that stays at each step."""
+
+
+def adamw(**settings: float) -> optax.GradientTransformation:
+    """Returns Adam with decoupled weight decay (Loshchilov and Hutter 2019, arXiv 1711.05101)."""
+    return optax.chain(optax.scale_by_adam(**settings), optax.add_decayed_weights(WEIGHT_DECAY))
+
+
+OPTIMIZERS: dict[str, Callable[..., optax.GradientTransformation]] = {
+    "adam": optax.scale_by_adam,
+    "adamw": adamw,
+    "nadam": partial(optax.scale_by_adam, nesterov=True),
+    "radam": optax.scale_by_radam,
+    "amsgrad": optax.scale_by_amsgrad,
+    "lion": lambda **settings: optax.scale_by_lion(),
+    "rmsprop": lambda **settings: optax.scale_by_rms(RMSPROP_DECAY),
+    "sgd": lambda **settings: optax.identity(),
+}
+"""The values of ``optimizer`` by name; those that are variants of Adam take an algorithm's settings ``b1`` and ``eps``."""
+
+
+def parse(key: str, value: Any) -> Any:
+    """Returns the setting ``optimizer``, checked.
+
+    Raises:
+        ValueError: for an unknown name.
+        TypeError: for anything but a name, an Optax transformation or a function that returns one.
+    """
+    if isinstance(value, optax.GradientTransformation):
+        return value
+    if isinstance(value, str):
+        if value.lower() not in OPTIMIZERS:
+            raise ValueError(
+                f"{key}={value!r} is unknown; choose one of {', '.join(OPTIMIZERS)}, or give an Optax optimizer"
+            )
+        return value.lower()
+    if callable(value) and isinstance(value(1.0), optax.GradientTransformation):
+        return value
+    raise TypeError(
+        f"{key}={value!r} must be one of {', '.join(OPTIMIZERS)}, an Optax optimizer such as optax.lamb, or one that was "
+        "created with the learning rate 1"
+    )
+
+
+def make(optimizer: Any, **adam: float) -> optax.GradientTransformation:
+    """Returns a transformation from gradients to directions, without a learning rate.
+
+    Args:
+        optimizer: what :func:`parse` returned.
+        adam: the algorithm's settings of Adam (``b1``, ``eps``); an optimizer of your own has its own.
+    """
+    if isinstance(optimizer, str):
+        return OPTIMIZERS[optimizer](**adam)
+    given = optimizer if isinstance(optimizer, optax.GradientTransformation) else optimizer(1.0)
+    return optax.chain(given, optax.scale(-1.0))  # Optax adds updates; the direction is subtracted
+
+
+def name(optimizer: Any) -> str:
+    """Returns the name under which a file mentions an optimizer of the user's own."""
+    function = optimizer.func if isinstance(optimizer, partial) else optimizer
+    return getattr(function, "__name__", type(function).__name__)

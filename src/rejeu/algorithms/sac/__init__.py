@@ -1,0 +1,33 @@
+"""Soft actor-critic (SAC): :mod:`continuous` for Box actions, :mod:`discrete` for Discrete actions."""
+
+from gymnasium import spaces
+
+from rejeu.algorithms.sac import continuous, discrete
+from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, actor_loss, critics_loss, policy, td_target
+from rejeu.algorithms.sac.state import Config, State
+from rejeu.algorithms.sac.temperature import initial_temperature, temperature_loss
+from rejeu.core import Algorithm
+
+__all__ = [
+    "LOG_STD_RANGE",
+    "Config",
+    "State",
+    "actor_loss",
+    "critics_loss",
+    "initial_temperature",
+    "make",
+    "policy",
+    "td_target",
+    "temperature_loss",
+]
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns SAC for these spaces.
+
+    Raises:
+        ValueError: if the action space is neither a finite Box nor Discrete.
+        TypeError: if the observation space holds something that is not an array.
+    """
+    module = discrete if isinstance(action_space, spaces.Discrete) else continuous
+    return module.make(config, observation_space, action_space)

@@ -1,0 +1,111 @@
+"""Soft actor-critic: an off-policy actor-critic that also maximizes the entropy of its policy.
+
+Sources: Haarnoja et al. 2018, "Soft Actor-Critic" (arXiv 1801.01290) and "Soft Actor-Critic Algorithms and
+Applications" (arXiv 1812.05905), which introduces the automatic temperature. With policy ``pi``, critics ``Q_i``, target
+critics ``Q'_i``, temperature ``alpha`` and discount ``d`` (0 where the MDP terminated)::
+
+    y           = r + d (min_i Q'_i(s', a') - alpha log pi(a' | s')),       a' ~ pi(. | s')
+    J_Q         = mean_i mean (Q_i(s, a) - y)^2 / 2
+    J_pi        = mean (alpha log pi(a | s) - min_i Q_i(s, a)),             a ~ pi(. | s), reparameterized
+    J_alpha     = -mean log_alpha (log pi(a | s) + target_entropy)
+    Q'_i       <- Q'_i + tau (Q_i - Q'_i)
+
+One update takes these steps in this order: critics, actor (against the new critics), temperature, targets. The actor and
+the temperature share one sample of actions, and the losses use the temperature from before the update, as in
+Stable-Baselines3. The critics' losses are summed over the critics, which gives each the gradient of its own ``J_Q``.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
+from rejeu.algorithms.sac.temperature import metrics_of, temperature_step
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.distributions import TanhNormal
+from rejeu.networks import Network, QNetwork, action_values
+from rejeu.prng import nth
+from rejeu.schedules import at
+from rejeu.spaces import action_dimension, check_box_action, leaves
+
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns SAC for Box actions."""
+    action_dim = action_dimension(check_box_action(action_space, config.name))
+    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
+    target_entropy = config.entropy_target(-float(action_dim))
+    optimizer = optimizers.make(config.optimizer)
+
+    def init(key: Array) -> State:
+        actor_key, critics_key, update_key = jax.random.split(key, 3)
+        widths = shape.critic_widths(HIDDEN_LAYERS)
+        actor = Network(actor_key, obs_leaves, 2 * action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
+        critics = ensemble(lambda k: QNetwork(k, obs_leaves, action_dim, widths, shape), critics_key, config.n_critics)
+        return initial_state(actor, critics, update_key, config, optimizer)
+
+    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
+        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
+        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
+        target = td_target(state.actor, state.target_critics, alpha, batch, target_key)
+        critics, critics_optimizer, critic_loss, values = minimize(
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+        )
+        actor, actor_optimizer, policy_loss, log_prob = minimize(
+            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
+        )
+        log_alpha, alpha_optimizer = temperature_step(
+            state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
+        )
+        state = next_state(
+            state, config, actor, critics, log_alpha, actor_optimizer, critics_optimizer, alpha_optimizer
+        )
+        return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target)
+
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        assert action is not None
+        return action_values(state.critics, obs, action)
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+
+
+def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
+    """Returns actions sampled from the policy, ``(batch, action_dim)``."""
+    return policy(actor, obs).sample(key)
+
+
+def exploit(actor: Network, obs: PyTree) -> Array:
+    """Returns the squashed means of the policy, ``(batch, action_dim)``."""
+    return policy(actor, obs).mode()
+
+
+def policy(actor: Network, obs: PyTree) -> TanhNormal:
+    """Returns the distribution of actions in [-1, 1] at ``obs``."""
+    mean, log_std = jnp.split(actor(obs), 2, axis=-1)
+    return TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+
+
+def td_target(actor: Network, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array) -> Array:
+    """Returns the TD targets, ``(batch,)`` (arXiv 1812.05905, equations 2 and 5)."""
+    next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
+    next_value = jnp.min(action_values(target_critics, batch.next_obs, next_action), axis=0)
+    return batch.reward + batch.discount * (next_value - alpha * next_log_prob)
+
+
+def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
+    """Returns half the squared TD error, averaged over the batch and summed over critics, and the values."""
+    values = action_values(critics, batch.obs, batch.action)
+    return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
+
+
+def actor_loss(actor: Network, critics: QNetwork, alpha: Array, obs: PyTree, key: Array) -> tuple[Array, Array]:
+    """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)`` (equation 7)."""
+    action, log_prob = policy(actor, obs).sample_and_log_prob(key)
+    value = jnp.min(action_values(critics, obs, action), axis=0)
+    return jnp.mean(alpha * log_prob - value), log_prob

@@ -1,0 +1,111 @@
+"""Soft actor-critic for Discrete actions: expectations over actions are sums, so no action is sampled.
+
+Source: Christodoulou 2019, "Soft Actor-Critic for Discrete Action Settings" (arXiv 1910.07207). With policy ``pi(a | s)``,
+critics ``Q_i(s)`` with one value per action, target critics ``Q'_i``, temperature ``alpha`` and discount ``d``::
+
+    V(s')    = sum_a pi(a | s') (min_i Q'_i(s', a) - alpha log pi(a | s'))
+    J_Q      = sum_i mean (Q_i(s)[a] - (r + d V(s')))^2 / 2
+    J_pi     = mean sum_a pi(a | s) (alpha log pi(a | s) - min_i Q_i(s, a))
+    J_alpha  = mean log_alpha (H(pi(. | s)) - target_entropy)
+
+``target_entropy="auto"`` is 0.3 log n. With the paper's 0.98 log n the policy stays nearly uniform and, with few actions,
+never becomes good.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
+from rejeu.algorithms.sac.temperature import metrics_of, temperature_step
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.networks import Network
+from rejeu.schedules import at
+from rejeu.spaces import leaves
+
+TARGET_ENTROPY_SHARE = 0.3
+"""Automatic target entropy as a share of the uniform policy's."""
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
+    """Returns SAC for Discrete actions."""
+    obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
+    target_entropy = config.entropy_target(TARGET_ENTROPY_SHARE * math.log(n_actions))
+    optimizer = optimizers.make(config.optimizer)
+
+    def network(key: Array, widths: tuple[int, ...]) -> Network:
+        return Network(key, obs_leaves, n_actions, widths, shape)
+
+    def init(key: Array) -> State:
+        actor_key, critics_key, update_key = jax.random.split(key, 3)
+        actor, widths = network(actor_key, shape.actor_widths(HIDDEN_LAYERS)), shape.critic_widths(HIDDEN_LAYERS)
+        critics = ensemble(lambda k: network(k, widths), critics_key, config.n_critics)
+        return initial_state(actor, critics, update_key, config, optimizer)
+
+    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
+        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
+        target = td_target(state.actor, state.target_critics, alpha, batch)
+        critics, critics_optimizer, critic_loss, values = minimize(
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+        )
+        least_values = jnp.min(all_values(critics, batch.obs), axis=0)
+        actor, actor_optimizer, policy_loss, entropy = minimize(
+            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, least_values, alpha, batch.obs
+        )
+        log_alpha, alpha_optimizer = temperature_step(
+            state.log_alpha, state.alpha_optimizer, -entropy, target_entropy, config, rate
+        )
+        state = next_state(
+            state, config, actor, critics, log_alpha, actor_optimizer, critics_optimizer, alpha_optimizer
+        )
+        return state, metrics_of(critic_loss, policy_loss, alpha, jnp.mean(entropy), values, target)
+
+    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+        return all_values(state.critics, obs)
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+
+
+def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
+    """Returns actions sampled from the policy, ``int32 (batch,)``."""
+    return jax.random.categorical(key, actor(obs)).astype(jnp.int32)
+
+
+def exploit(actor: Network, obs: PyTree) -> Array:
+    """Returns the most likely actions, ``int32 (batch,)``."""
+    return jnp.argmax(actor(obs), axis=-1).astype(jnp.int32)
+
+
+def all_values(critics: PyTree, obs: PyTree) -> Array:
+    """Returns every critic's value of every action, ``(n_critics, batch, n_actions)``."""
+    return jax.vmap(lambda critic: critic(obs))(critics)
+
+
+def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Transition) -> Array:
+    """Returns the TD targets, ``(batch,)``."""
+    log_probabilities = jax.nn.log_softmax(actor(batch.next_obs))
+    soft_values = jnp.min(all_values(target_critics, batch.next_obs), axis=0) - alpha * log_probabilities
+    return batch.reward + batch.discount * jnp.sum(jnp.exp(log_probabilities) * soft_values, axis=-1)
+
+
+def critics_loss(critics: PyTree, batch: Transition, target: Array) -> tuple[Array, Array]:
+    """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
+    index = jnp.broadcast_to(
+        batch.action[None, :, None], (jax.tree.leaves(critics)[0].shape[0], *batch.action.shape, 1)
+    )
+    values = jnp.take_along_axis(all_values(critics, batch.obs), index, axis=-1)[..., 0]
+    return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
+
+
+def actor_loss(actor: Network, values: Array, alpha: Array, obs: PyTree) -> tuple[Array, Array]:
+    """Returns the soft policy loss and the entropies in nats, ``(batch,)``; ``values`` is ``(batch, n_actions)``."""
+    log_probabilities = jax.nn.log_softmax(actor(obs))
+    probabilities = jnp.exp(log_probabilities)
+    loss = jnp.mean(jnp.sum(probabilities * (alpha * log_probabilities - values), axis=-1))
+    return loss, -jnp.sum(probabilities * log_probabilities, axis=-1)
