@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -66,11 +67,9 @@ def test_a_schedule_survives_json(schedule):
 @pytest.mark.parametrize(
     ("given", "error", "words"),
     [
-        (
-            lambda progress: 3e-4,
-            TypeError,
-            "learning_rate=.* must be a number, .*a function cannot be saved with the model",
-        ),
+        (lambda progress_remaining: 3e-4, ValueError, "learning_rate: functions are called with the progress"),
+        (lambda progress: float(progress), TypeError, "learning_rate: the function must use jax.numpy"),
+        (lambda progress: jnp.ones(2) * progress, TypeError, "learning_rate: the function must return one number"),
         (True, TypeError, "learning_rate=True must be a number"),
         (None, TypeError, "learning_rate=None must be a number"),
         ("3e-4", TypeError, "learning_rate='3e-4' must be a number"),
@@ -187,3 +186,16 @@ def test_schedules_of_a_loaded_agent_continue_by_the_steps_and_episodes_of_its_f
     np.testing.assert_allclose(by_steps[-1], 40 / 40)
     np.testing.assert_allclose(by_steps[0], (20 + 21 - len(by_steps)) / 40, rtol=1e-6)
     np.testing.assert_allclose(by_episodes, (40 + np.arange(1, 11)) / 50, rtol=1e-6)
+
+
+def test_any_function_of_the_progress_is_a_schedule(tmp_path):
+    def half_cosine(progress):
+        return 1e-2 * jnp.cos(progress * jnp.pi / 2)
+
+    settings = {"learning_starts": 0, "batch_size": 4, "buffer_size": 100, "seed": 0}
+    agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", learning_rate=half_cosine, **settings).learn(20)
+    path = agent.save(tmp_path / "model")
+    with pytest.raises(rejeu.CheckpointError, match="its learning_rate is your own, 'half_cosine'"):
+        rejeu.load(path)
+    assert rejeu.load(path, learning_rate=half_cosine).config == agent.config
+    assert rejeu.load(path, learning_rate=1e-3).config.learning_rate == 1e-3

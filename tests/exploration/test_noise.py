@@ -392,3 +392,26 @@ def test_a_deterministic_policy_without_noise_is_warned_of_once(agent):
         without.learn(2, reset_num_timesteps=False)
         for noise in (0.1, ParameterNoise()):
             agent("MlpPolicy", "Pendulum-v1", action_noise=noise, **small).learn(1)
+
+
+class Alternating:
+    """Noise of the user's own, which changes its sign from step to step."""
+
+    def init(self, n_envs):
+        return jnp.ones(n_envs)
+
+    def perturb(self, state, action, key):
+        return -state, action + 0.1 * state[:, None]
+
+
+def test_noise_of_the_users_own_is_added_and_mentioned_in_files(tmp_path):
+    noise = Alternating()
+    agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", action_noise=noise, learning_starts=0, buffer_size=50, seed=0).learn(
+        9
+    )
+    path = agent.save(tmp_path / "model")
+    with pytest.raises(rejeu.CheckpointError, match="its action_noise is your own, 'Alternating'"):
+        rejeu.load(path)
+    assert rejeu.load(path, action_noise=noise).config.action_noise is noise
+    with pytest.raises(TypeError, match="init and perturb"):
+        rejeu.DDPG("MlpPolicy", "Pendulum-v1", action_noise=object())

@@ -26,9 +26,9 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import exploit, explore, policy
-from rejeu.algorithms.sac.state import HIDDEN_LAYERS, State, initial_state, next_state
-from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of, temperature_step
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.algorithms.sac.state import HIDDEN_LAYERS, State, initial_state, temperature_and_targets
+from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
 from rejeu.networks import Network, QNetwork
 from rejeu.prng import nth
 from rejeu.schedules import at
@@ -78,9 +78,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return QNetwork(key, obs_leaves, action_dim, widths, shape, config.n_quantiles)
 
     def init(key: Array) -> State:
-        actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor = Network(actor_key, obs_leaves, 2 * action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        return initial_state(actor, ensemble(critic, critics_key, config.n_critics), update_key, config, optimizer)
+        return initial_state(key, obs_leaves, 2 * action_dim, critic, config, optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
@@ -92,11 +90,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         actor, actor_optimizer, policy_loss, log_prob = minimize(
             actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
         )
-        log_alpha, alpha_optimizer = temperature_step(
-            state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
-        )
-        state = next_state(
-            state, config, actor, critics, log_alpha, actor_optimizer, critics_optimizer, alpha_optimizer
+        state = temperature_and_targets(
+            state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, target_entropy, config, rate
         )
         values, expected = jnp.mean(quantiles, axis=-1), jnp.mean(target, axis=-1)
         return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, expected)

@@ -37,6 +37,11 @@ class Linear(eqx.Module):
         self.weight = jax.random.uniform(weight_key, (n_inputs, n_outputs), jnp.float32, -bound, bound)
         self.bias = jax.random.uniform(bias_key, (n_outputs,), jnp.float32, -bound, bound)
 
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs, also of a stack of layers."""
+        return self.bias.shape[-1]
+
     def __call__(self, x: Array) -> Array:
         """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)``."""
         return product(x, self.weight) + self.bias[None]

@@ -64,7 +64,8 @@ def own_module(role: str, module: Any, example: PyTree) -> tuple[Any, int]:
             f"{role} must map inputs of shape {shapes} to a vector, or a batch of them to (batch, n_outputs)"
         )
     arrays, constants = eqx.partition(module, eqx.is_array)
-    if takes_batch and not jax.tree.leaves(constants):
+    is_complete = takes_batch and not jax.tree.leaves(constants)
+    if is_complete and getattr(module, "n_outputs", None) == n_outputs:
         return module, n_outputs
     return OwnModule(arrays, constants, takes_batch, n_outputs), n_outputs
 

@@ -26,7 +26,7 @@ from rejeu import normalization
 from rejeu.algorithms.actor_critic import ActorCritic
 from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
 from rejeu.core import averaged_fields
-from rejeu.networks import MLP, Branches, Network, QNetwork, SimBa, convolutions
+from rejeu.networks import MLP, Branches, Linear, Network, QNetwork, SimBa, convolutions
 from rejeu.spaces import Leaf
 
 ARROW = " -> "
@@ -59,7 +59,7 @@ def n_parameters(network: Any) -> int:
 
 def n_members(network: Any) -> int | None:
     """Returns the number of members of an ensemble, None for a single network."""
-    if isinstance(network, Network | QNetwork) and len(network.head.bias.shape) == 2:
+    if isinstance(network, Network | QNetwork) and isinstance(network.head, Linear) and network.head.bias.ndim == 2:
         return network.head.bias.shape[0]
     return None
 
@@ -84,7 +84,7 @@ def draw(network: Any, reach: int = 0) -> str:
         return draw_policy_and_value(network.readers, cells[0], cells[-1])
     if not isinstance(network, Network | QNetwork):
         return f"({type(network).__name__})"
-    output = network.head.bias.shape[-1]
+    output = network.head.n_outputs
     if isinstance(network.torso, Branches):
         return draw_branches(network.torso, output, reach)
     return draw_torso("state, action" if isinstance(network, QNetwork) else "state", network.torso, output)
@@ -93,7 +93,7 @@ def draw(network: Any, reach: int = 0) -> str:
 def draw_policy_and_value(network: ActorCritic, policy_entrance: str, value_entrance: str) -> str:
     """Returns the lines of policy and value. Shared layers appear in both."""
     torso = network.torso if network.value_torso is None else network.value_torso
-    policy = draw_torso(policy_entrance, network.torso, network.head.bias.shape[-1])
+    policy = draw_torso(policy_entrance, network.torso, network.head.n_outputs)
     value = draw_torso(value_entrance, torso, 1) + (" (shared layers)" if network.value_torso is None else "")
     return f"policy: {policy}\nvalue:  {value}"
 

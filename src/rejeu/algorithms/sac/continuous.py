@@ -23,9 +23,9 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
-from rejeu.algorithms.sac.temperature import metrics_of, temperature_step
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
+from rejeu.algorithms.sac.temperature import metrics_of
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
 from rejeu.distributions import TanhNormal
 from rejeu.networks import Network, QNetwork, action_values
 from rejeu.prng import nth
@@ -43,12 +43,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     target_entropy = config.entropy_target(-float(action_dim))
     optimizer = optimizers.make(config.optimizer)
 
+    def critic(key: Array) -> QNetwork:
+        return QNetwork(key, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
+
     def init(key: Array) -> State:
-        actor_key, critics_key, update_key = jax.random.split(key, 3)
-        widths = shape.critic_widths(HIDDEN_LAYERS)
-        actor = Network(actor_key, obs_leaves, 2 * action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        critics = ensemble(lambda k: QNetwork(k, obs_leaves, action_dim, widths, shape), critics_key, config.n_critics)
-        return initial_state(actor, critics, update_key, config, optimizer)
+        return initial_state(key, obs_leaves, 2 * action_dim, critic, config, optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
@@ -60,11 +59,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         actor, actor_optimizer, policy_loss, log_prob = minimize(
             actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
         )
-        log_alpha, alpha_optimizer = temperature_step(
-            state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
-        )
-        state = next_state(
-            state, config, actor, critics, log_alpha, actor_optimizer, critics_optimizer, alpha_optimizer
+        state = temperature_and_targets(
+            state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, target_entropy, config, rate
         )
         return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target)
 

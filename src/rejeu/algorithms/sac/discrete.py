@@ -22,9 +22,9 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
-from rejeu.algorithms.sac.temperature import metrics_of, temperature_step
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
+from rejeu.algorithms.sac.temperature import metrics_of
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
 from rejeu.networks import Network
 from rejeu.schedules import at
 from rejeu.spaces import leaves
@@ -39,14 +39,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     target_entropy = config.entropy_target(TARGET_ENTROPY_SHARE * math.log(n_actions))
     optimizer = optimizers.make(config.optimizer)
 
-    def network(key: Array, widths: tuple[int, ...]) -> Network:
-        return Network(key, obs_leaves, n_actions, widths, shape)
+    def critic(key: Array) -> Network:
+        return Network(key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
 
     def init(key: Array) -> State:
-        actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor, widths = network(actor_key, shape.actor_widths(HIDDEN_LAYERS)), shape.critic_widths(HIDDEN_LAYERS)
-        critics = ensemble(lambda k: network(k, widths), critics_key, config.n_critics)
-        return initial_state(actor, critics, update_key, config, optimizer)
+        return initial_state(key, obs_leaves, n_actions, critic, config, optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
@@ -58,11 +55,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         actor, actor_optimizer, policy_loss, entropy = minimize(
             actor_loss, state.actor, state.actor_optimizer, optimizer, rate, least_values, alpha, batch.obs
         )
-        log_alpha, alpha_optimizer = temperature_step(
-            state.log_alpha, state.alpha_optimizer, -entropy, target_entropy, config, rate
-        )
-        state = next_state(
-            state, config, actor, critics, log_alpha, actor_optimizer, critics_optimizer, alpha_optimizer
+        state = temperature_and_targets(
+            state, (actor, actor_optimizer), (critics, critics_optimizer), -entropy, target_entropy, config, rate
         )
         return state, metrics_of(critic_loss, policy_loss, alpha, jnp.mean(entropy), values, target)
 

@@ -1,0 +1,96 @@
+"""The setting ``optimizer``: names, Optax optimizers of the user's own, and files that mention them."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import rejeu
+from rejeu.algorithms import a2c, crossq, optimizers, sac
+from rejeu.algorithms.config import rebuild, to_json
+from rejeu.core import descend
+from rejeu.errors import CheckpointError
+
+SETTINGS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0}
+OWN = [optax.lamb, partial(optax.adamw, weight_decay=1e-2), optax.chain(optax.clip(1.0), optax.adabelief(1.0))]
+
+
+def stepped(optimizer, rate, params, gradients, n=3):
+    state = optimizer.init(params)
+    for _ in range(n):
+        params, state = descend(params, gradients, state, optimizer, rate)
+    return params
+
+
+@pytest.mark.parametrize(
+    ("name", "reference"),
+    [
+        ("adam", optax.adam),
+        ("adamw", optax.adamw),
+        ("nadam", optax.nadam),
+        ("radam", optax.radam),
+        ("amsgrad", optax.amsgrad),
+        ("lion", partial(optax.lion, weight_decay=0.0)),
+        ("rmsprop", partial(optax.rmsprop, decay=0.99)),
+        ("sgd", optax.sgd),
+    ],
+)
+def test_a_name_gives_optaxs_optimizer(name, reference):
+    params, gradients = {"w": jnp.array([1.0, -2.0])}, {"w": jnp.array([0.5, 0.25])}
+    given = stepped(optimizers.make(optimizers.parse("optimizer", name)), 0.1, params, gradients)
+    optimizer = reference(0.1)
+    state, expected = optimizer.init(params), params
+    for _ in range(3):
+        change, state = optimizer.update(gradients, state, expected)
+        expected = optax.apply_updates(expected, change)
+    np.testing.assert_allclose(given["w"], expected["w"], rtol=1e-6)
+
+
+def test_an_optimizer_of_the_users_own_is_scaled_by_the_learning_rate():
+    params, gradients = jnp.array([1.0]), jnp.array([2.0])
+    for own in (optax.sgd, optax.sgd(1.0)):
+        assert float(stepped(optimizers.make(own), 0.25, params, gradients, n=1)[0]) == 0.5
+
+
+@pytest.mark.parametrize(("given", "error"), [("adamm", ValueError), (3, TypeError), (lambda rate: rate, TypeError)])
+def test_what_is_not_an_optimizer_is_refused(given, error):
+    with pytest.raises(error, match="optimizer="):
+        sac.Config(optimizer=given)
+
+
+def test_algorithms_keep_their_own_settings_of_adam():
+    assert optimizers.make(crossq.Config().optimizer, b1=0.5).init(jnp.zeros(1)).mu.shape == (1,)
+    assert isinstance(a2c.optimizer_of(a2c.Config()).init(jnp.zeros(1)), optax.ScaleByRmsState)
+    assert isinstance(a2c.optimizer_of(a2c.Config(use_rms_prop=False)).init(jnp.zeros(1)), optax.ScaleByAdamState)
+    assert isinstance(a2c.optimizer_of(a2c.Config(optimizer="adam")).init(jnp.zeros(1)), optax.ScaleByAdamState)
+
+
+@pytest.mark.parametrize("optimizer", OWN)
+def test_a_file_mentions_an_optimizer_of_the_users_own(optimizer):
+    config = sac.Config(optimizer=optimizer)
+    saved = to_json(config)
+    assert saved["optimizer"] == {"own": optimizers.name(optimizer)}
+    with pytest.raises(CheckpointError, match="its optimizer is your own"):
+        rebuild(sac.Config, saved, {})
+    assert rebuild(sac.Config, saved, {"optimizer": optimizer}) == config
+
+
+def test_a_file_without_the_setting_was_written_with_adam():
+    saved = to_json(sac.Config())
+    del saved["optimizer"]
+    assert rebuild(sac.Config, saved, {}) == sac.Config(optimizer="adam")
+
+
+def test_an_agent_learns_and_loads_with_another_optimizer(tmp_path):
+    learning_rate = rejeu.Linear(1e-2, 1e-3)
+    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", optimizer=OWN[2], learning_rate=learning_rate, **SETTINGS).learn(32)
+    path = agent.save(tmp_path / "model")
+    with pytest.raises(CheckpointError, match=r"load\(path, optimizer=GradientTransformation"):
+        rejeu.load(path)
+    loaded = rejeu.load(path, optimizer=OWN[2])
+    for key, value in agent.get_parameters().items():
+        np.testing.assert_array_equal(loaded.get_parameters()[key], value)
