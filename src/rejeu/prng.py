@@ -1,8 +1,8 @@
-"""JAX's own random numbers, bit for bit, made in a fraction of the time on a CPU.
+"""JAX's random numbers, bit for bit, computed several times faster on a CPU.
 
-JAX draws by the Threefry hash (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), whose rounds XLA runs
-on a CPU as a loop of many small kernels: more work than the whole actor of a small agent. Written out, they are one
-kernel. Keys of this module do that and give the same numbers as JAX's; all functions of ``jax.random`` take them.
+JAX uses the Threefry hash (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), whose rounds XLA runs
+on a CPU as a loop of many small kernels, which takes longer than the actor of a small agent. Unrolled, they are one
+kernel. Keys of this module unroll it and give the same numbers as JAX's; all functions of ``jax.random`` accept them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PARITY = 0x1BD11BDA
 
 
 def nth(key: Array, n: Any) -> Array:
-    """Returns the ``n``-th (``uint32[]`` or a whole number) of the keys that ``key`` ``uint32[2]`` stands for."""
+    """Returns the key that ``fold_in`` derives from ``key`` ``uint32[2]`` and ``n``, ``uint32[]`` or an int."""
     return jax.random.fold_in(jax.random.wrap_key_data(key, impl=IMPLEMENTATION), n)
 
 
@@ -57,10 +57,10 @@ def _fold_in(key: Array, data: Any) -> Array:
 
 def _random_bits(key: Array, bit_width: int, shape: tuple[int, ...]) -> Array:
     if bit_width == 64:
-        raise NotImplementedError("64-bit random numbers are not drawn with rejeu's keys; use jax.random.key")
+        raise NotImplementedError("rejeu's keys do not support 64-bit random numbers; use jax.random.key")
     high, low = _hashes(key, shape)
-    # XLA would repeat a plain ``high ^ low``, and the hash with it, in every kernel that reads the bits: nine times in an
-    # update of SAC, which then took twice as long to compile. A reduction it computes once.
+    # XLA would recompute ``high ^ low``, and so the hash, in every kernel that reads the bits: nine times in an update of
+    # SAC, which took twice as long to compile. It computes a reduction once.
     words = jnp.where(jnp.arange(2) == 0, high[..., None], low[..., None])
     return jax.lax.reduce_xor(words, axes=(len(shape),)).astype(f"uint{bit_width}")
 

@@ -1,4 +1,4 @@
-"""What surrounds XLA: compiled programs kept on disk, the seconds that compiling took, threads, and single kernels."""
+"""Settings of XLA: the compilation cache, the number of threads, and marks for its CPU compiler."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from jax import Array
 from jax.experimental.xla_metadata import set_xla_metadata
 
 THREADS = "NPROC"
-"""The environment variable that XLA takes the size of its CPU thread pool from."""
+"""Environment variable with the size of XLA's CPU thread pool."""
 LITTLE_WORK = 2**23
-"""Multiplications in the largest layer of an update up to which a second thread costs more than it brings. Measured on
-2 cores: a step of DDPG with batches of 128 through 128-128 takes half as long again with two threads, batches of 256 through
-256-256 lose a fifth with one."""
+"""Multiplications in the largest layer of an update up to which one thread is faster than two. Measured on 2 cores: with
+two threads a step of DDPG with batches of 128 and layers 128-128 takes 1.5 times as long; with one thread batches of 256 and
+layers 256-256 take 1.2 times as long."""
 
 RUN_ONCE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""XLA's options for what runs once only: it takes a quarter of the time to compile."""
+"""XLA's options for functions that run once: compiling takes a quarter of the time."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 OUTLINED = {"inlineable": "false"}
-"""What tells XLA to leave a function that a program calls a function."""
+"""Attributes of a call that XLA does not inline."""
 ONE_KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
-"""What tells it to make one kernel of the function."""
+"""Attributes of a call that XLA compiles to one kernel."""
 SMALL = 2**19
-"""Numbers that go into a function up to which it is made one kernel, which is the work of one thread."""
+"""Maximum number of input elements of such a call; one kernel runs in one thread."""
 
 _seconds = 0.0
 _listening = False
@@ -39,9 +39,9 @@ _threads: int | None = None
 
 
 def enable_cache() -> None:
-    """Turns on JAX's persistent compilation cache in the user's cache folder, unless one is set already.
+    """Turns on JAX's persistent compilation cache in the user's cache folder, unless one is set.
 
-    The environment variable ``JAX_COMPILATION_CACHE_DIR`` moves it; set to an empty text, it turns it off.
+    The environment variable ``JAX_COMPILATION_CACHE_DIR`` moves it; an empty value turns the cache off.
     """
     global _listening
     if not _listening:
@@ -62,15 +62,15 @@ def cores() -> int:
 
 
 def threads_for(work: float) -> int:
-    """Returns how many threads suit an update whose largest layer takes ``work`` multiplications."""
+    """Returns the number of threads for an update whose largest layer takes ``work`` multiplications."""
     return 1 if work <= LITTLE_WORK else cores()
 
 
 def start_device(n_threads: int) -> None:
-    """Starts JAX's device; on a CPU with so many threads.
+    """Starts JAX's device, on a CPU with ``n_threads`` threads.
 
-    The number of threads is fixed when the device starts, once in a process. Where the program has used JAX before, or
-    ``NPROC`` is set, nothing is chosen here.
+    The number of threads is fixed when the device starts, once in a process. It is not changed if the program has used JAX
+    before or ``NPROC`` is set.
     """
     global _threads
     if _threads is not None:
@@ -88,12 +88,12 @@ def start_device(n_threads: int) -> None:
 
 
 def threads() -> int:
-    """Returns the number of threads of JAX's device on a CPU; sums of large layers depend on it in their last bits."""
+    """Returns the number of threads of JAX's CPU device, on which the last bits of sums in large layers depend."""
     return cores() if _threads is None else _threads
 
 
 def _is_running() -> bool:
-    """Returns whether the program has started JAX's device already."""
+    """Returns whether the program has started JAX's device."""
     try:
         from jax._src.xla_bridge import backends_are_initialized  # there is no public way to ask
     except ImportError:
@@ -102,7 +102,7 @@ def _is_running() -> bool:
 
 
 def run_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns ``function`` compiled for a single call; by the usual options where another XLA does not know these."""
+    """Returns ``function`` compiled for a single call, with the usual options if XLA does not know the quick ones."""
     quick = jax.jit(function, compiler_options=RUN_ONCE)
 
     def call(*arguments: Any) -> Any:
@@ -117,27 +117,27 @@ def run_once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def outlined(function: F) -> F:
-    """Returns ``function``, which a CPU's XLA keeps as a function of its own wherever a compiled program calls it.
+    """Returns ``function`` such that XLA on a CPU does not inline it into a compiled program.
 
-    For the large steps of an update. XLA runs a program on a CPU kernel by kernel, in the order in which their inputs are
-    ready; whenever more than eight are, it gives half of them to another thread, hence to another core, in whose caches the
-    numbers are not. An update of DDPG (128-128, batches of 128) took 1.3 times as long by that. Of a function of its own
-    only its own kernels are counted. Arguments are pytrees; what is no array in them is taken as it is.
+    For the large steps of an update. XLA on a CPU runs a program kernel by kernel, in the order in which their inputs are
+    ready. If more than eight are ready, it gives half of them to another thread, and so to another core with cold caches: an
+    update of DDPG (layers 128-128, batches of 128) took 1.3 times as long. A function that is not inlined only counts its
+    own kernels. Arguments are pytrees; leaves that are not arrays are constants.
     """
     return _marked(function, OUTLINED, math.inf)
 
 
 def one_kernel(function: F) -> F:
-    """Returns ``function``, of which a CPU's XLA makes a single kernel wherever a compiled program calls it.
+    """Returns ``function`` such that XLA on a CPU compiles each call of it to one kernel.
 
-    For functions that do little to each of many small arrays, such as an optimizer's step, which are a kernel for each array
-    otherwise (see :func:`outlined`). Products of matrices are slow in it.
+    For cheap functions of many small arrays, such as an optimizer's step, which would be one kernel for each array (see
+    :func:`outlined`). Matrix products are slow in it.
     """
     return _marked(function, ONE_KERNEL, SMALL)
 
 
 def _marked(function: F, marks: dict[str, str], most: float) -> F:
-    """Returns ``function`` as one that compiled programs call, marked so, if at most so many numbers go into it."""
+    """Returns ``function`` as a call with these attributes, if its inputs have at most ``most`` elements."""
 
     @functools.wraps(function)
     def call(*arguments: Any, **keywords: Any) -> Any:

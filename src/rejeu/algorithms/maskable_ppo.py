@@ -1,8 +1,8 @@
-"""PPO where only some actions are allowed.
+"""PPO with invalid action masking.
 
 Source: Huang and Ontanon 2022, "A Closer Look at Invalid Action Masking in Policy Gradient Algorithms" (arXiv
-2006.14171): the logits of forbidden actions are replaced by a large negative number before the softmax, when acting as when
-learning, so that they are never drawn, get no probability and no gradient. All else is :mod:`rejeu.algorithms.ppo`.
+2006.14171): the logits of invalid actions are replaced by a large negative number before the softmax, when acting and when
+learning, so that they have probability 0 and no gradient. Everything else is as in :mod:`rejeu.algorithms.ppo`.
 """
 
 from __future__ import annotations

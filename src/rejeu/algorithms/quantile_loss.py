@@ -1,7 +1,6 @@
-"""Quantile regression: what distributional critics (QR-DQN, TQC) are trained by.
+"""The quantile Huber loss, by which distributional critics (QR-DQN, TQC) are trained.
 
-A critic gives ``n`` numbers instead of one: the quantiles of the return at the fractions ``(i + 1/2) / n``, which are
-the middles of ``n`` equal shares of probability.
+A critic has ``n`` outputs: the quantiles of the return at the fractions ``(i + 1/2) / n``.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from jax import Array
 
 
 def quantile_fractions(n_quantiles: int) -> Array:
-    """Returns the fractions that ``n_quantiles`` predicted quantiles stand for, ``(n_quantiles,)`` in (0, 1).
+    """Returns the fractions of ``n_quantiles`` predicted quantiles, ``(n_quantiles,)`` in (0, 1).
 
     >>> quantile_fractions(2).tolist()
     [0.25, 0.75]
@@ -31,9 +30,8 @@ def quantile_huber_loss(quantiles: Array, targets: Array, kappa: float = 1.0) ->
 
     Args:
         quantiles: predicted, ``(..., batch, n_quantiles)``; leading axes are critics.
-        targets: samples of the return to be predicted, ``(batch, n_targets)``, the same for all critics. Not
-            differentiated.
-        kappa: where the loss turns from quadratic to linear, in the units of the return.
+        targets: samples of the return to be predicted, ``(batch, n_targets)``, the same for all critics; without gradient.
+        kappa: the error at which the loss becomes linear, in the unit of the return.
 
     Returns:
         ``(..., batch)``.
@@ -54,8 +52,8 @@ def _loss(quantiles: Array, targets: Array, kappa: float) -> Array:
 def _loss_and_slope(quantiles: Array, targets: Array, kappa: float) -> tuple[Array, Array]:
     """Returns the loss, ``(..., batch)``, and its derivative by each quantile, shaped as ``quantiles``.
 
-    One target after another meets all quantiles: XLA would write the whole table of pairs to memory, several times over,
-    and take some fifteen times as long.
+    A scan over the targets, because XLA would write the whole table of pairs to memory several times, which takes about
+    fifteen times as long.
     """
     leading, n_quantiles, n_targets = quantiles.ndim - 2, quantiles.shape[-1], targets.shape[-1]
     fractions = quantile_fractions(n_quantiles).reshape((1,) * (leading + 1) + (-1,))

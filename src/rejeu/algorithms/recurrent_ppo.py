@@ -341,7 +341,7 @@ def unrolled_samples(network: RecurrentActorCritic, rollout: Rollout, gae_lambda
     never = jnp.zeros((shape[0] * shape[1],), bool)
     next_value = network.value(network.remember(memory, flat(rollout.next_obs), never))
     evaluated = [x.reshape(shape) for x in (log_prob, network.value(memory), next_value)]
-    return with_advantages(rollout, *evaluated, gae_lambda), started
+    return with_advantages(rollout, gae_lambda, *evaluated), started
 
 
 def loss(

@@ -1,19 +1,19 @@
-"""Batch renormalization: batch normalization that does in training what it will do in use.
+"""Batch renormalization: batch normalization that is the same function in training and in use.
 
 Source: Ioffe 2017, "Batch Renormalization" (arXiv 1702.03275, algorithm 1). With mean and standard deviation ``m_B``,
 ``s_B`` of the batch, the running ones ``m``, ``s``, and clip bounds ``r_max``, ``d_max``::
 
-    r = clip(s_B / s, 1 / r_max, r_max)         d = clip((m_B - m) / s, -d_max, d_max)         neither differentiated
+    r = clip(s_B / s, 1 / r_max, r_max)         d = clip((m_B - m) / s, -d_max, d_max)         without gradient
     y = scale ((x - m_B) / s_B r + d) + offset                                                  in training
     y = scale (x - m) / s + offset                                                              in use
 
-Where nothing is clipped the two give the same, but in training the gradient flows through the batch's statistics.
-During the warm-up ``r = 1`` and ``d = 0``: plain batch normalization. Running statistics move a hundredth of the way to
-the batch's at every training step; the paper keeps ``s``, we keep its square, as CrossQ's authors do.
+Without clipping the two are equal, but in training the gradient flows through the batch's statistics.
+During the warm-up ``r = 1`` and ``d = 0``: plain batch normalization. Running statistics are exponential averages
+with the rate 0.01. The paper averages ``s``, we average its square, as CrossQ's authors do.
 
-The running statistics are arrays of the network like its weights, but they learn from what passes, not by gradient:
-``train`` returns the output and the network that has seen it. Because an optimizer's step starts from the network
-before, :func:`with_statistics` joins the two::
+The running statistics are arrays of the network like its weights, but they are not learned by gradient: ``train`` returns
+the output and the network with updated statistics. Because an optimizer's step starts from the previous network,
+:func:`with_statistics` combines the two::
 
     (loss, trained), gradients = jax.value_and_grad(loss_that_returns_trained, has_aux=True)(network)
     network = with_statistics(descend(network, gradients, ...), trained)
@@ -36,13 +36,13 @@ from rejeu.spaces import Leaf
 Network = TypeVar("Network")
 
 MOMENTUM = 0.99
-"""Share of a running statistic that stays at each training step (arXiv 1902.05605, table of hyper-parameters)."""
+"""Decay of the running statistics (arXiv 1902.05605, table of hyper-parameters)."""
 EPSILON = 1e-3
 """Added to every variance, in the square of the input's unit."""
 R_MAX = 3.0
-"""Most by which the batch's standard deviation and the running one may differ, as a ratio."""
+"""Maximum ratio of the batch's and the running standard deviation."""
 D_MAX = 5.0
-"""Most by which their means may differ, in running standard deviations."""
+"""Maximum difference of their means, in running standard deviations."""
 
 
 class BatchRenorm(eqx.Module):
@@ -57,8 +57,8 @@ class BatchRenorm(eqx.Module):
     variance: Array
     """Running variance of the input, biased (divided by the batch size), ``(width,)``."""
     n_batches: Array
-    """Training steps so far, ``float32[]`` so that it may stand among what is differentiated. It stops growing at 2^24,
-    long after the warm-up."""
+    """Training steps so far, ``float32[]`` so that JAX can differentiate the network. It stops growing at 2^24, long after
+    the warm-up."""
     warm_up: int = eqx.field(static=True)
     """Training steps of plain batch normalization at the beginning."""
 
@@ -77,7 +77,7 @@ class BatchRenorm(eqx.Module):
         return x * factor[None] + (self.offset - mean * factor)[None]
 
     def train(self, x: Array) -> tuple[Array, BatchRenorm]:
-        """Normalizes ``(batch, width)`` by its own statistics, corrected; returns also the layer that has seen it."""
+        """Normalizes ``(batch, width)`` by its own statistics, corrected; also returns the layer with updated statistics."""
         batch_mean = jnp.mean(x, axis=0)
         centered = x - batch_mean[None]
         batch_variance = jnp.mean(jnp.square(centered), axis=0)
@@ -126,7 +126,7 @@ class RenormalizedMLP(eqx.Module):
         return x
 
     def train(self, x: Array) -> tuple[Array, RenormalizedMLP]:
-        """Does the same by the batch's statistics; returns also the torso that has seen it."""
+        """Does the same by the batch's statistics; also returns the torso with updated statistics."""
         x, norm = self.norms[0].train(x)
         norms = [norm]
         for layer, norm in zip(self.layers, self.norms[1:], strict=True):
@@ -167,7 +167,7 @@ class RenormalizedNetwork(eqx.Module):
         return self.head(self.torso(self._features(obs, action)))
 
     def train(self, obs: PyTree, action: Array | None = None) -> tuple[Array, RenormalizedNetwork]:
-        """Does the same by the batch's statistics; returns also the network that has seen it."""
+        """Does the same by the batch's statistics; also returns the network with updated statistics."""
         hidden, torso = self.torso.train(self._features(obs, action))
         return self.head(hidden), eqx.tree_at(lambda network: network.torso, self, torso)
 

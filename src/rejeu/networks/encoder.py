@@ -1,4 +1,4 @@
-"""From an observation of any structure to one vector of features: numbers, one-hot vectors, images by convolution."""
+"""Encoders: observations of any structure to one vector of features."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ NATURE = Convolutions(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512)
 """For images whose shorter side has 36 pixels or more: Mnih et al. 2015, "Human-level control through deep
 reinforcement learning" (Nature 518)."""
 SMALL = Convolutions(((32, 4, 2), (64, 3, 1)), 256)
-"""For images of 8 to 35 pixels on their shorter side. Our own choice; smaller ones are flattened."""
+"""For images of 8 to 35 pixels on their shorter side. Smaller images are flattened."""
 
 
 CHUNK = 256
-"""Most images that go through convolutions at once: one of 84 by 84 pixels takes 1.2 MB of temporary memory."""
+"""Maximum number of images that go through convolutions at once: one of 84 by 84 pixels takes 1.2 MB of temporary memory."""
 
 
 class Convolution(eqx.Module):
@@ -59,9 +59,8 @@ class Convolution(eqx.Module):
     def __call__(self, x: Array) -> Array:
         """Maps ``(batch, height, width, n_channels)`` to ``(batch, rows, columns, n_filters)``.
 
-        One matrix product over patches: on a CPU half the time of XLA's own convolution, which becomes a grouped one
-        where critics are stacked. The image is cut into cells of ``stride`` by ``stride`` pixels, so that a patch is a
-        few neighbouring cells.
+        One matrix product over patches, which takes half the time of XLA's convolution on a CPU. The image is divided
+        into cells of ``stride`` by ``stride`` pixels, so that a patch consists of a few neighboring cells.
         """
         kernel, _, n_channels, n_filters = self.weight.shape
         stride, cells = self.stride, kernel // self.stride
@@ -97,7 +96,7 @@ class CNN(eqx.Module):
         return in_chunks(self.features, x, CHUNK)
 
     def features(self, x: Array) -> Array:
-        """Returns the same of all images at once."""
+        """Returns the features of all images at once."""
         x = channels_last(x).astype(jnp.float32) / 255.0
         for layer in self.layers:
             x = jax.nn.relu(layer(x))
@@ -107,27 +106,27 @@ class CNN(eqx.Module):
 def in_chunks(function: Callable[[Array], Array], x: Array, size: int) -> Array:
     """Returns ``function(x)`` for a function of rows, computed ``size`` rows at a time.
 
-    A gradient computes each chunk again, so that what lies between input and output is never kept of more than one.
+    A gradient recomputes each chunk, so that intermediate values of only one chunk are kept.
     """
     n_chunks, rest = divmod(x.shape[0], size)
     if n_chunks == 0 or (n_chunks == 1 and rest == 0):
         return function(x)
     chunks = x[: n_chunks * size].reshape(n_chunks, size, *x.shape[1:])
-    once = jax.checkpoint(lambda chunk: function(chunk), prevent_cse=False)  # which hashes what it is given
+    once = jax.checkpoint(lambda chunk: function(chunk), prevent_cse=False)  # checkpoint hashes the function
     parts = jax.lax.map(once, chunks)
     parts = parts.reshape(n_chunks * size, *parts.shape[2:])
     return parts if rest == 0 else jnp.concatenate([parts, function(x[n_chunks * size :])])
 
 
 class Encoder(eqx.Module):
-    """Turns an observation of any structure into one feature vector, leaf by leaf; every image has a CNN of its own."""
+    """Turns an observation of any structure into one feature vector, leaf by leaf; every image has its own CNN."""
 
     leaves: tuple[Leaf, ...] = eqx.field(static=True)
     images: tuple[CNN, ...]
     """In the order of the leaves that are images."""
 
     def __init__(self, leaves: tuple[Leaf, ...], key: Array | None = None) -> None:
-        """Builds an encoder of these leaves; only images need the key.
+        """Builds an encoder of these leaves; the key is needed only for images.
 
         Raises:
             TypeError: if there are images and no key.
@@ -137,9 +136,7 @@ class Encoder(eqx.Module):
         for leaf in leaves:
             if (kind := convolutions(leaf)) is not None:
                 if key is None:
-                    raise TypeError(
-                        "Encoder(leaves, key): the encoder of an image has weights and needs a key to draw them"
-                    )
+                    raise TypeError("Encoder(leaves, key): the encoder of an image has weights and needs a key")
                 images.append(CNN(jax.random.fold_in(key, len(images)), leaf.shape, kind))
         self.images = tuple(images)
 
@@ -194,13 +191,13 @@ def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> A
 def reads_image(leaves: tuple[Leaf, ...]) -> bool:
     """Returns whether an observation is one image, or one stack of images, that convolutions read.
 
-    A Dict or Tuple is not, whatever it holds.
+    A Dict or Tuple is not.
     """
     return len(leaves) == 1 and not leaves[0].path and convolutions(leaves[0]) is not None
 
 
 def convolutions(leaf: Leaf) -> Convolutions | None:
-    """Returns the convolutions that an observation goes through, None if it is no image or too small for any."""
+    """Returns the convolutions for an observation, None if it is not an image or is too small."""
     if leaf.dtype != "uint8" or len(leaf.shape) not in (3, 4):
         return None
     side = min(image_shape(leaf.shape)[:2])
@@ -210,7 +207,7 @@ def convolutions(leaf: Leaf) -> Convolutions | None:
 def image_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
     """Returns height, width and channels of an image of 3 axes, or of a stack of images of 4.
 
-    The channels come first where the first axis is the shortest, else last, as Stable-Baselines3 has it. Frames of a
+    The channels come first if the first axis is the shortest, else last, as in Stable-Baselines3. Frames of a
     stack become channels.
 
     >>> image_shape((84, 84, 3)), image_shape((4, 84, 84)), image_shape((4, 96, 96, 3))
@@ -234,7 +231,7 @@ def channels_last(x: Array) -> Array:
 
 
 def n_features(leaf: Leaf) -> int:
-    """Returns how many features an observation leaf becomes."""
+    """Returns the number of features of an observation leaf."""
     kind = convolutions(leaf)
     return leaf.n_features if kind is None else kind.n_outputs
 

@@ -1,4 +1,4 @@
-"""The layers that every network is made of: affine maps, layer norm, and stacks of both."""
+"""The layers of all networks: linear maps, layer norm, and stacks of both."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class Linear(eqx.Module):
 
 @jax.custom_vjp
 def product(x: Array, weight: Array) -> Array:
-    """Returns ``x @ weight`` for ``(..., n)`` and ``(n, m)``; its gradients are computed as suits the processor.
+    """Returns ``x @ weight`` for ``(..., n)`` and ``(n, m)``; with gradients that are fast on CPUs.
 
-    The gradient of ``weight`` is ``x.T @ g``. The library that XLA multiplies matrices with on CPUs takes no transposed
-    left side, and what XLA does instead takes up to twice as long. So ``x`` is transposed first, which costs little, behind
-    a barrier, or XLA would put the two together again. Products of a single column are done otherwise, and gain nothing.
+    The gradient of ``weight`` is ``x.T @ g``. XLA's matrix library for CPUs does not accept a transposed left
+    side, and the fallback takes up to twice as long. So ``x`` is transposed first, behind a barrier that keeps XLA from fusing
+    the two. Products with a single column do not gain from it.
     """
     return x @ weight
 

@@ -1,4 +1,4 @@
-"""Hidden layers beyond a plain stack (branches, SimBa, a module of the user's), and the choice among all of them."""
+"""Hidden layers other than a plain stack: branches, SimBa, or a module of the user's own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rejeu.networks.shape import PolicyConfig
 
 
 class Branches(eqx.Module):
-    """Hidden layers that observation and action go through apart before they meet; see ``docs/networks.md``."""
+    """Separate hidden layers for observation and action, whose outputs are concatenated; see ``docs/networks.md``."""
 
     state: MLP
     action: MLP | None
@@ -46,7 +46,7 @@ class Branches(eqx.Module):
 
 
 def joined_width(n_features: int, action_dim: int | None, shape: PolicyConfig) -> int:
-    """Returns how many numbers the branches bring to where they meet; no action branch for None."""
+    """Returns the length of the concatenation of the branches; no action branch if ``action_dim`` is None."""
     from_state = (n_features, *shape.state_layers)[-1]
     return from_state if action_dim is None else from_state + (action_dim, *shape.action_layers)[-1]
 
@@ -75,9 +75,8 @@ class SimBa(eqx.Module):
     """A linear embedding, residual blocks and a final layer norm.
 
     Source: Lee et al. 2024, "SimBa: Simplicity Bias for Scaling Up Parameters in Deep Reinforcement Learning" (arXiv
-    2410.09754). The paper's running normalization of observations is not part of it: give the agent ``normalize=True`` if
-    their scales differ much. Nor is there a layer norm at the entrance, which would mix the units of unlike observations.
-    Weights are drawn as in all our layers rather than as the authors draw them.
+    2410.09754). The paper's running normalization of observations is not included: use ``normalize=True`` if their scales
+    differ. Weights are initialized as in all other layers.
     """
 
     embedding: Linear
@@ -100,7 +99,7 @@ class SimBa(eqx.Module):
 
 
 Torso = MLP | Branches | SimBa | Any
-"""Hidden layers: rejeu's own, or any module of the user's."""
+"""Hidden layers: rejeu's, or a module of the user's own."""
 
 
 def make_torso(

@@ -50,10 +50,10 @@ def samples(network: ActorCritic, rollout: Rollout, gae_lambda: float) -> Sample
     next_value = network.value(flat(rollout.next_obs))
     log_prob = distribution.log_prob(flat(rollout.action))
     evaluated = [x.reshape(shape) for x in (log_prob, value, next_value)]
-    return flat(with_advantages(rollout, *evaluated, gae_lambda))
+    return flat(with_advantages(rollout, gae_lambda, *evaluated))
 
 
-def with_advantages(rollout: Rollout, log_prob: Array, value: Array, next_value: Array, gae_lambda: float) -> Samples:
+def with_advantages(rollout: Rollout, gae_lambda: float, log_prob: Array, value: Array, next_value: Array) -> Samples:
     """Returns the steps of a rollout with what the network gives for them, leaves ``(steps, n_envs, ...)``."""
     last = jnp.concatenate([~rollout.valid[1:], jnp.ones_like(rollout.valid[:1])])
     ends = rollout.ended | last

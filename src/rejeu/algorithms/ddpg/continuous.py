@@ -66,7 +66,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             "q_value": jnp.mean(values),
             TD_ERROR: jnp.abs(values - target),
         }
-        return next_state(state, config, actor, critic, actor_optimizer, critic_optimizer), metrics
+        return next_state(state, config, (actor, actor_optimizer), (critic, critic_optimizer)), metrics
 
     def values(state: State, obs: PyTree, action: Array | None) -> Array:
         assert action is not None

@@ -59,9 +59,16 @@ def initial_state(actor: Network, critic: Any, optimizer: optax.GradientTransfor
     return State(actor, critic, *targets, optimizer.init(actor), optimizer.init(critic), jnp.int32(0))
 
 
-def next_state(state: State, config: Config, actor: Network, critic: Any, *optimizers: PyTree) -> State:
-    """Returns the state after an update: what was learned, the optimizer states, and the targets after a soft update."""
+def next_state(state: State, config: Config, actor: tuple[Network, PyTree], critic: tuple[Any, PyTree]) -> State:
+    """Returns the state after an update, from the new networks with their optimizer states; both targets are updated."""
     n_updates = state.n_updates + 1
     tau = tau_at(n_updates, config.tau, config.target_update_interval)
-    targets = polyak(state.target_actor, actor, tau), polyak(state.target_critic, critic, tau)
-    return State(actor, critic, *targets, *optimizers, n_updates)
+    return State(
+        actor=actor[0],
+        critic=critic[0],
+        target_actor=polyak(state.target_actor, actor[0], tau),
+        target_critic=polyak(state.target_critic, critic[0], tau),
+        actor_optimizer=actor[1],
+        critic_optimizer=critic[1],
+        n_updates=n_updates,
+    )
