@@ -7,6 +7,7 @@ An algorithm is a NamedTuple of pure functions over one explicit state (:class:`
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -131,7 +132,7 @@ class Algorithm(NamedTuple):
     recall: Callable[[PyTree, PyTree, PyTree, Array], tuple[Array, PyTree]] | None = None
     """``recall(carry, actor, obs, ended) -> (action, carry)``: the deterministic policy where it has a memory, with the
     carry of ``explorer``. None where the present observation is all that it needs."""
-    action_values: Callable[[PyTree, PyTree, Array | None], Array] | None = None
+    action_values: Callable[[PyTree, PyTree, Any], Array] | None = None
     """``action_values(state, obs, action)``: what each critic says of actions ``(batch, action_dim)`` in [-1, 1],
     ``(n_critics, batch)``; of Discrete actions what each says of all of them, ``(n_critics, batch, n_actions)``, and
     ``action`` is None. None for algorithms without such critics."""
@@ -160,6 +161,16 @@ Such a field is finite as long as the others are, so the check for NaN leaves it
 def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[..., Any]:
     """Returns ``jax.value_and_grad(loss, has_aux=has_aux)``, in a form that XLA runs faster on a CPU."""
     return outlined(jax.value_and_grad(loss, has_aux=has_aux))
+
+
+def without_gradient(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns ``function`` with outputs that are not differentiated, in a form that XLA runs faster on a CPU."""
+
+    @functools.wraps(function)
+    def stopped(*arguments: Any) -> Any:
+        return jax.lax.stop_gradient(function(*arguments))
+
+    return outlined(stopped)
 
 
 @one_kernel

@@ -176,7 +176,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = jax.lax.cond(n_updates % config.policy_delay == 0, delayed, lambda s: s, state)
         return state, metrics_of(critic_loss, state.actor_loss, alpha, state.entropy, values, target)
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
+    def values(state: State, obs: PyTree, action: Array) -> Array:
         return jax.vmap(lambda critic: critic(obs, action)[:, 0])(state.critics)
 
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)

@@ -46,6 +46,7 @@ from rejeu.core import (
     polyak,
     value_and_grad,
     weighted_mean,
+    without_gradient,
 )
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso
@@ -174,7 +175,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         moves = moves_due(state.step, clock.step, config.target_update_interval)
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
-        target = td_target(state.network, target_network, batch, config.double_q)
+        target = without_gradient(td_target)(state.network, target_network, batch, config.double_q)
         (loss, td_error), gradients = value_and_grad(td_loss, has_aux=True)(
             state.network, batch, target, LOSSES[config.loss]
         )
@@ -190,9 +191,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        return state.network(obs)[None]
-
+    values = lambda state, obs, action: state.network(obs)[None]  # noqa: E731
     return Algorithm(init, lambda state: state.network, explore, exploit, update, action_values=values)
 
 

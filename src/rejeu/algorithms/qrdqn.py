@@ -133,9 +133,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        return state.network(obs)[None]
-
+    values = lambda state, obs, action: state.network(obs)[None]  # noqa: E731
     return Algorithm(init, lambda state: state.network, explore, exploit, update, action_values=values)
 
 

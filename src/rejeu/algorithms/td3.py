@@ -27,10 +27,9 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.algorithms.ddpg.continuous import actor_loss, explore, policy
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS
+from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, metrics_of
 from rejeu.core import (
     AVERAGED,
-    TD_ERROR,
     Algorithm,
     Clock,
     Metrics,
@@ -43,6 +42,7 @@ from rejeu.core import (
     polyak,
     value_and_grad,
     weighted_mean,
+    without_gradient,
 )
 from rejeu.networks import Network, QNetwork, Widths, action_values
 from rejeu.prng import nth
@@ -126,8 +126,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         key, rate = nth(state.key, state.n_updates), at(config.learning_rate, clock.progress)
         sigma, limit = config.target_policy_noise, config.target_noise_clip
-        next_action = smoothed_action(state.target_actor, batch.next_obs, key, sigma, limit)
-        target = td_target(state.target_critics, batch, next_action)
+        next_action = without_gradient(smoothed_action)(state.target_actor, batch.next_obs, key, sigma, limit)
+        target = without_gradient(td_target)(state.target_critics, batch, next_action)
         critics, critics_optimizer, loss, values = minimize(
             critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
         )
@@ -148,18 +148,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
         state = dataclasses.replace(state, critics=critics, critics_optimizer=critics_optimizer, n_updates=n_updates)
         state = jax.lax.cond(n_updates % config.policy_delay == 0, delayed, lambda s: s, state)
-        metrics = {
-            "critic_loss": loss,
-            "actor_loss": state.actor_loss,
-            "q_value": jnp.mean(values),
-            TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
-        }
+        metrics = metrics_of(loss, state.actor_loss, values, jnp.mean(jnp.abs(values - target[None]), axis=0))
         return state, metrics
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        assert action is not None
-        return action_values(state.critics, obs, action)
-
+    values = lambda state, obs, action: action_values(state.critics, obs, action)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values)
 
 

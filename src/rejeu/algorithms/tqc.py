@@ -28,7 +28,7 @@ from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import exploit, explore, policy
 from rejeu.algorithms.sac.state import HIDDEN_LAYERS, State, initial_state, temperature_and_targets
 from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network, QNetwork
 from rejeu.prng import nth
 from rejeu.schedules import at
@@ -83,7 +83,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target = td_target(state.actor, state.target_critics, alpha, batch, target_key, n_kept)
+        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch, target_key, n_kept)
         critics, critics_optimizer, critic_loss, quantiles = minimize(
             critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
         )
@@ -96,10 +96,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         values, expected = jnp.mean(quantiles, axis=-1), jnp.mean(target, axis=-1)
         return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, expected)
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        assert action is not None
-        return jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)
-
+    values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 

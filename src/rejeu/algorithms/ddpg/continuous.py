@@ -22,9 +22,8 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import with_widths
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
+from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
 from rejeu.core import (
-    TD_ERROR,
     Algorithm,
     Clock,
     Metrics,
@@ -34,6 +33,7 @@ from rejeu.core import (
     minimize,
     value_and_grad,
     weighted_mean,
+    without_gradient,
 )
 from rejeu.networks import Network, QNetwork
 from rejeu.schedules import at
@@ -54,24 +54,16 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate = at(config.learning_rate, clock.progress)
-        target = td_target(state.target_actor, state.target_critic, batch)
+        target = without_gradient(td_target)(state.target_actor, state.target_critic, batch)
         critic, critic_optimizer, loss, values = minimize(
             critic_loss, state.critic, state.critic_optimizer, optimizer, rate, batch, target
         )
         policy_loss, gradients = value_and_grad(actor_loss)(state.actor, critic, batch.obs)
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
-        metrics = {
-            "critic_loss": loss,
-            "actor_loss": policy_loss,
-            "q_value": jnp.mean(values),
-            TD_ERROR: jnp.abs(values - target),
-        }
+        metrics = metrics_of(loss, policy_loss, values, jnp.abs(values - target))
         return next_state(state, config, (actor, actor_optimizer), (critic, critic_optimizer)), metrics
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        assert action is not None
-        return action_value(state.critic, obs, action)[None]
-
+    values = lambda state, obs, action: action_value(state.critic, obs, action)[None]  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values)
 
 

@@ -21,9 +21,18 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import with_widths
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, next_state
+from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
 from rejeu.algorithms.sac.discrete import exploit, explore
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
+from rejeu.core import (
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    minimize,
+    weighted_mean,
+    without_gradient,
+)
 from rejeu.networks import Network
 from rejeu.schedules import at
 from rejeu.spaces import leaves
@@ -45,25 +54,17 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate = at(config.learning_rate, clock.progress)
-        target = td_target(state.target_actor, state.target_critic, batch)
+        target = without_gradient(td_target)(state.target_actor, state.target_critic, batch)
         critic, critic_optimizer, loss, values = minimize(
             critic_loss, state.critic, state.critic_optimizer, optimizer, rate, batch, target
         )
         actor, actor_optimizer, policy_loss, entropy = minimize(
             actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critic(batch.obs), batch.obs
         )
-        metrics = {
-            "critic_loss": loss,
-            "actor_loss": policy_loss,
-            "entropy": entropy,
-            "q_value": jnp.mean(values),
-            TD_ERROR: jnp.abs(values - target),
-        }
+        metrics = metrics_of(loss, policy_loss, values, jnp.abs(values - target)) | {"entropy": entropy}
         return next_state(state, config, (actor, actor_optimizer), (critic, critic_optimizer)), metrics
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        return state.critic(obs)[None]
-
+    values = lambda state, obs, action: state.critic(obs)[None]  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 

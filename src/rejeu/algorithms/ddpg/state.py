@@ -11,7 +11,7 @@ import optax
 from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.core import AVERAGED, PyTree, copy, polyak, tau_at
+from rejeu.core import AVERAGED, TD_ERROR, Metrics, PyTree, copy, polyak, tau_at
 from rejeu.networks import Network, Widths
 from rejeu.schedules import Schedule
 from rejeu.validation import convert, whole
@@ -72,3 +72,8 @@ def next_state(state: State, config: Config, actor: tuple[Network, PyTree], crit
         critic_optimizer=critic[1],
         n_updates=n_updates,
     )
+
+
+def metrics_of(critic_loss: Array, actor_loss: Array, values: Array, td_error: Array) -> Metrics:
+    """Returns the metrics of an update."""
+    return {"critic_loss": critic_loss, "actor_loss": actor_loss, "q_value": jnp.mean(values), TD_ERROR: td_error}

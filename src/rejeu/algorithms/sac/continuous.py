@@ -25,7 +25,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
 from rejeu.algorithms.sac.temperature import metrics_of
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.distributions import TanhNormal
 from rejeu.networks import Network, QNetwork, action_values
 from rejeu.prng import nth
@@ -52,7 +52,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target = td_target(state.actor, state.target_critics, alpha, batch, target_key)
+        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch, target_key)
         critics, critics_optimizer, critic_loss, values = minimize(
             critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
         )
@@ -64,10 +64,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         )
         return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target)
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        assert action is not None
-        return action_values(state.critics, obs, action)
-
+    values = lambda state, obs, action: action_values(state.critics, obs, action)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 

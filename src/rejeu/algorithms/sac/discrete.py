@@ -24,7 +24,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
 from rejeu.algorithms.sac.temperature import metrics_of
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network
 from rejeu.schedules import at
 from rejeu.spaces import leaves
@@ -47,7 +47,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target = td_target(state.actor, state.target_critics, alpha, batch)
+        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch)
         critics, critics_optimizer, critic_loss, values = minimize(
             critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
         )
@@ -60,9 +60,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         )
         return state, metrics_of(critic_loss, policy_loss, alpha, jnp.mean(entropy), values, target)
 
-    def values(state: State, obs: PyTree, action: Array | None) -> Array:
-        return all_values(state.critics, obs)
-
+    values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
 
 
