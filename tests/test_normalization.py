@@ -299,9 +299,9 @@ def test_a_rollouts_rewards_are_scaled_by_its_own_returns_as_well():
         ("yes", TypeError, "must be True, False or a dict"),
         ({"norm_observations": True}, TypeError, "no setting 'norm_observations'; known: norm_obs"),
         ({"norm_obs": 1}, TypeError, "norm_obs=1 must be True or False"),
-        ({"clip_obs": 0.0}, ValueError, "clip_obs=0.0 must be a positive number"),
-        ({"clip_reward": float("inf")}, ValueError, "clip_reward=inf must be a positive number"),
-        ({"epsilon": True}, ValueError, "epsilon=True must be a positive number"),
+        ({"clip_obs": 0.0}, ValueError, "clip_obs=0.0 must be a finite number, above 0"),
+        ({"clip_reward": float("inf")}, ValueError, "clip_reward=inf must be a finite number, above 0"),
+        ({"epsilon": True}, ValueError, "epsilon=True must be a finite number, above 0"),
     ],
 )
 def test_a_bad_setting_is_refused(value, error, message):

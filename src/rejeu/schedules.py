@@ -133,8 +133,8 @@ def check_function(name: str, function: Schedule) -> None:
         )
     try:
         result = jax.eval_shape(function, jax.ShapeDtypeStruct((), jnp.float32))
-    except jax.errors.JAXTypeError as error:
-        raise TypeError(f"{name}: the function must use jax.numpy, without if and float(): {error}") from None
+    except jax.errors.JAXTypeError:
+        raise TypeError(f"{name}: the function must use jax.numpy, instead of NumPy, if and float()") from None
     if getattr(result, "shape", None) != ():
         raise TypeError(f"{name}: the function must return one number, got {result}")
 

@@ -164,7 +164,7 @@ def test_the_defaults_are_those_of_stable_baselines3():
         ({"learning_rate": float("nan")}, "learning_rate=nan must be finite"),
         (
             {"critic_learning_rate": 1e-3, "policy_kwargs": {"share_layers": True}},
-            "critic_learning_rate gives the value an optimizer of its own, which share_layers=True forbids; leave one",
+            "critic_learning_rate is a learning rate of its own for the value, which share_layers=True forbids; leave one",
         ),
     ],
 )

@@ -404,7 +404,10 @@ def test_other_action_spaces_are_refused_with_what_to_use(space, instead):
         ({"exploration_initial_eps": 1.5}, "exploration_initial_eps=1.5 must be"),
         ({"exploration_final_eps": -0.1}, "exploration_final_eps=-0.1 must be"),
         ({"exploration_schedule": "cosine"}, "must be 'linear' or 'exponential'"),
-        ({"exploration_schedule": "exponential", "exploration_final_eps": 0}, "out of an exponential schedule's reach"),
+        (
+            {"exploration_schedule": "exponential", "exploration_final_eps": 0},
+            "is not possible with an exponential schedule",
+        ),
         ({"target_update_interval": 0}, "target_update_interval=0 must be"),
         ({"max_grad_norm": 0}, "max_grad_norm=0 must be"),
         ({"clip_grad_value": -1}, "clip_grad_value=-1 must be"),

@@ -689,7 +689,7 @@ def test_the_defaults_are_those_of_stable_baselines3():
         ({"clip_range": -0.2}, "clip_range=-0.2 must not fall below 0"),
         ({"clip_range_vf": -0.2}, "clip_range_vf=-0.2 must not fall below 0"),
         ({"critic_learning_rate": -1.0}, "critic_learning_rate=-1.0 must not fall below 0"),
-        ({"learning_rate": lambda p: p}, r"learning_rate=.* must be a number, rejeu.Linear\(.*cannot be saved"),
+        ({"learning_rate": lambda p: float(p)}, "learning_rate: the function must use jax.numpy"),
         ({"normalize_advantage": 1}, "normalize_advantage=1 must be True or False"),
         ({"policy_kwargs": [64]}, r"policy_kwargs=\[64\] must be a dict with the keys net_arch"),
         ({"policy_kwargs": {"log_std_init": float("inf")}}, "log_std_init=inf must be a finite number"),
@@ -699,27 +699,27 @@ def test_the_defaults_are_those_of_stable_baselines3():
         ({"policy_kwargs": {"net_arch": {"pi": [8], "v": [8]}}}, r"unknown keys \['v'\]; expected 'pi' and "),
         (
             {"policy_kwargs": {"state_dependent_std": True, "learn_std": False}},
-            "state_dependent_std=True leaves learn_std=False without meaning",
+            "state_dependent_std=True conflicts with learn_std=False",
         ),
         (
             {"policy_kwargs": {"share_layers": True, "share_features_extractor": False}},
-            "share_layers=True leaves share_features_extractor=False without meaning; .* one",
+            "share_layers=True conflicts with share_features_extractor=False; .* one",
         ),
         (
             {"policy_kwargs": {"share_layers": True, "net_arch": {"pi": [32], "vf": [64, 64]}}},
-            r"one stack of hidden layers, of the policy's widths \[32\], and leaves vf=\[64, 64\] without meaning; leave",
+            r"one stack of hidden layers, of the policy's widths \[32\], and conflicts with vf=\[64, 64\]; leave",
         ),
         (
             {"policy_kwargs": {"share_layers": True, "vf": [32]}},
-            r"of the policy's widths \[64, 64\], and leaves vf=\[32\] without meaning",
+            r"of the policy's widths \[64, 64\], and conflicts with vf=\[32\]",
         ),
         (
             {"policy_kwargs": {"share_layers": True, "actor_layers": [8], "critic_layers": [4]}},
-            r"of the policy's widths \[8\], and leaves critic_layers=\[4\] without meaning",
+            r"of the policy's widths \[8\], and conflicts with critic_layers=\[4\]",
         ),
         (
             {"critic_learning_rate": 1e-3, "policy_kwargs": {"share_layers": True}},
-            "critic_learning_rate gives the value an optimizer of its own, which share_layers=True forbids; leave one",
+            "critic_learning_rate is a learning rate of its own for the value, which share_layers=True forbids; leave one",
         ),
     ],
 )

@@ -587,7 +587,7 @@ def test_memory_is_begun_anew_when_training_is(agent):
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"use_sde": True}, ValueError, "state-dependent noise is not for policies with a memory"),
+        ({"use_sde": True}, ValueError, "state-dependent noise is not available for policies with memory"),
         ({"n_episodes": 1}, ValueError, "give n_steps and leave it out"),
         ({"critic_learning_rate": 1e-3}, ValueError, "leave it out"),
         ({"policy_kwargs": {"cell": "rnn"}}, ValueError, "must be 'lstm' or 'gru'"),
@@ -597,7 +597,7 @@ def test_memory_is_begun_anew_when_training_is(agent):
         (
             {"policy_kwargs": {"shared_lstm": True, "share_features_extractor": False}},
             ValueError,
-            "shared_lstm=True leaves share_features_extractor=False without meaning: .*; leave out one",
+            "shared_lstm=True conflicts with share_features_extractor=False: .*; leave out one",
         ),
         ({"policy_kwargs": {"lstm_size": 4}}, TypeError, "lstm_hidden_size"),
     ],

@@ -367,7 +367,7 @@ def test_noise_may_be_given_as_a_number_or_a_text(given, expected):
     [
         ("ou", "must be None, a standard deviation"),
         ("uniform(1)", "must be one of normal"),
-        ("ou(x)", "'x' is no number"),
+        ("ou(x)", "'x' is not a number"),
         ("ou(0.2, 0.3)", "has no setting '0.3'"),
         ("ou(0.2, omega=1)", "has no setting 'omega=1'; ou has sigma, theta"),
         (-0.1, "must not be negative"),

@@ -216,11 +216,11 @@ def test_the_default_widths_are_the_algorithms_own():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"state_layers": [8], "net_arch": [8]}, "state_layers leaves net_arch without meaning"),
-        ({"common_layers": [8], "architecture": "simba"}, "common_layers leaves architecture='simba' without meaning"),
-        ({"torso": OwnTorso, "net_arch": {"pi": [8]}}, "torso leaves pi without meaning"),
-        ({"torso": OwnTorso, "layer_norm": True}, "torso leaves layer_norm without meaning"),
-        ({"architecture": "simba", "layer_norm": True}, "leaves layer_norm without meaning"),
+        ({"state_layers": [8], "net_arch": [8]}, "state_layers conflicts with net_arch"),
+        ({"common_layers": [8], "architecture": "simba"}, "common_layers conflicts with architecture='simba'"),
+        ({"torso": OwnTorso, "net_arch": {"pi": [8]}}, "torso conflicts with pi"),
+        ({"torso": OwnTorso, "layer_norm": True}, "torso conflicts with layer_norm"),
+        ({"architecture": "simba", "layer_norm": True}, "conflicts with layer_norm"),
         ({"architecture": "simba", "net_arch": [8, 16]}, r"net_arch=\[8, 16\] must hold equal numbers"),
         ({"architecture": "transformer"}, "must be 'mlp' or 'simba'"),
         ({"actor_layers": [0]}, r"actor_layers=\[0\] must hold positive whole numbers"),

@@ -29,8 +29,7 @@ from rejeu.algorithms.actor_critic import (
     ActorCritic,
     OnPolicyConfig,
     Samples,
-    action_kind,
-    check_value_rate,
+    checked,
     clip_and_descend,
     entropy_of,
     explained_variance,
@@ -39,10 +38,8 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardized,
 )
-from rejeu.algorithms.config import with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.schedules import Schedule, at
-from rejeu.spaces import check_action, leaves
 from rejeu.validation import convert, flag, number
 
 
@@ -100,10 +97,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
-    check_action(action_space, config.name)
-    obs_leaves, kind = leaves(observation_space), action_kind(action_space)
-    check_value_rate(config, obs_leaves)
-    shape = with_widths(config, obs_leaves).policy_kwargs
+    obs_leaves, kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizer_of(config)
 
     def init(key: Array) -> State:

@@ -38,8 +38,7 @@ from rejeu.algorithms.actor_critic import (
     ActorCritic,
     OnPolicyConfig,
     Samples,
-    action_kind,
-    check_value_rate,
+    checked,
     clip_and_descend,
     entropy_of,
     explained_variance,
@@ -48,11 +47,9 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardized,
 )
-from rejeu.algorithms.config import with_widths
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
-from rejeu.spaces import check_action, leaves
 from rejeu.validation import convert, number, whole
 
 ADAM_EPSILON = 1e-5
@@ -133,10 +130,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
-    check_action(action_space, config.name)
-    obs_leaves, kind = leaves(observation_space), action_kind(action_space)
-    check_value_rate(config, obs_leaves)
-    shape = with_widths(config, obs_leaves).policy_kwargs
+    obs_leaves, kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:

@@ -31,19 +31,18 @@ from rejeu.algorithms.actor_critic import (
     ActorCriticConfig,
     Distribution,
     Samples,
-    action_kind,
+    checked,
     flat,
     orthogonal,
     unmasked,
     with_advantages,
 )
-from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew
 from rejeu.networks import make_encoder
 from rejeu.prng import nth
-from rejeu.spaces import Leaf, check_action, leaves
+from rejeu.spaces import Leaf
 from rejeu.validation import choice, convert, flag, nested, whole
 
 
@@ -268,9 +267,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space.
     """
-    check_action(action_space, config.name)
-    obs_leaves, kind = leaves(observation_space), action_kind(action_space)
-    shape = with_widths(config, obs_leaves).policy_kwargs
+    obs_leaves, kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:

@@ -46,7 +46,7 @@ class ActorCriticConfig(PolicyConfig):
 
     def __post_init__(self) -> None:
         if isinstance(self.net_arch, Mapping):
-            split_net_arch(self, {"pi": "pi", "qf": "qf", "vf": "vf"})
+            split_net_arch(self, {"pi": "pi", "vf": "vf", "qf": "qf"})
         if self.vf is not None:
             assign(self, qf=self.vf)
         PolicyConfig.__post_init__(self)
@@ -69,7 +69,7 @@ class ActorCriticConfig(PolicyConfig):
         if self.share_layers and own is not None and own != widths:
             raise ValueError(
                 f"policy_kwargs: share_layers=True has one stack of hidden layers, of the policy's widths {list(widths)}, "
-                f"and leaves {key}={list(own)} without meaning; leave out one"
+                f"and conflicts with {key}={list(own)}; leave out one"
             )
 
 

@@ -12,11 +12,12 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig
+from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig, OnPolicyConfig, check_value_rate
+from rejeu.algorithms.config import with_widths
 from rejeu.core import Masked, PyTree
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
 from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
-from rejeu.spaces import Leaf
+from rejeu.spaces import Leaf, check_action, leaves
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
@@ -53,6 +54,20 @@ def action_kind(space: spaces.Space) -> ActionKind:
         return ActionKind("categorical", tuple(int(n) for n in space.nvec.ravel()), False)
     assert isinstance(space, spaces.MultiBinary)
     return ActionKind("binary", (int(np.prod(space.shape, dtype=int)),), False)
+
+
+def checked(
+    config: OnPolicyConfig, observation_space: spaces.Space, action_space: spaces.Space
+) -> tuple[tuple[Leaf, ...], ActionKind, Any]:
+    """Returns the leaves of observations, the kind of actions, and the settings of the network with their widths.
+
+    Raises:
+        ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
+    """
+    check_action(action_space, config.name)
+    obs_leaves = leaves(observation_space)
+    check_value_rate(config, obs_leaves)
+    return obs_leaves, action_kind(action_space), with_widths(config, obs_leaves).policy_kwargs
 
 
 Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli
