@@ -25,7 +25,7 @@ from jax import Array
 
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, Transition
 from rejeu.spaces import Leaf
-from rejeu.validation import convert, flag, number
+from rejeu.validation import coerce, flag, number
 
 MAX_COUNT = 2.0**23
 """Maximum count of the moments; from then on older values are forgotten. float32 cannot count beyond 2^24 by ones."""
@@ -47,8 +47,8 @@ class NormalizationConfig:
     """Added to variances."""
 
     def __post_init__(self) -> None:
-        convert(self, ("norm_obs", "norm_reward"), flag)
-        convert(self, ("clip_obs", "clip_reward", "epsilon"), number, above=0)
+        coerce(self, ("norm_obs", "norm_reward"), flag)
+        coerce(self, ("clip_obs", "clip_reward", "epsilon"), number, above=0)
 
 
 def parse(value: Any) -> NormalizationConfig | None:

@@ -57,7 +57,7 @@ def flag(key: str, value: Any) -> bool:
     return value
 
 
-def convert(
+def coerce(
     config: Any, keys: str | tuple[str, ...], converter: Callable[..., Any], optional: bool = False, **limits: Any
 ) -> None:
     """Replaces fields of a frozen dataclass by ``converter(key, value, **limits)``; for use in ``__post_init__``.

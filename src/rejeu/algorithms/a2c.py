@@ -40,7 +40,7 @@ from rejeu.algorithms.actor_critic import (
 )
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.schedules import Schedule, at
-from rejeu.validation import convert, flag, number
+from rejeu.validation import coerce, flag, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +70,8 @@ class Config(OnPolicyConfig):
 
     def __post_init__(self) -> None:
         OnPolicyConfig.__post_init__(self)
-        convert(self, "use_rms_prop", flag)
-        convert(self, "rms_prop_eps", number, above=0)
+        coerce(self, "use_rms_prop", flag)
+        coerce(self, "rms_prop_eps", number, above=0)
 
 
 class State(eqx.Module):

@@ -24,7 +24,7 @@ from rejeu.networks import PolicyConfig, Widths, reads_image, settled
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
-from rejeu.validation import C, assign, build, choice, convert, flag, nested, number, whole
+from rejeu.validation import C, assign, build, choice, coerce, flag, nested, number, whole
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
 """The replay buffers by name, and the configuration of each."""
@@ -96,22 +96,22 @@ class OffPolicyConfig:
     """The same where the observation is an image."""
 
     def __post_init__(self) -> None:
-        convert(self, "learning_rate", schedules.parse, least=0)
-        convert(self, "optimizer", optimizers.parse)
-        convert(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1)
-        convert(self, "frame_stack", whole, least=1, optional=True)
-        convert(self, "learning_starts", whole, least=0)
-        convert(self, "tau", number, above=0, most=1)
-        convert(self, "gamma", number, least=0, most=1)
-        convert(self, "train_freq", train_freq)
-        convert(self, "gradient_steps", gradient_steps)
-        convert(self, "overlap", flag)
-        convert(self, "priorities", nested, kind=PriorityConfig, optional=True)
+        coerce(self, "learning_rate", schedules.parse, least=0)
+        coerce(self, "optimizer", optimizers.parse)
+        coerce(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1)
+        coerce(self, "frame_stack", whole, least=1, optional=True)
+        coerce(self, "learning_starts", whole, least=0)
+        coerce(self, "tau", number, above=0, most=1)
+        coerce(self, "gamma", number, least=0, most=1)
+        coerce(self, "train_freq", train_freq)
+        coerce(self, "gradient_steps", gradient_steps)
+        coerce(self, "overlap", flag)
+        coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
         assign(self, normalize=normalization.parse(self.normalize), action_noise=action_noises.parse(self.action_noise))
-        convert(self, "nonfinite", choice, among=("stop", "skip"))
-        convert(self, "policy_kwargs", nested, kind=PolicyConfig)
-        convert(self, "replay_buffer_class", buffer_name)
-        convert(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
+        coerce(self, "nonfinite", choice, among=("stop", "skip"))
+        coerce(self, "policy_kwargs", nested, kind=PolicyConfig)
+        coerce(self, "replay_buffer_class", buffer_name)
+        coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
         if self.batch_size > self.buffer_size:
             raise ValueError(
                 f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "

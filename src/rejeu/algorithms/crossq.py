@@ -42,7 +42,7 @@ from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
-from rejeu.validation import convert, whole
+from rejeu.validation import coerce, whole
 
 ACTOR_LAYERS = (256, 256)
 """Default widths of the actor."""
@@ -73,8 +73,8 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        convert(self, "policy_delay", whole, least=1)
-        convert(self, "renorm_warmup_steps", whole, least=0)
+        coerce(self, "policy_delay", whole, least=1)
+        coerce(self, "renorm_warmup_steps", whole, least=0)
         check_shape(self.policy_kwargs)
 
 

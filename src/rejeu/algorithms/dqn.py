@@ -52,7 +52,7 @@ from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso
 from rejeu.schedules import Exponential, Linear, Schedule, at
 from rejeu.spaces import Leaf, leaves
-from rejeu.validation import choice, convert, flag, number, whole
+from rejeu.validation import choice, coerce, flag, number, whole
 
 HIDDEN_LAYERS = (64, 64)
 """Default widths of the network but on images, those of Stable-Baselines3."""
@@ -94,12 +94,12 @@ class QLearningConfig(OffPolicyConfig):
                 f"action_noise={self.action_noise} does not apply to Discrete actions; explore by exploration_final_eps, "
                 "or by action_noise=ParameterNoise()"
             )
-        convert(self, "target_update_interval", whole, least=1)
-        convert(self, "max_grad_norm", number, above=0, optional=True)
-        convert(self, "exploration_fraction", number, above=0, most=1)
-        convert(self, "exploration_schedule", choice, among=("linear", "exponential"))
+        coerce(self, "target_update_interval", whole, least=1)
+        coerce(self, "max_grad_norm", number, above=0, optional=True)
+        coerce(self, "exploration_fraction", number, above=0, most=1)
+        coerce(self, "exploration_schedule", choice, among=("linear", "exponential"))
         for key in ("exploration_initial_eps", "exploration_final_eps"):
-            convert(self, key, number, least=0, most=1)
+            coerce(self, key, number, least=0, most=1)
             if getattr(self, key) == 0 and self.exploration_schedule == "exponential":
                 raise ValueError(
                     f"{key}=0 is not possible with an exponential schedule; try 0.01, or the linear schedule"
@@ -132,9 +132,9 @@ class Config(QLearningConfig):
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
-        convert(self, "loss", choice, among=tuple(LOSSES))
-        convert(self, "clip_grad_value", number, above=0, optional=True)
-        convert(self, ("double_q", "dueling"), flag)
+        coerce(self, "loss", choice, among=tuple(LOSSES))
+        coerce(self, "clip_grad_value", number, above=0, optional=True)
+        coerce(self, ("double_q", "dueling"), flag)
 
 
 class State(eqx.Module):

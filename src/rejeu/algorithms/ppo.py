@@ -50,7 +50,7 @@ from rejeu.algorithms.actor_critic import (
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
-from rejeu.validation import convert, number, whole
+from rejeu.validation import coerce, number, whole
 
 ADAM_EPSILON = 1e-5
 """Added to Adam's denominator, as in the authors' code."""
@@ -77,10 +77,10 @@ class Config(OnPolicyConfig):
 
     def __post_init__(self) -> None:
         OnPolicyConfig.__post_init__(self)
-        convert(self, ("batch_size", "n_epochs"), whole, least=1)
-        convert(self, "clip_range", schedules.parse, least=0)
-        convert(self, "clip_range_vf", schedules.parse, least=0, optional=True)
-        convert(self, "target_kl", number, above=0, optional=True)
+        coerce(self, ("batch_size", "n_epochs"), whole, least=1)
+        coerce(self, "clip_range", schedules.parse, least=0)
+        coerce(self, "clip_range_vf", schedules.parse, least=0, optional=True)
+        coerce(self, "target_kl", number, above=0, optional=True)
 
     def steps_per_gradient(self, n_envs: int) -> int:
         """Returns the number of steps of ``n_envs`` environments per gradient step."""

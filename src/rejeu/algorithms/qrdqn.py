@@ -54,7 +54,7 @@ from rejeu.core import (
 from rejeu.networks import Network
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import leaves
-from rejeu.validation import convert, whole
+from rejeu.validation import coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ class Config(QLearningConfig):
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
-        convert(self, "n_quantiles", whole, least=1)
+        coerce(self, "n_quantiles", whole, least=1)
 
 
 class State(eqx.Module):

@@ -43,7 +43,7 @@ from rejeu.exploration.explorer import renew
 from rejeu.networks import make_encoder
 from rejeu.prng import nth
 from rejeu.spaces import Leaf
-from rejeu.validation import choice, convert, flag, nested, whole
+from rejeu.validation import choice, coerce, flag, nested, whole
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class RecurrentConfig(ActorCriticConfig):
 
     def __post_init__(self) -> None:
         ActorCriticConfig.__post_init__(self)
-        convert(self, "cell", choice, among=("lstm", "gru"))
-        convert(self, "lstm_hidden_size", whole, least=1)
-        convert(self, "shared_lstm", flag)
+        coerce(self, "cell", choice, among=("lstm", "gru"))
+        coerce(self, "lstm_hidden_size", whole, least=1)
+        coerce(self, "shared_lstm", flag)
         if self.share_layers and not self.shared_lstm:
             raise ValueError("share_layers=True needs shared_lstm=True: shared layers need a shared memory")
         if self.shared_lstm and not self.share_features_extractor:
@@ -87,7 +87,7 @@ class Config(ppo.Config):
     name: ClassVar[str] = "RecurrentPPO"
 
     def __post_init__(self) -> None:
-        convert(self, "policy_kwargs", nested, kind=RecurrentConfig)
+        coerce(self, "policy_kwargs", nested, kind=RecurrentConfig)
         ppo.Config.__post_init__(self)
         if self.critic_learning_rate is not None:
             raise ValueError("critic_learning_rate: policy and value read through one encoder here; leave it out")

@@ -48,7 +48,7 @@ from rejeu.networks import Network, QNetwork, Widths, action_values
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import action_dimension, check_box_action, leaves
-from rejeu.validation import convert, number, whole
+from rejeu.validation import coerce, number, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +73,8 @@ class Config(OffPolicyConfig):
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
-        convert(self, ("policy_delay", "n_critics"), whole, least=1)
-        convert(self, ("target_policy_noise", "target_noise_clip"), number, least=0)
+        coerce(self, ("policy_delay", "n_critics"), whole, least=1)
+        coerce(self, ("target_policy_noise", "target_noise_clip"), number, least=0)
 
 
 class State(eqx.Module):

@@ -33,7 +33,7 @@ from rejeu.networks import Network, QNetwork
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
-from rejeu.validation import convert, whole
+from rejeu.validation import coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +51,8 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        convert(self, ("n_quantiles", "target_update_interval"), whole, least=1)
-        convert(self, "top_quantiles_to_drop_per_net", whole, least=0)
+        coerce(self, ("n_quantiles", "target_update_interval"), whole, least=1)
+        coerce(self, "top_quantiles_to_drop_per_net", whole, least=0)
         if self.top_quantiles_to_drop_per_net >= self.n_quantiles:
             raise ValueError(
                 f"top_quantiles_to_drop_per_net={self.top_quantiles_to_drop_per_net} would leave nothing of "

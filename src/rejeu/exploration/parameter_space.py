@@ -31,7 +31,7 @@ from jax import Array
 from rejeu.core import Algorithm, Clock, PyTree
 from rejeu.networks import LayerNorm
 from rejeu.networks.batch_renorm import BatchRenorm
-from rejeu.validation import convert, number, whole
+from rejeu.validation import coerce, number, whole
 
 NORMALIZATION_LAYERS: tuple[type[eqx.Module], ...] = (
     LayerNorm,
@@ -64,8 +64,8 @@ class ParameterNoise:
 
     def __post_init__(self) -> None:
         for key, least in (("initial_sigma", 0.0), ("target_distance", 0.0), ("adaptation", 1.0)):
-            convert(self, key, number, least=least)
-        convert(self, "adaptation_interval", whole, least=1)
+            coerce(self, key, number, least=least)
+        coerce(self, "adaptation_interval", whole, least=1)
 
 
 class State(eqx.Module):

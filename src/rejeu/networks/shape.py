@@ -10,7 +10,7 @@ from jax import Array
 
 from rejeu.networks.layers import ACTIVATIONS
 from rejeu.spaces import Leaf
-from rejeu.validation import assign, choice, convert, flag, whole
+from rejeu.validation import assign, choice, coerce, flag, whole
 
 
 class Widths(NamedTuple):
@@ -72,12 +72,12 @@ class PolicyConfig:
     def __post_init__(self) -> None:
         if isinstance(self.net_arch, Mapping):
             split_net_arch(self, {"pi": "pi", "qf": "qf"})
-        convert(self, ("net_arch", "pi", "qf"), layer_widths, optional=True)
-        convert(self, BRANCHES, layer_widths)
-        convert(self, ("n_blocks", "width"), whole, least=1)
-        convert(self, "activation_fn", activation_name)
-        convert(self, "layer_norm", flag)
-        convert(self, "architecture", choice, among=("mlp", "simba"))
+        coerce(self, ("net_arch", "pi", "qf"), layer_widths, optional=True)
+        coerce(self, BRANCHES, layer_widths)
+        coerce(self, ("n_blocks", "width"), whole, least=1)
+        coerce(self, "activation_fn", activation_name)
+        coerce(self, "layer_norm", flag)
+        coerce(self, "architecture", choice, among=("mlp", "simba"))
         self._check_shape()
 
     def _check_shape(self) -> None:

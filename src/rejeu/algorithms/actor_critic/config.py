@@ -13,7 +13,7 @@ from rejeu.networks import PolicyConfig, Widths, convolutions, split_net_arch
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
-from rejeu.validation import assign, choice, convert, flag, nested, number, whole
+from rejeu.validation import assign, choice, coerce, flag, nested, number, whole
 
 HIDDEN_LAYERS = (64, 64)
 """Default widths of policy and value."""
@@ -52,8 +52,8 @@ class ActorCriticConfig(PolicyConfig):
         PolicyConfig.__post_init__(self)
         assign(self, vf=self.qf)
         flags = ("share_features_extractor", "share_layers", "ortho_init", "learn_std", "state_dependent_std")
-        convert(self, (*flags, "squash_output"), flag)
-        convert(self, "log_std_init", number)
+        coerce(self, (*flags, "squash_output"), flag)
+        coerce(self, "log_std_init", number)
         if self.state_dependent_std and not self.learn_std:
             raise ValueError("policy_kwargs: state_dependent_std=True conflicts with learn_std=False")
         if self.share_layers and not self.share_features_extractor:
@@ -127,21 +127,21 @@ class OnPolicyConfig:
     """The same where the observation is an image."""
 
     def __post_init__(self) -> None:
-        convert(self, ("learning_rate", "ent_coef"), schedules.parse, least=0)
-        convert(self, "critic_learning_rate", schedules.parse, least=0, optional=True)
-        convert(self, "optimizer", optimizers.parse, optional=True)
-        convert(self, "n_steps", whole, least=1)
-        convert(self, "n_episodes", whole, least=1, optional=True)
-        convert(self, ("gamma", "gae_lambda"), number, least=0, most=1)
-        convert(self, "vf_coef", number, least=0)
-        convert(self, "max_grad_norm", number, above=0, optional=True)
-        convert(self, ("normalize_advantage", "use_sde"), flag)
-        convert(self, "sde_sample_freq", whole, least=-1)
+        coerce(self, ("learning_rate", "ent_coef"), schedules.parse, least=0)
+        coerce(self, "critic_learning_rate", schedules.parse, least=0, optional=True)
+        coerce(self, "optimizer", optimizers.parse, optional=True)
+        coerce(self, "n_steps", whole, least=1)
+        coerce(self, "n_episodes", whole, least=1, optional=True)
+        coerce(self, ("gamma", "gae_lambda"), number, least=0, most=1)
+        coerce(self, "vf_coef", number, least=0)
+        coerce(self, "max_grad_norm", number, above=0, optional=True)
+        coerce(self, ("normalize_advantage", "use_sde"), flag)
+        coerce(self, "sde_sample_freq", whole, least=-1)
         if self.sde_sample_freq == 0:
             raise ValueError("sde_sample_freq=0 would sample no noise; use 1 or more, or -1 for once per episode")
         assign(self, normalize=normalization.parse(self.normalize))
-        convert(self, "nonfinite", choice, among=("stop", "skip"))
-        convert(self, "policy_kwargs", nested, kind=ActorCriticConfig)
+        coerce(self, "nonfinite", choice, among=("stop", "skip"))
+        coerce(self, "policy_kwargs", nested, kind=ActorCriticConfig)
         if self.critic_learning_rate is not None and self.policy_kwargs.share_layers:
             raise ValueError(
                 "critic_learning_rate is a learning rate of its own for the value, which share_layers=True forbids; leave "

@@ -14,7 +14,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import AVERAGED, TD_ERROR, Metrics, PyTree, copy, polyak, tau_at
 from rejeu.networks import Network, Widths
 from rejeu.schedules import Schedule
-from rejeu.validation import convert, whole
+from rejeu.validation import coerce, whole
 
 HIDDEN_LAYERS = (400, 300)
 """Default widths of actor and critic but on images, those of the paper."""
@@ -36,7 +36,7 @@ class Config(OffPolicyConfig):
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
-        convert(self, "target_update_interval", whole, least=1)
+        coerce(self, "target_update_interval", whole, least=1)
 
 
 class State(eqx.Module):

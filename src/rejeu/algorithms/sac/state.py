@@ -17,7 +17,7 @@ from rejeu.algorithms.sac.temperature import EntropyConfig
 from rejeu.core import AVERAGED, PyTree, copy, ensemble, polyak, tau_at
 from rejeu.networks import Network
 from rejeu.spaces import Leaf
-from rejeu.validation import convert, whole
+from rejeu.validation import coerce, whole
 
 HIDDEN_LAYERS = (256, 256)
 """Default widths of actor and critics."""
@@ -34,7 +34,7 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        convert(self, "target_update_interval", whole, least=1)
+        coerce(self, "target_update_interval", whole, least=1)
 
 
 class State(eqx.Module):

@@ -21,7 +21,7 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import TD_ERROR, Metrics, PyTree, descend
-from rejeu.validation import convert, number, whole
+from rejeu.validation import coerce, number, whole
 
 OPTIMIZER = optax.scale_by_adam()
 """Of the temperature."""
@@ -43,8 +43,8 @@ class EntropyConfig(OffPolicyConfig):
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
         initial_temperature(self.ent_coef)
-        convert(self, "target_entropy", lambda key, value: value if value == "auto" else number(key, value))
-        convert(self, "n_critics", whole, least=1)
+        coerce(self, "target_entropy", lambda key, value: value if value == "auto" else number(key, value))
+        coerce(self, "n_critics", whole, least=1)
 
     def entropy_target(self, automatic: float) -> float:
         """Returns the target entropy in nats, ``automatic`` for ``"auto"``."""
