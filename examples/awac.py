@@ -23,7 +23,7 @@ import rejeu
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import AVERAGED, TD_ERROR, PyTree, copy, descend, ensemble, polyak, weighted_mean
 from rejeu.distributions import Normal
-from rejeu.networks import Actor, Critic, action_values
+from rejeu.networks import Network, QNetwork, action_values
 from rejeu.presets import Preset
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action, leaves
@@ -41,7 +41,7 @@ class Config(OffPolicyConfig):
 class Policy(eqx.Module):
     """A normal distribution with a network for its mean, and one learned standard deviation for each action."""
 
-    network: Actor
+    network: Network
     log_std: Array
 
     def __call__(self, obs: PyTree) -> Normal:
@@ -55,8 +55,8 @@ class State(eqx.Module):
     """Everything that is learned; every leaf is an array."""
 
     actor: Policy
-    critics: Critic
-    target_critics: Critic = eqx.field(metadata=AVERAGED)
+    critics: QNetwork
+    target_critics: QNetwork = eqx.field(metadata=AVERAGED)
     actor_optimizer: PyTree
     critics_optimizer: PyTree
     key: Array
@@ -69,8 +69,8 @@ def make(config: Config, observation_space, action_space) -> rejeu.Algorithm:
 
     def init(key: Array) -> State:
         actor_key, q_key, update_key = jax.random.split(key, 3)
-        actor = Policy(Actor(actor_key, inputs, size, shape.actor_widths((256, 256)), shape), jnp.zeros((1, size)))
-        critics = ensemble(lambda k: Critic(k, inputs, size, shape.critic_widths((256, 256)), shape), q_key, 2)
+        actor = Policy(Network(actor_key, inputs, size, shape.actor_widths((256, 256)), shape), jnp.zeros((1, size)))
+        critics = ensemble(lambda k: QNetwork(k, inputs, size, shape.critic_widths((256, 256)), shape), q_key, 2)
         optimizers = optimizer.init(actor), optimizer.init(critics)
         return State(actor, critics, copy(critics), *optimizers, update_key, jnp.int32(0))
 
@@ -92,17 +92,17 @@ def make(config: Config, observation_space, action_space) -> rejeu.Algorithm:
     return rejeu.Algorithm(init, lambda state: state.actor, Policy.sample, lambda actor, obs: actor(obs).mode(), update)
 
 
-def td_target(actor: Policy, target_critics: Critic, batch: rejeu.Transition, key: Array) -> Array:
+def td_target(actor: Policy, target_critics: QNetwork, batch: rejeu.Transition, key: Array) -> Array:
     values = action_values(target_critics, batch.next_obs, actor.sample(batch.next_obs, key))
     return batch.reward + batch.discount * jnp.min(values, axis=0)
 
 
-def critics_loss(critics: Critic, batch: rejeu.Transition, target: Array) -> tuple[Array, Array]:
+def critics_loss(critics: QNetwork, batch: rejeu.Transition, target: Array) -> tuple[Array, Array]:
     values = action_values(critics, batch.obs, batch.action)
     return jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
 
 
-def actor_loss(actor: Policy, critics: Critic, batch: rejeu.Transition, beta: float, key: Array) -> Array:
+def actor_loss(actor: Policy, critics: QNetwork, batch: rejeu.Transition, beta: float, key: Array) -> Array:
     value = jnp.min(action_values(critics, batch.obs, actor.sample(batch.obs, key)), axis=0)
     advantage = jnp.min(action_values(critics, batch.obs, batch.action), axis=0) - value
     weight = jax.lax.stop_gradient(jax.nn.softmax(advantage / beta))
