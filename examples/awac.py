@@ -16,10 +16,10 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jax import Array
 
 import rejeu
+from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import AVERAGED, TD_ERROR, PyTree, copy, descend, ensemble, polyak, weighted_mean
 from rejeu.distributions import Normal
@@ -65,14 +65,14 @@ class State(eqx.Module):
 
 def make(config: Config, observation_space, action_space) -> rejeu.Algorithm:
     size = action_dimension(check_box_action(action_space, "AWAC"))
-    inputs, shape, optimizer = leaves(observation_space), config.policy_kwargs, optax.scale_by_adam()
+    inputs, shape, optimizer = leaves(observation_space), config.policy_kwargs, optimizers.make(config.optimizer)
 
     def init(key: Array) -> State:
         actor_key, q_key, update_key = jax.random.split(key, 3)
         actor = Policy(Network(actor_key, inputs, size, shape.actor_widths((256, 256)), shape), jnp.zeros((1, size)))
         critics = ensemble(lambda k: QNetwork(k, inputs, size, shape.critic_widths((256, 256)), shape), q_key, 2)
-        optimizers = optimizer.init(actor), optimizer.init(critics)
-        return State(actor, critics, copy(critics), *optimizers, update_key, jnp.int32(0))
+        moments = optimizer.init(actor), optimizer.init(critics)
+        return State(actor, critics, copy(critics), *moments, update_key, jnp.int32(0))
 
     def update(state: State, batch: rejeu.Transition, clock: rejeu.Clock):
         target_key, actor_key = jax.random.split(jax.random.fold_in(state.key, state.n_updates))
