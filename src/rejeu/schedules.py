@@ -67,6 +67,8 @@ class Exponential:
         return self.start * (self.end / self.start) ** done
 
 
+ROUNDING = 1e-6
+"""Relative error by which the end of a schedule may fall below its limit, such as the end of a cosine."""
 Schedule = Callable[[Any], Any]
 """A function from the progress in [0, 1] to a value: :class:`Linear`, :class:`Exponential` or one of your own."""
 SCHEDULES: dict[str, type[Linear] | type[Exponential]] = {"linear": Linear, "exponential": Exponential}
@@ -88,7 +90,8 @@ def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
         ValueError: for a number that is not finite, or a value below ``least`` at the beginning or the end.
     """
     parsed = _parse(name, value)
-    if min(float(at(parsed, end)) for end in (0.0, 1.0)) < least:
+    ends = [float(at(parsed, end)) for end in (0.0, 1.0)]
+    if min(ends) < least - ROUNDING * max(map(abs, ends)):
         raise ValueError(f"{name}={value!r} must not fall below {least:g}")
     return parsed
 

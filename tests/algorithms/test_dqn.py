@@ -412,7 +412,7 @@ def test_other_action_spaces_are_refused_with_what_to_use(space, instead):
         ({"max_grad_norm": 0}, "max_grad_norm=0 must be"),
         ({"clip_grad_value": -1}, "clip_grad_value=-1 must be"),
         ({"loss": "absolute"}, "loss='absolute' must be 'huber' or 'squared'"),
-        ({"action_noise": rejeu.NormalActionNoise([0.0], [0.1])}, "no meaning for Discrete actions"),
+        ({"action_noise": rejeu.NormalActionNoise([0.0], [0.1])}, "does not apply to Discrete actions"),
     ],
 )
 def test_an_impossible_setting_is_refused(setting, message):
