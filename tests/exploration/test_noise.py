@@ -406,9 +406,7 @@ class Alternating:
 
 def test_noise_of_the_users_own_is_added_and_mentioned_in_files(tmp_path):
     noise = Alternating()
-    agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", action_noise=noise, learning_starts=0, batch_size=4, seed=0).learn(
-        9
-    )
+    agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", action_noise=noise, learning_starts=0, batch_size=4, seed=0).learn(9)
     path = agent.save(tmp_path / "model")
     with pytest.raises(rejeu.CheckpointError, match="its action_noise is your own, 'Alternating'"):
         rejeu.load(path)
