@@ -331,7 +331,7 @@ def try_case(case: Case, seed: int) -> dict[str, Any]:
         truth.look()
         if pending is not None:  # one call later, as some of the steps were overwritten
             drawn, keys, errors = pending
-            buffer.reprioritise([(drawn, errors)])
+            buffer.update_priorities([(drawn, errors)])
             truth.give(keys, errors)
         tally.check(buffer.size() == len(truth.steps), f"{buffer.size()} steps, expected {len(truth.steps)}")
         if not truth.steps:

@@ -88,7 +88,7 @@ def hindsight(capacity: int, n_envs: int = 1, n_steps: int = 1, k: int = 0, **co
 def draw_all(buffer, rng, n: int = 512) -> np.ndarray:
     """Returns the observations of a draw of ``n``, and gives it TD errors of 1."""
     batch, drawn = buffer.draw(rng, (n,))
-    buffer.reprioritise([(drawn, np.ones(n))])
+    buffer.update_priorities([(drawn, np.ones(n))])
     return jax.tree.leaves(batch.obs)[0][:, 0]
 
 
@@ -146,7 +146,7 @@ def give_td_errors(buffer, by_time: np.ndarray) -> None:
     while unseen:
         batch, drawn = buffer.draw(rng, (256,))
         times = jax.tree.leaves(batch.obs)[0][:, 0].astype(int)
-        buffer.reprioritise([(drawn, by_time[times])])
+        buffer.update_priorities([(drawn, by_time[times])])
         unseen -= set(times.tolist())
 
 
@@ -188,10 +188,10 @@ def test_new_steps_get_the_largest_priority_so_far():
     story.step()
     assert buffer.priorities.tree[0] == 1.0
     _, drawn = buffer.draw(np.random.default_rng(0), (1,))
-    buffer.reprioritise([(drawn, np.array([7.0]))])
+    buffer.update_priorities([(drawn, np.array([7.0]))])
     story.step()
     _, drawn = buffer.draw(np.random.default_rng(0), (2,))
-    buffer.reprioritise([(drawn, np.array([0.5, 0.5]))])
+    buffer.update_priorities([(drawn, np.array([0.5, 0.5]))])
     story.step()
     np.testing.assert_allclose(buffer.priorities.tree[np.arange(4)], [0.5 + 1e-6, 0.5 + 1e-6, 7 + 1e-6, 0])
 
@@ -205,7 +205,7 @@ def test_td_errors_of_steps_overwritten_meanwhile_are_passed_over():
     story.step()
     story.step()
     before = buffer.priorities.tree[np.arange(4)].copy()
-    buffer.reprioritise([(drawn, np.array([9.0, 9.0, 9.0]))])
+    buffer.update_priorities([(drawn, np.array([9.0, 9.0, 9.0]))])
     kept = 2  # of the times 0, 1, 2 only 2 is left, in row 2
     expected = before.copy()
     expected[kept] = 9 + 1e-6
@@ -236,7 +236,7 @@ def test_exactly_the_steps_that_are_kept_can_be_drawn(rows, n_envs, course, kind
         if learns and buffer.size():
             n = 16
             _, drawn = buffer.draw(rng, (n,))
-            buffer.reprioritise([(drawn, rng.random(n))])
+            buffer.update_priorities([(drawn, rng.random(n))])
         can_be_drawn = np.flatnonzero(buffer.priorities.tree[np.arange(buffer.ring.rows * n_envs)] > 0)
         drawn = {float(buffer.ring.obs[0][i, 0]) for i in can_be_drawn}
         assert drawn == story.kept()
@@ -317,9 +317,9 @@ def test_td_errors_belong_to_their_draw_in_whatever_order_they_come():
     rng = np.random.default_rng(0)
     draws = [buffer.draw(rng, (6,)) for _ in range(4)]  # equal priorities: each draw has every step once
     for batch, drawn in (draws[2], draws[0]):  # the others are never answered
-        buffer.reprioritise([(drawn, batch.obs[:, 0] + 1.0)])
+        buffer.update_priorities([(drawn, batch.obs[:, 0] + 1.0)])
         np.testing.assert_allclose(buffer.priorities.tree[np.arange(6)], np.arange(6) + 1.0, rtol=1e-5)
-        buffer.reprioritise([(drawn, np.ones(6))])
+        buffer.update_priorities([(drawn, np.ones(6))])
 
 
 def test_a_restored_buffer_can_draw_all_its_steps_and_ignores_td_errors_of_earlier_draws():
@@ -334,9 +334,9 @@ def test_a_restored_buffer_can_draw_all_its_steps_and_ignores_td_errors_of_earli
     other.restore(buffer.arrays())
     first, drawn = other.draw(rng, (512,))
     assert set(first.obs[:, 0].tolist()) == story.kept()
-    other.reprioritise([(stale_draw, np.full(4, 100.0))])
+    other.update_priorities([(stale_draw, np.full(4, 100.0))])
     assert other.priorities.tree.total == pytest.approx(other.size())
-    other.reprioritise([(drawn, np.full(512, 3.0))])
+    other.update_priorities([(drawn, np.full(512, 3.0))])
     assert other.priorities.tree.total == pytest.approx(other.size() * (3 + 1e-6) ** 0.6)
 
 

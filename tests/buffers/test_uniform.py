@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
+from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import COUNTERS, check_memory
 from rejeu.buffers.uniform import ReplayBuffer
@@ -227,8 +228,8 @@ def with_counters(arrays, since_start=0, until_end=0):
 
 def test_counters_in_older_files_are_counted_anew(arrays):
     rings = [make_ring(12, 2, counters=COUNTERS) for _ in range(2)]
-    rings[0].restore(arrays)
-    rings[1].restore(arrays | with_counters(arrays))
+    ring_io.restore(rings[0], arrays)
+    ring_io.restore(rings[1], arrays | with_counters(arrays))
     np.testing.assert_array_equal(rings[0].until_end, rings[1].until_end)
     np.testing.assert_array_equal(rings[0].since_start, rings[1].since_start)
     assert rings[0].since_start.any()
@@ -274,12 +275,12 @@ def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
     for cut in sorted({min(cut, len(history)) for cut in (*cuts, len(history))}):
         # The same up to there, whatever follows.
         replay, _ = filled(n_envs, rows, history[:cut], priorities=priorities, counters=COUNTERS)
-        parts.append({key: np.copy(value) for key, value in replay.ring.rows_since(heads).items()})
+        parts.append({key: np.copy(value) for key, value in ring_io.rows_since(replay.ring, heads).items()})
         heads = replay.ring.head.copy()
     other = make_ring(rows * n_envs, n_envs, counters=COUNTERS)
-    other.put_rows(parts)
+    ring_io.put_rows(other, parts)
     assert kept_counters(other) == kept_counters(replay.ring)
-    expected, found = replay.ring.arrays(), other.arrays()
+    expected, found = ring_io.arrays(replay.ring), ring_io.arrays(other)
     kept = [replay.ring.index(np.full(k, e), replay.ring.head[e] - np.arange(k)) for e, k in enumerate(counts(replay))]
     for key in expected:
         if key in ("head", "n_steps"):
@@ -299,21 +300,21 @@ def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
 
 def test_rows_with_counters_of_older_checkpoints_are_read():
     ring = filled(2, 6, [NO_END] * 8)[0].ring
-    rows = ring.rows_since(np.full(2, -1))
+    rows = ring_io.rows_since(ring, np.full(2, -1))
     assert "since_start" not in rows
     other = make_ring(12, 2)
-    other.put_rows([rows | {"since_start": np.zeros(len(rows["kind"]), np.int32)}])
+    ring_io.put_rows(other, [rows | {"since_start": np.zeros(len(rows["kind"]), np.int32)}])
     np.testing.assert_array_equal(other.records, ring.records)
     np.testing.assert_array_equal(other.kind, ring.kind)
 
 
 def test_rows_of_a_kind_that_is_none_are_refused_and_whole_ones_then_taken():
-    rows = filled(2, 6, [NO_END] * 8)[0].ring.rows_since(np.full(2, -1))
+    rows = ring_io.rows_since(filled(2, 6, [NO_END] * 8)[0].ring, np.full(2, -1))
     other = make_ring(12, 2)
     with pytest.raises(ValueError, match="damaged kinds"):
-        other.put_rows([rows | {"kind": rows["kind"] + 3}])
+        ring_io.put_rows(other, [rows | {"kind": rows["kind"] + 3}])
     assert len(other) == 0
-    other.put_rows([rows])
+    ring_io.put_rows(other, [rows])
     assert len(other) == 10
 
 

@@ -39,7 +39,7 @@ def rejeu_sampler(what: str, size: int) -> Any:
         nonlocal turn
         _, drawn = replay.draw(rng, (BATCH,), 0.5)
         assert drawn is not None
-        replay.reprioritise([(drawn, td_errors[turn % len(td_errors)])])
+        replay.update_priorities([(drawn, td_errors[turn % len(td_errors)])])
         turn += 1
 
     return draw_and_update

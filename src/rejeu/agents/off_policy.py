@@ -15,6 +15,7 @@ from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.buffers import ring_io
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
 from rejeu.buffers.prioritized import Priorities
 from rejeu.buffers.ring import Ring
@@ -65,7 +66,7 @@ class OffPolicyAgent(Agent):
             with checkpoint.opened(path, "replay") as file:
                 for kind, own in (("observation", self.observation_space), ("action", self.action_space)):
                     model_files.check_space(file.header.get(f"{kind}_space"), own, kind)
-                self.run.replay.ring.check(file.specs)
+                ring_io.check(self.run.replay.ring, file.specs)
                 arrays = file.read()
             spaces.check_actions(self.action_space, arrays["action"], "the replay file")
             self.run.replay.restore(arrays)

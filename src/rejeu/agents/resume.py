@@ -19,6 +19,7 @@ from rejeu.agents import model_files
 from rejeu.agents.base import BaseAgent, Best, Resumed, whole_seed
 from rejeu.agents.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_files, run_folder
 from rejeu.agents.training import fill_windows
+from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
@@ -27,8 +28,9 @@ from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, json_arrays
 from rejeu.io.records import MAX_ENVS, convert
+from rejeu.loops.checks import is_finite
 from rejeu.loops.packing import Readings
-from rejeu.loops.run import Run, is_finite
+from rejeu.loops.run import Run
 from rejeu.loops.training_call import TrainingCall
 from rejeu.validation import number
 
@@ -157,7 +159,7 @@ def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
         CheckpointError, ValueError: if they are not.
     """
     with checkpoint.opened(path, "rows") as file:
-        agent.run.replay.ring.check_rows(file.specs)
+        ring_io.check_rows(agent.run.replay.ring, file.specs)
         return file.read()
 
 
@@ -262,7 +264,7 @@ def restore_counters(agent: BaseAgent, saved: SavedRun) -> None:
         value = getattr(saved, key)
         setattr(run, key, exactly(value, (len(value),), getattr(run, key).dtype, key))
     run.rng.bit_generator.state = saved.rng
-    run.watch.n_skipped = saved.n_skipped
+    run.monitor.n_skipped = saved.n_skipped
     run.seconds = {key: saved.seconds[key] for key in run.seconds}
     agent.reset_seconds = number("before", saved.seconds.get("before", 0.0), least=0, most=run.seconds["total"])
     values, agent.logger.name_to_count = saved.logger
@@ -340,7 +342,7 @@ def restore_buffer(
         buffer.started = exactly(saved["started"], (buffer.n_envs,), np.dtype(bool), "started")
         buffer.carry = like(carry, saved["carry"], "carry") if begun or buffer.length or saved["carry"] else ()
         return
-    buffer.ring.put_rows(rows)
+    ring_io.put_rows(buffer.ring, rows)
     if not np.array_equal(buffer.ring.head, saved["heads"]):
         raise ValueError("rows of the replay buffer are missing")
     if buffer.priorities is not None:

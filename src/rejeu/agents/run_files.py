@@ -31,6 +31,7 @@ from msgspec import Meta
 from rejeu import xla
 from rejeu.agents import model_files
 from rejeu.agents.base import BaseAgent
+from rejeu.buffers import ring_io
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
@@ -175,7 +176,7 @@ class RunFolder:
         row_files = self.row_files
         if not all((self.folder / name).exists() for name, _ in row_files.files):
             row_files.files = []  # somebody has cleared the folder: all rows are written again
-        rows = ring.rows_since(row_files.heads(ring))
+        rows = ring_io.rows_since(ring, row_files.heads(ring))
         name = f"rows_{step:012d}_{secrets.token_hex(4)}.safetensors"
         checkpoint.write(self.folder / name, "rows", rows, {})
         row_files.add(name, ring)
@@ -303,7 +304,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "seed": run.seed,
         "reason": "" if run.seed is not None and run.obs is None else reason,
         "metrics": None if run.metrics is None else {key: np.asarray(value) for key, value in run.metrics.items()},
-        "n_skipped": run.watch.n_skipped,
+        "n_skipped": run.monitor.n_skipped,
         "td_errors": leaves([td_error for _, td_error in run.td_errors]),
         "seconds": {**{key: float(value) for key, value in run.seconds.items()}, "before": agent.reset_seconds},
         "buffer": buffer_content(run),

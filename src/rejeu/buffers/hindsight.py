@@ -1,39 +1,36 @@
-"""Hindsight experience replay: past steps, relabelled with goals that the agent did reach.
+"""Hindsight experience replay: past steps, relabeled with goals that the agent reached.
 
-Source: Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). Relabelling happens when a batch is
-drawn: of every batch the share ``k / (k + 1)`` gets, in place of its own goal, an achieved goal from (section 4.5)
+Source: Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). Relabeling happens when a batch is
+drawn: the share ``k / (k + 1)`` of every batch gets, in place of its own goal, an achieved goal from (section 4.5)
 
 - ``future``: a later moment of the same episode,
 - ``final``: the episode's last moment,
 - ``episode``: any moment of the same episode,
 - ``random``: any moment in the buffer,
 
-and the reward that the environment gives for it. Episodes that still run, or whose beginning the ring has forgotten, are
-used as far as they are kept. ``terminated`` is computed again where the environment offers ``compute_terminated`` and
-kept as it was elsewhere: a crash remains a crash.
+and the environment's reward for that goal. Of episodes that still run, or whose beginning was overwritten, the stored
+part is used. ``terminated`` is recomputed if the environment has ``compute_terminated``, and kept otherwise: a crash
+remains a crash.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.ring import TERMINATED, Ring, Rows
 from rejeu.buffers.uniform import (
+    BaseReplayBuffer,
     batch,
-    begin,
     bootstrap_discount,
     discounted,
     discounted_sum,
-    discounts_by_kind,
-    draw,
     look_ahead,
 )
 from rejeu.core import Transition
@@ -98,7 +95,7 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     return ("since_start", "until_end") if of_episode else ("until_end",)
 
 
-class HerReplayBuffer:
+class HerReplayBuffer(BaseReplayBuffer):
     """Draws transitions from a :class:`Ring`, uniformly or by priority, and gives most of them a goal that was reached."""
 
     def __init__(
@@ -121,85 +118,49 @@ class HerReplayBuffer:
                 f"goal_selection_strategy={config.goal_selection_strategy!r} needs a ring that keeps "
                 f"{' and '.join(missing)}; make it with Ring(..., counters={counters(config)})"
             )
-        self.ring = ring
-        self.gamma = gamma
-        self.config = config
-        self.goals = goals
-        self.n_steps = n_steps
-        self.priorities = priorities
-        self.each_reward = each_reward and n_steps > 1
-        self._discounts = discounts_by_kind(gamma)
+        super().__init__(ring, gamma, n_steps, priorities, each_reward)
+        self.config, self.goals = config, goals
         paths = [leaf.path for leaf in ring.obs_leaves]
         self.achieved = paths.index("achieved_goal")
         self.desired = paths.index("desired_goal")
 
-    def size(self) -> int:
-        """Returns the number of transitions kept."""
-        return len(self.ring)
-
-    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
-        """Starts episodes; see :meth:`Ring.begin`."""
-        begin(self.ring, self.priorities, obs, envs)
-
-    def add(
-        self,
-        action: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-        next_obs: Any,
-        envs: np.ndarray | None = None,
-    ) -> None:
-        """Records one step of each environment; see :meth:`Ring.add`."""
-        index, following = self.ring.add(action, reward, terminated, next_obs, envs)
-        if self.priorities is not None:
-            self.priorities.add(index, following)
-
-    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
-        """Returns transitions, every leaf ``(*shape, ...)``, the last axis of ``shape`` being one batch.
-
-        Of each batch, the first ``k / (k + 1)`` are relabelled. ``rng`` advances, ``progress`` anneals the weights.
-        """
-        return self.draw(rng, shape, progress)[0]
-
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
     ) -> tuple[Transition, Draw | None]:
-        """Returns what :meth:`sample` does and, with priorities, what :meth:`reprioritise` takes; None without."""
-        ring, k = self.ring, self.config.n_sampled_goal
-        rows, weight, drawn = draw(ring, self.priorities, rng, math.prod(shape), progress)
-        step, obs = ring.read(rows.position)
-        relabelled = relabelled_positions(shape, k)
+        """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`.
 
-        goal_index = self._goal_index(rng, rows.env[relabelled], rows.time[relabelled], step[relabelled])
+        Of each batch, the first ``k / (k + 1)`` are relabeled.
+        """
+        ring, k = self.ring, self.config.n_sampled_goal
+        rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
+        step, obs = ring.read(rows.position)
+        relabeled = relabeled_positions(shape, k)
+
+        goal_index = self._goal_index(rng, rows.env[relabeled], rows.time[relabeled], step[relabeled])
         goal = ring.read_leaf(self.achieved, goal_index)
         steps: int | np.ndarray = 1
         rewards = None
         if self.n_steps > 1:
-            rewards, steps, terminated = self._n_step(rows, relabelled, goal)
+            rewards, steps, terminated = self._n_step(rows, relabeled, goal)
             reward = discounted_sum(rewards, self.gamma)
             discount = bootstrap_discount(self.gamma, steps, terminated)
         _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
-            reward, discount = step["reward"], self._discounts.take(rows.kind)
+            reward, discount = step["reward"], self.discounts.take(rows.kind)
             if len(goal):
-                reached = next_obs[self.achieved][relabelled]
-                reward[relabelled] = self.goals.reward(reached, goal)
+                reached = next_obs[self.achieved][relabeled]
+                reward[relabeled] = self.goals.reward(reached, goal)
                 if self.goals.terminated is not None:
-                    discount[relabelled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
-        obs[self.desired][relabelled] = goal
-        next_obs[self.desired][relabelled] = goal
+                    discount[relabeled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
+        obs[self.desired][relabeled] = goal
+        next_obs[self.desired][relabeled] = goal
         rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
         return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight, rewards), drawn
 
-    def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
-        """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
-        if self.priorities is not None:
-            self.priorities.update(td_errors)
-
     def _goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Returns where in the ring new goals for rows stand: observations after a step, by the strategy.
+        """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.
 
-        The rows are given by environment and time, ``(n,)``; ``step`` is what the ring holds of them, records ``(n,)``.
+        The relabeled rows are given by environment and time, ``(n,)``, and by their records ``step`` ``(n,)``.
         """
         ring, strategy = self.ring, self.config.goal_selection_strategy
         if callable(strategy):
@@ -208,8 +169,7 @@ class HerReplayBuffer:
             other = ring.draw(rng, len(step))
             return ring.index(other.env, other.time + 1)
         until_end = step["until_end"]
-        head = ring.head[env] if ring.n_envs > 1 else ring.head[0]
-        ahead = np.where(until_end, until_end, head - time)
+        ahead = np.where(until_end, until_end, ring.head[env] - time)
         if strategy == "final":
             return ring.index(env, time + ahead)
         if strategy == "episode":
@@ -218,37 +178,27 @@ class HerReplayBuffer:
         return ring.index(env, time + 1 + (rng.random(len(time)) * ahead).astype(np.int64))
 
     def _n_step(
-        self, rows: Rows, relabelled: slice | np.ndarray, goal: np.ndarray
+        self, rows: Rows, relabeled: slice | np.ndarray, goal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns rewards ``(batch, n)``, number of steps and ``terminated``, for the new goals where there are any."""
         ring = self.ring
         window = look_ahead(ring, rows, self.n_steps)
         rewards, valid = ring.reward[window.position], window.valid.copy()
         terminal = (ring.kind[window.position] == TERMINATED) & valid
-        following = ring.index(rows.env[relabelled, None], rows.time[relabelled, None] + 1 + np.arange(self.n_steps))
+        following = ring.index(rows.env[relabeled, None], rows.time[relabeled, None] + 1 + np.arange(self.n_steps))
         reached = ring.obs[self.achieved][following].reshape(-1, *goal.shape[1:])
         goals = np.repeat(goal, self.n_steps, axis=0)
-        rewards[relabelled] = self.goals.reward(reached, goals).reshape(-1, self.n_steps)
+        rewards[relabeled] = self.goals.reward(reached, goals).reshape(-1, self.n_steps)
         if self.goals.terminated is not None:
-            ends = self.goals.terminated(reached, goals).reshape(-1, self.n_steps) & valid[relabelled]
-            terminal[relabelled] = ends
-            valid[relabelled, 1:] &= ~np.logical_or.accumulate(ends, axis=1)[:, :-1]
+            ends = self.goals.terminated(reached, goals).reshape(-1, self.n_steps) & valid[relabeled]
+            terminal[relabeled] = ends
+            valid[relabeled, 1:] &= ~np.logical_or.accumulate(ends, axis=1)[:, :-1]
             terminal &= valid
         return np.where(valid, rewards, np.float32(0.0)), valid.sum(axis=1), terminal.any(axis=1)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Returns everything kept, as named arrays; goals are drawn anew each time, so nothing else is needed."""
-        return self.ring.arrays()
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`."""
-        self.ring.restore(arrays)
-        if self.priorities is not None:
-            self.priorities.restore()
-
 
 @cache
-def relabelled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
+def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     """Returns which of the flattened transitions of ``shape`` get a new goal: the first ``k / (k + 1)`` of each batch."""
     n = int(shape[-1] * k / (k + 1))
     if math.prod(shape) == shape[-1]:

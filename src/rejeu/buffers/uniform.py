@@ -1,20 +1,23 @@
-"""The plain replay buffer: steps are drawn uniformly, or by priority; n-step returns by option."""
+"""The replay buffer: steps are drawn uniformly, or by priority, with one-step or n-step returns."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.ring import LAST, TERMINATED, Ring, Rows
 from rejeu.core import Transition
 
 
-class ReplayBuffer:
-    """Draws transitions from a :class:`Ring`, uniformly or by priority."""
+class BaseReplayBuffer(ABC):
+    """Stores steps in a :class:`Ring`; subclasses define how batches are drawn from it."""
 
     def __init__(
         self,
@@ -24,13 +27,24 @@ class ReplayBuffer:
         priorities: Priorities | None = None,
         each_reward: bool = False,
     ) -> None:
-        """Draws from ``ring``; with ``each_reward`` transitions of several steps have :attr:`Transition.rewards`."""
-        self.ring = ring
-        self.gamma = gamma
-        self.n_steps = n_steps
-        self.priorities = priorities
+        """Takes a ring; with ``each_reward``, transitions of several steps have :attr:`Transition.rewards`."""
+        self.ring, self.gamma, self.n_steps, self.priorities = ring, gamma, n_steps, priorities
         self.each_reward = each_reward and n_steps > 1
-        self._discounts = discounts_by_kind(gamma)
+        self.discounts = bootstrap_discount(gamma, 1, np.arange(3) == TERMINATED)
+        """Discounts of single steps, by the kind of their row, ``float32 (3,)``."""
+
+    @abstractmethod
+    def draw(
+        self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
+    ) -> tuple[Transition, Draw | None]:
+        """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`."""
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
+        """Returns transitions, every leaf ``(*shape, ...)``, the last axis of ``shape`` being one batch.
+
+        ``progress`` is the schedule's progress for importance weights.
+        """
+        return self.draw(rng, shape, progress)[0]
 
     def size(self) -> int:
         """Returns the number of transitions kept."""
@@ -38,7 +52,10 @@ class ReplayBuffer:
 
     def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
         """Starts episodes; see :meth:`Ring.begin`."""
-        begin(self.ring, self.priorities, obs, envs)
+        self.ring.begin(obs, envs)
+        if self.priorities is not None:
+            envs = self.ring.all_envs if envs is None else envs
+            self.priorities.tree.set(self.ring.index(envs, self.ring.head[envs]), 0.0)
 
     def add(
         self,
@@ -53,20 +70,43 @@ class ReplayBuffer:
         if self.priorities is not None:
             self.priorities.add(index, following)
 
-    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Transition:
-        """Returns transitions, every leaf ``(*shape, ...)``; ``rng`` advances, ``progress`` anneals the weights."""
-        return self.draw(rng, shape, progress)[0]
+    def draw_rows(
+        self, rng: np.random.Generator, n: int, progress: float
+    ) -> tuple[Rows, np.ndarray | None, Draw | None]:
+        """Returns ``n`` steps and, with priorities, their importance weights and what :meth:`update_priorities` takes."""
+        if self.priorities is None:
+            return self.ring.draw(rng, n), None, None
+        return self.priorities.draw(rng, n, progress)
+
+    def update_priorities(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+        """Sets priorities by pairs of a :class:`Draw` and the absolute TD errors of its batch."""
+        if self.priorities is not None:
+            self.priorities.update(td_errors)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns the contents as named arrays."""
+        return ring_io.arrays(self.ring)
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Restores the result of :meth:`arrays`; see :func:`rejeu.buffers.ring_io.restore`. Priorities start equal."""
+        ring_io.restore(self.ring, arrays)
+        if self.priorities is not None:
+            self.priorities.restore()
+
+
+class ReplayBuffer(BaseReplayBuffer):
+    """Draws transitions uniformly, or by priority."""
 
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
     ) -> tuple[Transition, Draw | None]:
-        """Returns what :meth:`sample` does and, with priorities, what :meth:`reprioritise` takes; None without."""
-        rows, weight, drawn = draw(self.ring, self.priorities, rng, math.prod(shape), progress)
+        """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`."""
+        rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
         step, obs = self.ring.read(rows.position)
         steps: int | np.ndarray = 1
         rewards = None
         if self.n_steps == 1:
-            reward, discount = step["reward"], self._discounts.take(rows.kind)
+            reward, discount = step["reward"], self.discounts.take(rows.kind)
         else:
             window = look_ahead(self.ring, rows, self.n_steps)
             rewards = np.where(window.valid, self.ring.reward[window.position], np.float32(0.0))
@@ -75,36 +115,6 @@ class ReplayBuffer:
         _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
         rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
         return batch(self.ring, shape, obs, step["action"], reward, next_obs, discount, weight, rewards), drawn
-
-    def reprioritise(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
-        """Sets priorities by pairs of what :meth:`draw` returned and the absolute TD errors of that batch."""
-        if self.priorities is not None:
-            self.priorities.update(td_errors)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Returns everything kept, as named arrays."""
-        return self.ring.arrays()
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Puts back what :meth:`arrays` returned; see :meth:`Ring.restore`. Priorities start equal."""
-        self.ring.restore(arrays)
-        if self.priorities is not None:
-            self.priorities.restore()
-
-
-def begin(ring: Ring, priorities: Priorities | None, obs: Any, envs: np.ndarray | None) -> None:
-    """Starts episodes in the ring and takes their first rows out of what can be drawn."""
-    ring.begin(obs, envs)
-    if priorities is not None:
-        envs = ring.all_envs if envs is None else envs
-        priorities.tree.set(ring.index(envs, ring.head[envs]), 0.0)
-
-
-def draw(
-    ring: Ring, priorities: Priorities | None, rng: np.random.Generator, n: int, progress: float
-) -> tuple[Rows, np.ndarray | None, Draw | None]:
-    """Returns ``n`` steps, and where there are priorities their importance weights and what gives TD errors back."""
-    return (ring.draw(rng, n), None, None) if priorities is None else priorities.draw(rng, n, progress)
 
 
 def batch(
@@ -119,26 +129,11 @@ def batch(
     rewards: np.ndarray | None = None,
 ) -> Transition:
     """Returns transitions in ``shape`` from flat arrays; weights are divided by the largest of each batch."""
-
-    def shaped(array: np.ndarray) -> np.ndarray:
-        return array.reshape(shape + array.shape[1:])
-
+    flat = Transition(ring.tree(obs), action, reward, ring.tree(next_obs), discount, weight, rewards)
+    shaped = flat if len(shape) == 1 else jax.tree.map(lambda array: array.reshape(shape + array.shape[1:]), flat)
     if weight is not None:
-        weight = shaped(weight)
-        weight /= weight.max(axis=-1, keepdims=True)
-    if rewards is not None:
-        rewards = shaped(rewards)
-    if len(shape) == 1:
-        return Transition(ring.tree(obs), action, reward, ring.tree(next_obs), discount, weight, rewards)
-    return Transition(
-        ring.tree([shaped(leaf) for leaf in obs]),
-        shaped(action),
-        shaped(reward),
-        ring.tree([shaped(leaf) for leaf in next_obs]),
-        shaped(discount),
-        weight,
-        rewards,
-    )
+        shaped = shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
+    return shaped
 
 
 class Window(NamedTuple):
@@ -160,9 +155,9 @@ def look_ahead(ring: Ring, rows: Rows, n: int) -> Window:
     index = ring.index(rows.env[:, None], times)
     kind = ring.kind[index]
     is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
-    goes_on = is_step & (kind != TERMINATED)
+    continues = is_step & (kind != TERMINATED)
     valid = is_step.copy()
-    valid[:, 1:] &= np.logical_and.accumulate(goes_on, axis=1)[:, :-1]
+    valid[:, 1:] &= np.logical_and.accumulate(continues, axis=1)[:, :-1]
     return Window(index, valid, valid.sum(axis=1), ((kind == TERMINATED) & valid).any(axis=1))
 
 
@@ -179,8 +174,3 @@ def discounted(rewards: np.ndarray, gamma: float) -> np.ndarray:
 def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
     """Returns ``gamma^steps``, and 0 where the MDP terminated, ``float32``."""
     return np.where(terminated, np.float32(0.0), np.asarray(gamma**steps, np.float32))
-
-
-def discounts_by_kind(gamma: float) -> np.ndarray:
-    """Returns :func:`bootstrap_discount` of single steps, by the kind of their row, ``float32 (3,)``."""
-    return bootstrap_discount(gamma, 1, np.arange(3) == TERMINATED)
