@@ -146,6 +146,8 @@ class Algorithm(NamedTuple):
 
 TD_ERROR = "td_error"
 """Name among the metrics of an update for the absolute TD error of each transition, ``(batch,)``."""
+EXPLAINED_VARIANCE = "explained_variance"
+"""Name among the metrics for the explained variance of the value. It may be NaN; all other metrics must be finite."""
 
 
 AVERAGED = {"averaged": True}
@@ -155,7 +157,7 @@ AVERAGED = {"averaged": True}
         critics: QNetwork
         target_critics: QNetwork = eqx.field(metadata=AVERAGED)
 
-Such a field is finite as long as the others are, so the check for NaN leaves it out, and so does an agent's summary."""
+An agent's summary leaves such fields out."""
 
 
 def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[..., Any]:

@@ -19,7 +19,7 @@ from rejeu.envs.registry import make_env
 from rejeu.envs.workers import pool
 from rejeu.errors import BadEnvironmentError
 from rejeu.loops import run
-from rejeu.loops.run import check_finite
+from rejeu.loops.checks import check_finite
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac

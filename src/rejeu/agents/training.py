@@ -19,7 +19,9 @@ from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.errors import CheckpointError
 from rejeu.interrupt import Interrupt
 from rejeu.loops import finite
-from rejeu.loops.run import Episode, Progress, time_shares
+from rejeu.loops.nonfinite import NonFiniteUpdate
+from rejeu.loops.run import Episode, Progress
+from rejeu.loops.timing import time_shares
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Console, RetryingSink, Sink, TensorBoard, next_folder
 from rejeu.reporting.text import counted
@@ -133,7 +135,7 @@ def train(
                         break
             agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
             finite.settle(agent)
-        except finite.Broken as broken:
+        except NonFiniteUpdate as broken:
             raise finite.reported(agent, broken) from None
 
 
@@ -336,7 +338,7 @@ def statistics_row(agent: BaseAgent) -> dict[str, float]:
     numbers["time/compile_seconds"] = xla.seconds()
     numbers["train/n_updates"] = run.n_updates
     if agent.learner.skips:
-        numbers["train/skipped_updates"] = run.watch.n_skipped
+        numbers["train/skipped_updates"] = run.monitor.n_skipped
     for key, value in (run.metrics or {}).items():
         numbers[f"train/{key}"] = float(value)
     return numbers

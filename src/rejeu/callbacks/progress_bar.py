@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rejeu.callbacks.base import TrainedAgent, TrainingCallback
 from rejeu.callbacks.due import step_before
-from rejeu.loops.run import Progress, time_shares
+from rejeu.loops.run import Progress
+from rejeu.loops.timing import time_shares
 from rejeu.reporting.notebook import Display
 
 if TYPE_CHECKING:

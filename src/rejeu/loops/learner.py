@@ -1,8 +1,4 @@
-"""An algorithm's functions as the loops call them: compiled once, over a packed state.
-
-A state crosses the border between Python and XLA many times a second. Packed into a few vectors (see
-:mod:`rejeu.loops.packing`) it does so several times faster than as a tree of modules, and so do batches.
-"""
+"""The compiled functions of an algorithm that loops and agents call, such as ``act`` and ``update``."""
 
 from __future__ import annotations
 
@@ -15,192 +11,122 @@ import numpy as np
 from jax import Array
 
 from rejeu import xla
-from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Transition, copy as copied
+from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Transition, copy
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
-from rejeu.io.checkpoint import names
-from rejeu.loops import finite
-from rejeu.loops.packing import HostPacker, Message, Packing, Readings
+from rejeu.loops import nonfinite
+from rejeu.loops.packing import PackedState, Packing, Readings
 from rejeu.prng import nth
-
-PackedState = list[Array]
-"""The state of an algorithm as the vectors of its :class:`Packing`."""
 
 
 class Learner:
-    """The pure functions of one algorithm, compiled; holds no state of its own."""
+    """The pure functions of an algorithm, compiled. Holds no state: every function takes it, packed into a few vectors.
+
+    ``act`` is ``_act`` compiled by ``jax.jit``, and so on.
+    """
 
     def __init__(self, algorithm: Algorithm, noise: Noise | None, skips: bool = False) -> None:
-        self.algorithm = algorithm
-        self.skips = skips
-        """Whether an update that leaves numbers that are not finite is undone."""
+        """Takes an algorithm and the action noise of training; ``skips`` undoes updates that leave NaN or infinity."""
+        self.algorithm, self.skips = algorithm, skips
+        self.explorer = exploration.make(algorithm, noise)
         self.shapes = jax.eval_shape(algorithm.init, jax.ShapeDtypeStruct((2,), jnp.uint32))
-        """The state, of shapes in place of arrays."""
-        self._packing = packing = Packing(self.shapes)
-        averaged = {i for i, name in enumerate(names(self.shapes)) if finite.is_averaged(name)}
-        passed_over = averaged if skips else {*packing.large}
-        """Large leaves that no update looks at; where none is skipped, the next one finds what broke there by its loss."""
-        self._act_packer, self._exploit_packer, self._update_packer = HostPacker(), HostPacker(), HostPacker()
-        self._recall_packer, self._observe_packer = HostPacker(), HostPacker()
-        self._explorer = explorer = exploration.make(algorithm, noise)
-        pack, unpack = xla.one_kernel(packing.pack), xla.one_kernel(packing.unpack)
-
-        @xla.run_once
-        def init(key: Array) -> PackedState:
-            return packing.pack(algorithm.init(key))
-
-        def acting(explorer: Explorer) -> Any:
-            @partial(jax.jit, static_argnums=4)
-            def act(
-                state: PackedState, carry: PyTree, key: Array, vectors: list[Array], plan: Message
-            ) -> tuple[Array, PyTree]:
-                obs, ended, clock = plan.unpack(vectors)
-                actor = algorithm.actor(packing.unpack(state))
-                return explorer.act(carry, actor, obs, ended, nth(key, clock.step), clock)
-
-            return act
-
-        @partial(jax.jit, static_argnums=2)
-        def exploit(state: PackedState, vectors: list[Array], plan: Message) -> Array:
-            return algorithm.exploit(algorithm.actor(packing.unpack(state)), plan.unpack(vectors))
-
-        @partial(jax.jit, static_argnums=3)
-        def recall(state: PackedState, carry: PyTree, vectors: list[Array], plan: Message) -> tuple[Array, PyTree]:
-            assert algorithm.recall is not None
-            obs, ended = plan.unpack(vectors)
-            return algorithm.recall(carry, algorithm.actor(packing.unpack(state)), obs, ended)
-
-        @partial(jax.jit, donate_argnums=0, static_argnums=2)
-        def observe(state: PackedState, vectors: list[Array], plan: Message) -> PackedState:
-            assert algorithm.observe is not None
-            return packing.pack(algorithm.observe(packing.unpack(state), *plan.unpack(vectors)))
-
-        @jax.jit
-        def action_values(state: PackedState, obs: PyTree, action: Array | None) -> Array:
-            assert algorithm.action_values is not None
-            return algorithm.action_values(packing.unpack(state), obs, action)
-
-        @jax.jit
-        def state_value(state: PackedState, carry: PyTree, obs: PyTree, ended: Array) -> Array:
-            assert algorithm.state_value is not None
-            return algorithm.state_value(carry, algorithm.actor(packing.unpack(state)), obs, ended)
-
-        def is_sound(after: PackedState, metrics: Metrics) -> Array:
-            return finite.all_finite(packing.without(after, passed_over), metrics)
-
-        def learnt(state: PackedState, batch: Transition | Rollout, clock: Clock) -> tuple[PackedState, Metrics, Array]:
-            after, metrics = algorithm.update(unpack(state), batch, clock)
-            # Without the barrier XLA would compute the whole step of the optimizer once more for the check.
-            packed = jax.lax.optimization_barrier(pack(after))
-            sound = is_sound(packed, metrics)
-            return packed, metrics, sound
-
-        def learnt_or_skipped(state: PackedState, batch: Transition | Rollout, clock: Clock) -> tuple[Any, Any]:
-            after, metrics, sound = learnt(state, batch, clock)
-            if TD_ERROR in metrics:  # NaN leaves the priorities as they are
-                metrics[TD_ERROR] = jnp.where(sound, metrics[TD_ERROR], jnp.nan)
-            return [jnp.where(sound, new, old) for new, old in zip(after, state, strict=True)], (metrics, sound)
-
-        @partial(jax.jit, donate_argnums=0, static_argnums=2)
-        def update(
-            state: PackedState, vectors: list[Array], plan: Message
-        ) -> tuple[PackedState, Readings, Array | None]:
-            batches, clock = xla.one_kernel(plan.unpack)(vectors)
-            is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
-            if skips and is_one:
-                packed, (metrics, sound) = learnt_or_skipped(state, batches, clock)
-            elif skips:
-                packed, (metrics, sound) = jax.lax.scan(lambda s, one: learnt_or_skipped(s, one, clock), state, batches)
-            elif is_one:
-                packed, metrics, sound = learnt(state, batches, clock)
-            else:
-                after, metrics = jax.lax.scan(
-                    lambda s, batch: algorithm.update(s, batch, clock), packing.unpack(state), batches
-                )
-                packed = jax.lax.optimization_barrier(packing.pack(after))
-                sound = is_sound(packed, metrics)  # what is broken stays so
-            td_error = metrics.pop(TD_ERROR, None)
-            wanted = isinstance(batches, Transition) and batches.weight is not None
-            if skips and not is_one:
-                means = {name: jnp.mean(value, where=sound) for name, value in metrics.items()}
-            else:
-                means = jax.tree.map(jnp.mean, metrics)
-            return packed, Readings.of(means, jnp.sum(~sound)), td_error if wanted else None
-
-        self.init = init
-        """``init(key) -> state``, packed."""
-        self.copy = jax.jit(copied)
-        """``copy(packed) -> packed`` in buffers of its own."""
-        self.observe = None if algorithm.observe is None else self._observe_packed
-        """``observe(state, obs, running_return) -> state``, packed, whose predecessor is donated; None where the algorithm
-        has no use for it (see :class:`rejeu.core.Algorithm`)."""
-        self.action_values, self.state_value = action_values, state_value
-        """``action_values(state, obs, action)`` and ``state_value(state, carry, obs, ended)`` over a packed state; see
-        :class:`rejeu.core.Algorithm`."""
-        self._exploit, self._recall, self._observe, self._update = exploit, recall, observe, update
-        self._act = self._sample = acting(explorer)
+        """The unpacked state, with shapes in place of arrays."""
+        self.packing = Packing(self.shapes)
+        self.init = xla.run_once(self._init)
+        self.act = self.sample = jax.jit(partial(self._act, self.explorer))
         if algorithm.recall is None and (noise is not None or algorithm.explorer is not None):
-            self._sample = acting(exploration.plain(algorithm))
+            self.sample = jax.jit(partial(self._act, exploration.plain(algorithm)))
+        self.update = jax.jit(self._update, donate_argnums=0)
+        self.observe = None if algorithm.observe is None else jax.jit(self._observe, donate_argnums=0)
+        self.exploit, self.recall = jax.jit(self._exploit), jax.jit(self._recall)
+        self.action_values, self.state_value = jax.jit(self._action_values), jax.jit(self._state_value)
+        self.copy = jax.jit(copy)
 
-    def act(
-        self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
+    def _act(
+        self, explorer: Explorer, state: PackedState, carry: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock
     ) -> tuple[Array, PyTree]:
-        """Returns actions for ``obs`` ``(n_envs, ...)``, exploring, noise included, and the carry of exploration.
+        """Returns actions drawn for ``obs`` ``(n_envs, ...)``, and the carry of exploration after them.
 
-        ``ended``, ``bool (n_envs,)``, is where an episode has just begun.
+        ``ended``, ``bool (n_envs,)``, is where an episode has just begun. ``act`` draws with the noise of training, and
+        ``sample`` without it.
         """
-        return self._act(state, carry, key, *self._act_packer((obs, ended, clock), len(ended)))
+        actor = self.algorithm.actor(self.packing.unpack(state))
+        return explorer.act(carry, actor, obs, ended, nth(key, clock.step), clock)
 
-    def sample(
-        self, state: PackedState, memory: PyTree, obs: PyTree, ended: Any, key: Array, clock: Clock
-    ) -> tuple[Array, PyTree]:
-        """Returns actions drawn from the policy for ``obs`` ``(batch, ...)``, without any noise, and its memory after them.
-
-        ``memory`` is ``()`` for a policy without one; ``ended`` is as for :meth:`act`.
-        """
-        return self._sample(state, memory, key, *self._act_packer((obs, ended, clock), len(ended)))
-
-    def recall(self, state: PackedState, carry: PyTree, obs: PyTree, ended: Any) -> tuple[Array, PyTree]:
-        """Returns the deterministic actions of a policy with a memory, and the memory after ``obs`` ``(batch, ...)``."""
-        return self._recall(state, carry, *self._recall_packer((obs, ended), len(ended)))
-
-    def _observe_packed(self, state: PackedState, obs: PyTree, running_return: Any) -> PackedState:
-        return self._observe(state, *self._observe_packer((obs, running_return), len(running_return)))
-
-    def exploit(self, state: PackedState, obs: PyTree) -> Array:
-        """Returns the deterministic actions for ``obs`` ``(batch, ...)``."""
-        return self._exploit(state, *self._exploit_packer(obs, len(jax.tree.leaves(obs)[0])))
-
-    def update(
+    def _update(
         self, state: PackedState, batches: Transition | Rollout, clock: Clock
     ) -> tuple[PackedState, Readings, Array | None]:
-        """Takes a gradient step on a batch, or one on each of several in one scan, or learns a rollout.
+        """Takes a gradient step on a batch, or one on each of several in a scan, or learns from a rollout.
 
-        ``batches`` has leaves ``(batch, ...)`` or ``(steps, batch, ...)``. Returns the packed state, whose predecessor is
-        donated, the metrics, means over the steps, and the absolute TD errors, shaped as the rewards are, which are None
-        unless the batches are weighted.
+        Args:
+            state: donated.
+            batches: leaves ``(batch, ...)`` or ``(steps, batch, ...)``.
+            clock: where the run is.
+
+        Returns:
+            The new state, the metrics (means over the steps), and the absolute TD errors, shaped like the rewards, if the
+            batches have importance weights.
         """
-        weighted = isinstance(batches, Transition) and batches.weight is not None
-        return self._update(state, *self._update_packer((batches, clock), (batches.reward.shape, weighted)))
+
+        def step(before: PyTree, batch: Any) -> tuple[PyTree, Metrics]:
+            after, metrics = self.algorithm.update(before, batch, clock)
+            return nonfinite.undo(before, after, metrics) if self.skips else (after, metrics)
+
+        before = xla.one_kernel(self.packing.unpack)(state)
+        is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
+        after, metrics = step(before, batches) if is_one else jax.lax.scan(step, before, batches)
+        # Without the barrier XLA would compute the optimizer's step once more for the check.
+        state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack)(after))
+        td_error = metrics.pop(TD_ERROR, None)
+        is_weighted = isinstance(batches, Transition) and batches.weight is not None
+        return state, nonfinite.readings(state, metrics), td_error if is_weighted else None
+
+    def _init(self, key: Array) -> PackedState:
+        """Returns the state before learning."""
+        return self.packing.pack(self.algorithm.init(key))
+
+    def _observe(self, state: PackedState, obs: PyTree, running_return: Array) -> PackedState:
+        """Returns the state, which is donated, with observations added to its statistics (see ``Algorithm.observe``)."""
+        assert self.algorithm.observe is not None
+        return self.packing.pack(self.algorithm.observe(self.packing.unpack(state), obs, running_return))
+
+    def _exploit(self, state: PackedState, obs: PyTree) -> Array:
+        """Returns the deterministic actions for ``obs`` ``(batch, ...)``."""
+        return self.algorithm.exploit(self.algorithm.actor(self.packing.unpack(state)), obs)
+
+    def _recall(self, state: PackedState, carry: PyTree, obs: PyTree, ended: Array) -> tuple[Array, PyTree]:
+        """Returns the deterministic actions of a recurrent policy and its memory after ``obs`` ``(batch, ...)``."""
+        assert self.algorithm.recall is not None
+        return self.algorithm.recall(carry, self.algorithm.actor(self.packing.unpack(state)), obs, ended)
+
+    def _action_values(self, state: PackedState, obs: PyTree, action: Array | None) -> Array:
+        """Returns the critics' values; see ``Algorithm.action_values``."""
+        assert self.algorithm.action_values is not None
+        return self.algorithm.action_values(self.packing.unpack(state), obs, action)
+
+    def _state_value(self, state: PackedState, carry: PyTree, obs: PyTree, ended: Array) -> Array:
+        """Returns the critic's values of states; see ``Algorithm.state_value``."""
+        assert self.algorithm.state_value is not None
+        return self.algorithm.state_value(carry, self.algorithm.actor(self.packing.unpack(state)), obs, ended)
 
     def state(self, packed: PackedState) -> PyTree:
-        """Returns a packed state as the algorithm's own class, in buffers of its own; waits for it.
+        """Returns a packed state as the algorithm's own class, in buffers of its own; waits for the device.
 
-        This and :meth:`pack` are done on the host: they are called seldom, and compiling them took longer.
+        This and :meth:`pack` run on the host: they are called seldom, and compiling them would take longer.
         """
-        return jax.tree.map(jnp.array, self._packing.unpack([np.asarray(array) for array in packed]))
+        return jax.tree.map(jnp.array, self.packing.unpack([np.asarray(array) for array in packed]))
 
     def pack(self, state: PyTree) -> PackedState:
         """Returns a state packed, in buffers of its own: the inverse of :meth:`state`."""
-        return [jnp.array(a) for a in self._packing.pack_leaves([np.asarray(leaf) for leaf in jax.tree.leaves(state)])]
+        return [jnp.array(array) for array in self.packing.pack(jax.tree.map(np.asarray, state), np.concatenate)]
 
     def bad_leaves(self, state: PackedState) -> list[str]:
-        """Returns the names of the leaves of a state that hold a number that is not finite; waits for it."""
+        """Returns the names of the leaves of a packed state that are not finite; waits for the device."""
         arrays = [np.asarray(array) for array in state]
         if all(array.dtype.kind != "f" or np.isfinite(array).all() for array in arrays):
             return []
-        return finite.bad_leaves(self._packing.unpack(arrays))
+        return nonfinite.bad_leaves(self.packing.unpack(arrays))
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""
-        return self._explorer.init(self.algorithm.actor(self.shapes), n_envs)
+        return self.explorer.init(self.algorithm.actor(self.shapes), n_envs)

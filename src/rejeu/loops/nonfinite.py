@@ -1,165 +1,193 @@
-"""Which update was the first to leave numbers that are not finite.
+"""The check that updates leave finite numbers, and the search for the update that did not.
 
-An update says with its metrics whether what it left is finite (:func:`rejeu.loops.finite.all_finite`). The answer is read one
-turn later. :class:`NonFiniteMonitor` keeps a copy of the state from some updates ago and the batches since. It repeats these
-updates to find the first one to blame, and leaves the agent in the state before it. Large arrays, of weights between wide
-layers, are not checked in every update: a number there that is not finite makes the next loss so.
-
-Where such updates are skipped, they undo themselves, check large arrays too, and are counted here.
+Every compiled update reports, with its metrics, whether what it left is finite. :class:`NonFiniteMonitor` reads this one
+turn later, when the loop waits for the device anyway. It keeps a copy of a state and the updates since, from which it
+recomputes the state before the first bad update. With ``nonfinite="skip"`` a bad update is undone on the device at once
+(:func:`undo`), and the monitor only counts.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu.core import Clock, Rollout, Transition
-from rejeu.loops.finite import MOST_SKIPPED, Broken
+from rejeu.core import EXPLAINED_VARIANCE, TD_ERROR, Clock, Metrics, PyTree, Rollout, Transition
+from rejeu.io.checkpoint import names
+from rejeu.loops.packing import PackedState, Readings
 
-if TYPE_CHECKING:
-    from rejeu.loops.learner import Learner, PackedState
-    from rejeu.loops.packing import Readings
-    from rejeu.loops.run import Run
-
-STRETCH = 64
-"""Most calls of the update between two copies of the state."""
-STRETCH_BYTES = 32 * 2**20
-"""Most bytes of batches kept for them."""
-
-
-class Stretch:
-    """A state, and what has been done to it since."""
-
-    def __init__(self, start: PackedState) -> None:
-        self.start = start
-        """A copy of its own."""
-        self.done: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
-        """Functions that took the state and these arguments, and returned it, alone or first of a tuple."""
-        self.n_updates = 0
-
-        self.previous: Stretch | None = None
-        """The one before."""
-
-    def first_to_break(self, learner: Learner, last: int) -> tuple[PackedState, int]:
-        """Returns the first thing done, up to number ``last``, that left something not finite, and the state before it."""
-        state = learner.copy(self.start)
-        for i, (function, arguments) in enumerate(self.done[:last]):
-            before = learner.copy(state)
-            after = function(state, *arguments)
-            state = after[0] if isinstance(after, tuple) else after
-            if learner.bad_leaves(state):
-                return before, i
-        return state, last
+MAX_CALLS = 64
+"""Number of calls after which the state is copied again."""
+MAX_BYTES = 32 * 2**20
+"""Number of bytes of batches after which the state is copied again."""
+MAX_SKIPPED = 100
+"""Number of successive skipped updates after which training stops, because nothing is learned."""
+FINITE = "finite"
+"""Name among the metrics for whether a gradient step was kept, where bad ones are undone."""
+WIDTH, FEW = 16, 256
 
 
-class Unread(NamedTuple):
-    """An update whose outcome is still on the device."""
+def check(arrays: Iterable[Array], metrics: Metrics) -> Array:
+    """Returns whether all numbers of a state and its metrics are finite, ``bool[]``; used inside compiled code."""
+    vectors = [array.reshape(-1) for array in (*arrays, *checked(metrics).values())]
+    floats = [_folded(vector).astype(jnp.float32) for vector in vectors if jnp.issubdtype(vector.dtype, jnp.floating)]
+    if not floats:
+        return jnp.bool(True)
+    return jnp.isfinite(jnp.sum(_folded(jnp.concatenate(floats)) * jnp.float32(0)))  # 0 * x is NaN unless x is finite
 
-    readings: Readings
-    batches: Transition | Rollout
-    clock: Clock
-    stretch: Stretch | None
-    """None where updates that break something undo themselves."""
-    place: int
-    """Which of what was done in that stretch it is."""
+
+def checked(metrics: Metrics) -> Metrics:
+    """Returns the metrics that must be finite.
+
+    TD errors are left out, which priorities ignore if they are NaN, and so is the explained variance, which is undefined
+    if all returns are equal.
+    """
+    return {name: value for name, value in metrics.items() if name not in (TD_ERROR, EXPLAINED_VARIANCE)}
+
+
+def _folded(x: Array) -> Array:
+    """Returns a sixteenth as many numbers, one of which is NaN unless all of ``x`` are finite; short vectors unchanged.
+
+    XLA on a CPU sums a single vector number by number. Adding up sixteen parts of it is several times faster.
+    """
+    if x.size <= FEW:
+        return x
+    n, zero = -(-x.size // WIDTH), jnp.zeros((), x.dtype)
+    begins = [min(i * n, x.size - n) for i in range(WIDTH)]  # the last parts overlap
+    return sum((x[begin : begin + n] * zero for begin in begins), jnp.zeros(n, x.dtype))
+
+
+def undo(before: PyTree, after: PyTree, metrics: Metrics) -> tuple[PyTree, Metrics]:
+    """Returns the state ``after`` an update, or the one ``before`` it unless the update left finite numbers.
+
+    The metrics then say so, and TD errors are NaN, which leaves priorities unchanged. Used inside compiled code.
+    """
+    finite = check(jax.tree.leaves(after), metrics)
+    if TD_ERROR in metrics:
+        metrics = metrics | {TD_ERROR: jnp.where(finite, metrics[TD_ERROR], jnp.nan)}
+    return jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before), metrics | {FINITE: finite}
+
+
+def readings(state: PackedState, metrics: Metrics) -> Readings:
+    """Returns the means of metrics over gradient steps, and how many of these were bad; used inside compiled code."""
+    if FINITE not in metrics:  # one bad step spoils all that follow
+        return Readings.of({name: jnp.mean(value) for name, value in metrics.items()}, ~check(state, metrics))
+    finite = metrics.pop(FINITE)
+    means = {name: jnp.mean(value, where=finite) for name, value in metrics.items()}
+    return Readings.of(means, jnp.sum(~finite))
+
+
+def bad_leaves(tree: PyTree) -> list[str]:
+    """Returns the dotted names of the leaves that hold NaN or infinity, each with the first such number."""
+    found = []
+    for name, leaf in zip(names(tree), jax.tree.leaves(tree), strict=True):
+        array = np.asarray(leaf)
+        if array.dtype.kind == "f" and not (ok := np.isfinite(array)).all():
+            found.append(f"{name} ({array[~ok].ravel()[0]})")
+    return found
+
+
+class NonFiniteUpdate(Exception):
+    """An update left NaN or infinity; :func:`rejeu.loops.finite.reported` explains it."""
+
+    def __init__(self, state: PackedState | None, batches: Transition | Rollout, clock: Clock, in_a_row: int) -> None:
+        super().__init__("an update left numbers that are not finite")
+        self.state = state
+        """The state before it; None if the update was undone."""
+        self.batches, self.clock, self.in_a_row = batches, clock, in_a_row
+
+
+class Call(NamedTuple):
+    """A function that changed the state."""
+
+    function: Callable[..., Any]
+    """Takes the state and the arguments; returns the new state, alone or first in a tuple."""
+    arguments: tuple[Any, ...]
+    """Of an update, the batches and the clock."""
+    readings: Readings | None
+    """What an update reported; None for other functions."""
 
 
 class NonFiniteMonitor:
-    """Looks after the updates of a run. Mutable."""
+    """Observes the updates of a run. Mutable."""
 
-    def __init__(self) -> None:
+    def __init__(self, copy: Callable[[PackedState], PackedState], skips: bool) -> None:
+        """Takes a function that copies a state, and whether bad updates undo themselves, so that no copy is needed."""
         self.n_skipped = 0
-        """Updates that were skipped, in all."""
+        """Skipped updates in all."""
+        self._copy, self._skips = copy, skips
         self._in_a_row = 0
-        self._unread: deque[Unread] = deque()
-        self._stretch: Stretch | None = None
-        self._most = STRETCH
+        self._copied: PackedState | None = None
+        """A copy of a state whose updates were all checked."""
+        self._calls: list[Call] = []
+        """What has changed the state since the copy."""
         self._newest: PackedState | None = None
-        """The state that the present stretch has led to."""
+        """The state after these calls."""
+        self._n_bytes = 0
+        self._unread: deque[int] = deque()
+        """Indices among the calls of the updates whose readings were not looked at."""
 
     def __len__(self) -> int:
-        """Returns the number of updates whose outcome was not looked at."""
+        """Returns the number of updates whose readings were not looked at."""
         return len(self._unread)
 
-    def update(self, run: Run, learner: Learner, batches: Transition | Rollout, clock: Clock) -> Array | None:
-        """Learns from batches as :meth:`Learner.update` does, puts state and metrics into ``run``, returns TD errors."""
-        stretch = None if learner.skips else self._on(run, learner, batches)
-        place = 0 if stretch is None else len(stretch.done)
-        run.state, run.metrics, td_error = learner.update(run.state, batches, clock)
-        self._unread.append(Unread(run.metrics, batches, clock, stretch, place))
-        if stretch is not None:
-            stretch.done.append((learner.update, (batches, clock)))
-            stretch.n_updates += 1
-        self._newest = run.state
-        return td_error
+    def follow(self, state: PackedState) -> None:
+        """Copies the state unless it is the one that the recorded calls led to; to be called before an update."""
+        if state is not self._newest and not self._skips:
+            self._begin(state)
 
-    def observe(self, run: Run, learner: Learner) -> None:
-        """Lets the state take in the present observations, if it has a use for them.
+    def record(self, state: PackedState, function: Callable[..., Any], *arguments: Any, readings: Any = None) -> None:
+        """Records a call of ``function`` that led to ``state``; an update also has ``readings``."""
+        if readings is not None:
+            self._unread.append(len(self._calls))
+        self._calls.append(Call(function, arguments, readings))
+        self._newest = state
+        self._n_bytes += sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[0]))
 
-        They are copied: the device may read a large array after the environments have written the next step to it.
-        """
-        if learner.observe is None:
-            return
-        is_known = run.state is self._newest
-        seen = (jax.tree.map(np.copy, run.obs), run.running_return)
-        run.state = learner.observe(run.state, *seen)
-        if is_known and self._stretch is not None:
-            self._stretch.done.append((learner.observe, seen))
-            self._newest = run.state
-
-    def _on(self, run: Run, learner: Learner, batches: Transition | Rollout) -> Stretch:
-        """Returns the present stretch, or a new one where that is long or something else has changed the state."""
-        most = 1 if isinstance(batches, Rollout) else STRETCH
-        if self._stretch is not None and self._stretch.n_updates == 1 and most > 1:
-            size = sum(leaf.nbytes for leaf in jax.tree.leaves(batches))
-            self._most = max(1, min(most, STRETCH_BYTES // max(size, 1)))
-        if self._stretch is None or run.state is not self._newest or self._stretch.n_updates >= self._most:
-            new = Stretch(learner.copy(run.state))
-            if self._stretch is not None and run.state is self._newest:
-                new.previous, self._stretch.previous = self._stretch, None
-            self._stretch, self._most = new, most
-        return self._stretch
-
-    def read(self, run: Run, learner: Learner, n: int | None = None) -> None:
+    def read(self, n: int | None = None) -> None:
         """Looks at the oldest ``n`` updates (None: all); waits for them.
 
         Raises:
-            Broken: if one of them left numbers that are not finite; ``run.state`` is then what it was before, and the
-                running episodes are given up.
+            NonFiniteUpdate: if one of them left NaN or infinity, or if too many in a row were skipped.
         """
-        for _ in range(len(self._unread) if n is None else n):
-            one = self._unread.popleft()
-            n_bad = one.readings.n_bad
-            if not n_bad:
-                self._in_a_row = 0
-                continue
-            if one.stretch is not None:
-                one = self._culprit(run, learner, one)
-            else:
-                self.n_skipped += n_bad
-                self._in_a_row += n_bad
-                if self._in_a_row < MOST_SKIPPED:
-                    continue
-            in_a_row, self._in_a_row = self._in_a_row, 0
-            self._unread.clear()
-            self._stretch = self._newest = None
-            run.td_errors = []
-            run.obs = run.action = None  # what has been chosen since is not to be relied on: new episodes
-            raise Broken(one.batches, one.clock, in_a_row)
+        is_full = self._is_full()
+        for _ in range(len(self._unread) if n is None or is_full else n):
+            place = self._unread.popleft()
+            readings = self._calls[place].readings
+            assert readings is not None
+            n_bad = readings.n_bad
+            self._in_a_row = self._in_a_row + n_bad if n_bad else 0
+            self.n_skipped += n_bad if self._skips else 0
+            if n_bad and (not self._skips or self._in_a_row >= MAX_SKIPPED):
+                raise self._error(place)
+        if is_full:
+            self._begin(self._newest)
 
-    @staticmethod
-    def _culprit(run: Run, learner: Learner, one: Unread) -> Unread:
-        """Returns the first update to blame for what ``one`` found, and puts the state before it into ``run``."""
-        stretch, last = one.stretch, one.place
-        assert stretch is not None
-        if stretch.previous is not None and learner.bad_leaves(stretch.start):
-            stretch = stretch.previous
-            last = len(stretch.done) - 1
-        run.state, place = stretch.first_to_break(learner, last)
-        _, arguments = stretch.done[place]
-        return one._replace(batches=arguments[0], clock=arguments[1])
+    def _is_full(self) -> bool:
+        """Returns whether the state is to be copied again. A rollout is a view of a buffer that is soon overwritten."""
+        if not self._calls:
+            return False
+        is_rollout = isinstance(self._calls[-1].arguments[0], Rollout)
+        return is_rollout or len(self._calls) >= MAX_CALLS or self._n_bytes >= MAX_BYTES
+
+    def _begin(self, state: PackedState | None) -> None:
+        """Forgets all calls and copies the state that they led to."""
+        self._calls, self._n_bytes, self._newest = [], 0, state
+        self._unread.clear()
+        self._copied = None if state is None or self._skips else self._copy(state)
+
+    def _error(self, place: int) -> NonFiniteUpdate:
+        """Returns the error of the update at ``place`` among the calls, and forgets all calls."""
+        batches, clock = self._calls[place].arguments
+        state = self._copied
+        for call in [] if state is None else self._calls[:place]:
+            after = call.function(state, *call.arguments)
+            state = after[0] if isinstance(after, tuple) else after
+        in_a_row, self._in_a_row = self._in_a_row, 0
+        self._begin(None)
+        return NonFiniteUpdate(state, batches, clock, in_a_row)

@@ -1,0 +1,123 @@
+"""Checks of the loops: of what environments return, and of the state before training."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import jax
+import numpy as np
+
+from rejeu.core import PyTree
+from rejeu.envs import validation
+from rejeu.envs.base import Step
+from rejeu.errors import BadEnvironmentError, NonFiniteError
+from rejeu.loops.learner import Learner
+from rejeu.loops.run import Run
+from rejeu.spaces import leaves
+
+VDOT_SIZE = 2**13
+"""Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
+
+
+def check_step(run: Run, step: Step) -> None:
+    """Checks the rewards and observations of a step, and from time to time the bounds of the observations.
+
+    Raises:
+        BadEnvironmentError: if a reward or an observation is NaN or infinite: nothing can be learned from it.
+        NonFiniteError: if the agent's own action was not finite, so that the environment is not to blame.
+    """
+    check_finite(run, step, run.step)
+    if run.step >= run.next_look:
+        check_bounds(run, step.obs)
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Returns whether all numbers are finite. For small arrays the square is the fastest check."""
+    if array.dtype.kind != "f":
+        return True
+    if array.size <= VDOT_SIZE and math.isfinite(np.vdot(array, array)):
+        return True
+    return bool(np.isfinite(array).all())
+
+
+def check_finite(run: Run, step: Step, taken: int) -> None:
+    """Raises an error if a reward or an observation is NaN or infinite; see :func:`check_step`."""
+    if not is_finite(step.reward):
+        which = int(np.flatnonzero(~np.isfinite(step.reward))[0])
+        _check_action(run, taken)
+        raise BadEnvironmentError(
+            f"{run.env.env_id} returned the reward {step.reward[which]} in environment {which} after {taken} steps; rewards "
+            "must be finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformReward"
+        )
+    check_obs(run, step.obs, taken, "returned")
+
+
+def checked_reset(run: Run, done: np.ndarray) -> PyTree:
+    """Starts new episodes in the environments where ``done`` and returns the observations of all.
+
+    Raises:
+        BadEnvironmentError: if one of them is not finite.
+    """
+    obs = run.env.reset_done(done)
+    check_obs(run, obs, run.step, "reset returned")
+    return obs
+
+
+def check_obs(run: Run, obs: PyTree, taken: int, what: str) -> None:
+    """Raises ``BadEnvironmentError`` if an observation ``(n_envs, ...)`` is NaN or infinite; see :func:`check_finite`."""
+    for i, array in enumerate(jax.tree.leaves(obs)):
+        if not is_finite(array):
+            _check_action(run, taken)
+            where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+            path = leaves(run.env.observation_space)[i].path
+            at = ", ".join(map(str, where[1:]))
+            raise BadEnvironmentError(
+                f"{run.env.env_id}: {what} an observation with {array[where]}{f' at [{at}]' if at else ''}"
+                f"{f' of {path!r}' if path else ''} in environment {where[0]} after {taken} steps; observations must be "
+                "finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformObservation and "
+                "np.nan_to_num"
+            )
+
+
+def check_bounds(run: Run, obs: PyTree) -> None:
+    """Warns once in a run if an observation ``(n_envs, ...)`` lies far outside of the declared bounds.
+
+    The interval between two checks doubles each time, because a check takes longer than a step of some environments.
+    """
+    run.next_look = 2 * run.step + 1
+    fault = validation.far_outside(run.env.observation_space, obs)
+    if fault is not None:
+        run.next_look = math.inf
+        warnings.warn(
+            f"{run.env.env_id} returned {fault}, after {run.step} steps. Networks learn badly from large numbers: scale the "
+            "observations, or set normalize=True if it is not, and declare the bounds that they really have",
+            UserWarning,
+            stacklevel=2,
+        )
+
+
+def _check_action(run: Run, taken: int) -> None:
+    if run.action is not None and not is_finite(run.action):
+        which = int(np.argwhere(~np.isfinite(run.action))[0][0])
+        raise NonFiniteError(
+            f"the policy chose the action {run.action[which]} in environment {which} after {taken} steps, and "
+            f"{run.env.env_id} answered with numbers that are not finite. The weights are finite, what they compute is not: "
+            "they or the observations are too large; lower learning_rate, or set normalize=True",
+            names=("action",),
+            step=taken,
+            n_updates=run.n_updates,
+        )
+
+
+def check_state(run: Run, learner: Learner) -> None:
+    """Raises ``NonFiniteError`` if the state is not finite when training begins; waits for the device."""
+    if bad := learner.bad_leaves(run.state):
+        more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
+        raise NonFiniteError(
+            f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
+            f"{run.n_updates}); set_parameters or a file put them there: give it finite numbers, or load another model",
+            names=[text.split(" ")[0] for text in bad],
+            step=run.step,
+            n_updates=run.n_updates,
+        )
