@@ -28,6 +28,9 @@ from rejeu.io import checkpoint
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
 
+BUFFERS: dict[str, Any] = {"ReplayBuffer": ReplayBuffer, "HerReplayBuffer": HerReplayBuffer}
+"""Replay buffers by the name of their class."""
+
 
 class OffPolicyAgent(Agent):
     """The base class of agents that learn from a replay buffer. Abstract: subclasses set ``algorithm``.
@@ -146,10 +149,13 @@ class OffPolicyAgent(Agent):
         )
         priorities = None if config.priorities is None else Priorities(ring, config.priorities)
         each_reward = config.normalize is not None and config.normalize.norm_reward
-        if config.hindsight is None:
-            return ReplayBuffer(ring, config.gamma, config.n_steps, priorities, each_reward)
-        goals = self._goals(env)
-        return HerReplayBuffer(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
+        kind: Any = config.replay_buffer_class
+        kind = BUFFERS[kind] if isinstance(kind, str) else kind
+        if config.hindsight is not None:
+            goals = self._goals(env)
+            return kind(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
+        settings: Any = config.replay_buffer_kwargs or ()
+        return kind(ring, config.gamma, config.n_steps, priorities, each_reward, **dict(settings))
 
     def drop_rollout(self) -> None:
         """Does nothing: off-policy algorithms learn from the transitions of any policy."""

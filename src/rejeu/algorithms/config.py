@@ -16,7 +16,7 @@ import optax
 
 from rejeu import normalization, schedules
 from rejeu.algorithms import optimizers
-from rejeu.buffers.hindsight import HindsightConfig
+from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.errors import CheckpointError
 from rejeu.exploration import noise as action_noises
@@ -60,10 +60,12 @@ class OffPolicyConfig:
     action_noise: Any = None
     """Noise added to the actions of the training policy: a standard deviation for actions in [-1, 1] such as 0.1,
     ``"ou(0.2)"``, an object such as ``NormalActionNoise(mean, sigma)``, or one of your own. None for no noise."""
-    replay_buffer_class: str = "ReplayBuffer"
-    """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not."""
-    replay_buffer_kwargs: HindsightConfig | None = None
-    """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``."""
+    replay_buffer_class: str | type = "ReplayBuffer"
+    """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not.
+    Or a class of your own with the constructor and methods of one of them, such as a subclass; see ``rejeu.buffers``."""
+    replay_buffer_kwargs: HindsightConfig | tuple[tuple[str, Any], ...] | None = None
+    """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``;
+    further keyword arguments for a class of your own."""
     n_steps: int = 1
     """Number of rewards summed before bootstrapping (n-step returns). Larger values propagate rewards faster, with some
     off-policy bias."""
@@ -121,7 +123,8 @@ class OffPolicyConfig:
     @property
     def hindsight(self) -> HindsightConfig | None:
         """How goals are relabelled, or None where they are not."""
-        return self.replay_buffer_kwargs
+        settings = self.replay_buffer_kwargs
+        return settings if isinstance(settings, HindsightConfig) else None
 
 
 def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any]) -> C:
@@ -203,19 +206,23 @@ def value_to_json(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def buffer_name(key: str, value: Any) -> str:
-    """Returns the name of a replay buffer from its name, its class or None."""
+def buffer_name(key: str, value: Any) -> str | type:
+    """Returns the name of a replay buffer from its name, its class or None, or a class of the user's own."""
     if value is None:
         return "ReplayBuffer"
+    if isinstance(value, type) and value.__name__ not in REPLAY_BUFFERS:
+        return value
     name = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
     if name not in REPLAY_BUFFERS:
         raise ValueError(f"{key}={name!r} is unknown; choose one of {', '.join(REPLAY_BUFFERS)}")
     return name
 
 
-def buffer_settings(key: str, value: Any, buffer: str) -> Any:
-    """Returns the settings of the replay buffer of that name, None for one without settings."""
-    kind = REPLAY_BUFFERS[buffer]
+def buffer_settings(key: str, value: Any, buffer: str | type) -> Any:
+    """Returns the settings of a replay buffer: a record or, for a class of the user's own, pairs of names and values."""
+    if isinstance(buffer, type) and not issubclass(buffer, HerReplayBuffer):
+        return tuple((name, tuple(one) if isinstance(one, list) else one) for name, one in dict(value or {}).items())
+    kind = HindsightConfig if isinstance(buffer, type) else REPLAY_BUFFERS[buffer]
     if kind is not None:
         return nested(key, value or {}, kind)
     if value:
