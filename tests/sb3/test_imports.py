@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import os
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -120,6 +122,18 @@ def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
 def test_paths_lead_to_the_same_objects(module, names):
     for name in names:
         assert getattr(importlib.import_module(f"rejeu.sb3{module}"), name) is getattr(rejeu, name)
+
+
+def test_the_core_does_not_import_rejeu_sb3_and_get_env_still_returns_a_vec_env():
+    script = """
+import sys, rejeu
+agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1", backend="gymnasium"), policy_kwargs={"net_arch": [4]})
+agent.learn(5)
+assert not [name for name in sys.modules if name.startswith("rejeu.sb3")]
+print(type(agent.get_env()).__name__)
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert ran.stdout == "DummyVecEnv\n", ran.stderr
 
 
 def test_what_is_missing_cannot_be_imported():

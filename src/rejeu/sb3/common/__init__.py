@@ -1,1 +1,1 @@
-"""What Stable-Baselines3 has in ``common``."""
+"""Modules shared by the algorithms."""

@@ -1,4 +1,4 @@
-"""What all agents share."""
+"""The base class of the algorithms."""
 
 from rejeu.agents import Agent as BaseAlgorithm
 

@@ -1,4 +1,4 @@
-"""Checking an environment."""
+"""The environment checker."""
 
 from rejeu.envs.checker import check_env
 

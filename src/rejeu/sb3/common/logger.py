@@ -1,4 +1,4 @@
-"""Where numbers go."""
+"""Logging of training statistics."""
 
 from rejeu.reporting.logging import Logger, configure
 

@@ -1,4 +1,4 @@
-"""Noise on actions."""
+"""Action noise."""
 
 from rejeu.exploration.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 

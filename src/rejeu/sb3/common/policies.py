@@ -1,4 +1,4 @@
-"""The policies by name: agents take the names, and the observation space decides what is built."""
+"""Names of the policies. The observation space determines the network."""
 
 MlpPolicy = "MlpPolicy"
 CnnPolicy = "CnnPolicy"

@@ -1,4 +1,4 @@
-"""Seeds and schedules."""
+"""Random seeds and schedules."""
 
 import random
 from typing import Any
@@ -10,24 +10,24 @@ from rejeu.schedules import Linear, Linear as LinearSchedule
 
 
 def set_random_seed(seed: int, using_cuda: bool = False) -> None:
-    """Seeds Python's and NumPy's global generators; rejeu itself draws from none of them, see ``seed`` of the agents.
+    """Seeds the global generators of Python and NumPy. rejeu does not use them; see the ``seed`` of the agents.
 
-    ``using_cuda`` is accepted and without effect.
+    ``using_cuda`` is accepted and ignored.
     """
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - the global generator is what is meant
 
 
 def get_linear_fn(start: float, end: float, end_fraction: float) -> Linear:
-    """Returns a straight line from ``start`` to ``end``, reached when ``end_fraction`` of the run is done.
+    """Returns a linear schedule from ``start`` to ``end``, which is reached after the fraction ``end_fraction`` of the run.
 
-    Called, it takes the share of the run that is done, where Stable-Baselines3 takes what remains.
+    It is called with the completed fraction of the run, in Stable-Baselines3 with the remaining one.
     """
     return Linear(start, end, end_fraction)
 
 
 def get_schedule_fn(value_schedule: Any) -> Any:
-    """Returns a number or a schedule as agents take it."""
+    """Returns a number or a schedule in the form that agents accept."""
     return schedules.parse("value_schedule", value_schedule)
 
 

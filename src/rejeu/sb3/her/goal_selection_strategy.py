@@ -1,4 +1,4 @@
-"""Where the goals of hindsight come from."""
+"""Goal selection strategies of hindsight experience replay."""
 
 from rejeu.buffers.hindsight import GoalSelectionStrategy
 

@@ -1,4 +1,4 @@
-"""The buffer of hindsight replay."""
+"""The hindsight replay buffer."""
 
 from rejeu.buffers.hindsight import HerReplayBuffer
 

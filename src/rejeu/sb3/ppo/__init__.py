@@ -1,4 +1,4 @@
-"""Proximal policy optimisation."""
+"""Proximal policy optimization."""
 
 from rejeu.agents import PPO
 from rejeu.sb3.common.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
