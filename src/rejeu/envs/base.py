@@ -1,4 +1,4 @@
-"""The contract of vector environments: what agents step, whatever it is that steps the environments.
+"""The interface of vector environments, which all backends implement.
 
 The contract hides nothing: after a step the observation is the true successor, also where the episode ended, and ended
 environments stay ended until :meth:`VectorEnv.reset_done` is called.
@@ -20,15 +20,15 @@ from rejeu.envs.seeds import Seed
 from rejeu.errors import BadEnvironmentError
 
 SUCCESS_KEYS = ("is_success", "success")
-"""Where an info says whether the goal was reached; the first that is there counts."""
+"""Keys of an info that say whether the goal was reached, in order of precedence."""
 
 
 class DivergedError(RuntimeError):
-    """Environments did not repeat what was recorded, so a run cannot be resumed in the middle of their episodes."""
+    """Environments did not reproduce recorded episodes, so a run cannot be resumed in the middle of them."""
 
 
 class Step(NamedTuple):
-    """What one step of all environments returned."""
+    """The result of one step of all environments."""
 
     obs: Any
     """True successors, a pytree of arrays ``(n_envs, ...)``; valid until the next call."""
@@ -41,24 +41,24 @@ class Step(NamedTuple):
     info: Any
     """The backend's own info; read it with :meth:`VectorEnv.success`."""
     returns: np.ndarray | None = None
-    """The return of each episode that ended, as a ``Monitor`` beneath wrappers that change rewards counted it, ``(n_envs,)``,
-    NaN elsewhere; None where the sum of the rewards is the return."""
+    """The return of each episode that ended, ``(n_envs,)``, as recorded by a ``Monitor`` inside wrappers that change rewards;
+    NaN elsewhere. None if the sum of the rewards is the return."""
 
     def return_of(self, env: int, total: float) -> float:
-        """Returns the return of the episode that ended in environment ``env`` and whose rewards sum up to ``total``."""
+        """Returns the return of the episode that ended in environment ``env`` with the sum of rewards ``total``."""
         counted = math.nan if self.returns is None else float(self.returns[env])
         return float(total) if math.isnan(counted) else counted
 
 
 class Description(NamedTuple):
-    """What an environment is registered as."""
+    """Properties of the registration of an environment."""
 
     env_id: str
     """The id, or the name of its class if it has none."""
     max_episode_steps: int | None
-    """The time limit, where it is known."""
+    """The time limit, None if unknown."""
     reward_threshold: float | None
-    """The return at which it counts as solved, where it declares one."""
+    """The return at which the environment counts as solved, None if it declares none."""
 
 
 class VectorEnv(ABC):
@@ -70,15 +70,15 @@ class VectorEnv(ABC):
     action_space: gym.Space
     """Of one environment."""
     backend: str
-    """Which backend steps them."""
+    """Name of the backend."""
     env_id: str
-    """The id they are registered under, or the class name of what was given."""
+    """The id of the environments, or the name of their class."""
     made_from: tuple[str, Mapping[str, Any]] | None = None
-    """The id and the keyword arguments that :func:`make_vector` made these of; None for what was given otherwise."""
+    """The id and keyword arguments given to :func:`make_vector`; None if it was given something else."""
     max_episode_steps: int | None = None
-    """The time limit, where it is known."""
+    """The time limit, None if unknown."""
     reward_threshold: float | None = None
-    """The return at which the environment counts as solved, where it declares one."""
+    """The return at which the environment counts as solved, None if it declares none."""
     venv: Any = None
     """The vector environment with automatic resets that this was made from, or that was made of it; None if there is none."""
     wrapped_by: str | None = None
@@ -86,14 +86,14 @@ class VectorEnv(ABC):
     vec_normalize: Any = None
     """The wrapper that normalizes what the vector returns by running statistics, if there is one."""
     _obs: Any
-    """The observations last returned."""
+    """The observations returned last."""
 
     seeds: Seed = None
-    """One seed for each environment, with which a run begins in place of its own; None where there are none."""
+    """One seed for each environment, which a run uses instead of its own seed; None if there are none."""
 
     @abstractmethod
     def reset(self, seed: Seed = None) -> Any:
-        """Starts an episode in every environment and returns the observations ``(n_envs, ...)``.
+        """Resets every environment and returns the observations ``(n_envs, ...)``.
 
         Args:
             seed: a number, after which environment i takes the i-th, or a sequence of one number for each. None lets the
@@ -103,11 +103,11 @@ class VectorEnv(ABC):
     def step(self, action: np.ndarray, active: np.ndarray | None = None) -> Step:
         """Steps every environment, or only the ``active`` ones.
 
-        Those left out keep their observation, get the reward 0 and have not ended. A Gymnasium vector environment can only
+        Inactive environments keep their observation, get the reward 0 and do not end. A Gymnasium vector environment can only
         be stepped as a whole, so there they move on unseen; on any backend, reset them before they are stepped again.
 
         Args:
-            action: in the environment's own range, ``(n_envs, ...)``; the rows of those left out are ignored.
+            action: in the environment's own range, ``(n_envs, ...)``; the rows of inactive environments are ignored.
             active: ``bool (n_envs,)``; None for all.
 
         Raises:
@@ -142,10 +142,10 @@ class VectorEnv(ABC):
 
     @abstractmethod
     def success(self, step: Step, env: int) -> float:
-        """Returns 1.0 or 0.0 for whether environment ``env`` reached its goal in ``step``, NaN if it does not say."""
+        """Returns 1.0 if environment ``env`` reached its goal in ``step``, 0.0 if not, NaN if unknown."""
 
     def judge(self, step: Step, env: int, episode_return: float, threshold: float | None) -> float:
-        """Returns 1.0 or 0.0 for whether the episode that ``step`` ended in environment ``env`` succeeded.
+        """Returns 1.0 if the episode of environment ``env`` that ended in ``step`` succeeded, 0.0 if not.
 
         Where the environment does not say so itself, an episode succeeds whose return is at least ``threshold``, or the
         environment's own reward threshold if that is None; NaN where there is neither.
@@ -195,7 +195,7 @@ class VectorEnv(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Releases the environments."""
+        """Closes the environments."""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.n_envs} x {self.env_id}, backend {self.backend!r}>"
@@ -213,10 +213,10 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
 
 
 def success_of(info: dict[str, Any]) -> float:
-    """Returns 1.0 or 0.0 as an info dict says under ``is_success`` or ``success``, NaN if it says neither.
+    """Returns the value of ``is_success`` or ``success`` in an info as 1.0 or 0.0, NaN without either.
 
     Raises:
-        BadEnvironmentError: if the info is no dict.
+        BadEnvironmentError: if the info is not a dict.
     """
     if not isinstance(info, dict):
         raise BadEnvironmentError(

@@ -28,15 +28,15 @@ from rejeu.spaces import cast, leaves
 from rejeu.validation import whole
 
 NO_LIMIT = 2**31 - 1
-"""What EnvPool says of the length of episodes that have no time limit."""
+"""EnvPool's time limit of environments without one."""
 
 
 class EnvPool(VectorEnv):
     """Environments of the EnvPool package, stepped by C++ threads.
 
-    A pool keeps its state to itself, but it is deterministic given its seed and the actions. So the actions since it was made
-    are recorded, and a run is resumed by replaying them. Where the record is full (see :mod:`rejeu.envs.action_log`) the pool
-    is made again with a seed that follows from the one before; that is a part of every run, resumed or not.
+    A pool does not expose its state, but it is deterministic given its seed and the actions. The actions since its creation
+    are recorded, and a run is resumed by replaying them. When the record is full (see :mod:`rejeu.envs.action_log`), the pool
+    is created again with a seed derived from the previous one, in every run, resumed or not.
     """
 
     backend = "envpool"
@@ -45,7 +45,7 @@ class EnvPool(VectorEnv):
         self.env_id = env_id
         self.n_envs = n_envs
         self._pool = self._make(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
-        self.observation_space = _bounded_rightly(self._pool.observation_space)
+        self.observation_space = _corrected_bounds(self._pool.observation_space)
         self.action_space = self._pool.action_space
         limit = int(self._pool.spec.config.max_episode_steps)
         self.max_episode_steps = None if limit >= NO_LIMIT else limit
@@ -55,7 +55,7 @@ class EnvPool(VectorEnv):
 
     def _make(self, seed: int | Sequence[int]) -> Any:
         self._seed = seed
-        # Of a number environment i gets the i-th after it, which EnvPool takes as int32.
+        # Environment i gets seed + i, an int32 in EnvPool.
         taken = seed % (2**31 - self.n_envs) if isinstance(seed, int) else list(seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
@@ -73,7 +73,7 @@ class EnvPool(VectorEnv):
 
     def reset(self, seed: Seed = None) -> Any:
         if seed is None and self.must_reset:
-            seed = following(self._seed)
+            seed = next_seed(self._seed)
         if seed is not None:
             self._pool, self._log = self._make(seed), self._new_log()
         self._log.reset()
@@ -147,18 +147,18 @@ class EnvPool(VectorEnv):
         self._pool.close()
 
 
-def following(seed: int | Sequence[int]) -> int | Sequence[int]:
-    """Returns the seed of the pool that is made after the one of ``seed``."""
+def next_seed(seed: int | Sequence[int]) -> int | Sequence[int]:
+    """Returns the seed of the next pool."""
     if isinstance(seed, int):
         return int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
     return tuple(int(np.random.SeedSequence([one, 1]).generate_state(1)[0]) % END for one in seed)
 
 
 def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
-    """Returns the seed of a pool as a file has it.
+    """Returns the seed of a pool from a file.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if it is invalid.
     """
     several = checked(seed, n_envs) if isinstance(seed, list) else None
     return whole("seed", seed, least=0) if several is None else several
@@ -179,9 +179,9 @@ def check_envpool_knows(env_id: str) -> None:
 
 
 def envpool_knows(env_id: str) -> bool:
-    """Returns whether EnvPool is to be considered for an id.
+    """Returns whether EnvPool can be used for an id.
 
-    That is if it is installed and has the environment; not if Gymnasium has a newer version only, or if the goals need a
+    It must be installed and have the environment. False if Gymnasium has only a newer version, or if the goals need a
     package that is not installed.
     """
     if not in_envpool(env_id) or (env_id not in gym.registry and newer_version(env_id) is not None):
@@ -191,16 +191,16 @@ def envpool_knows(env_id: str) -> bool:
 
 
 def reward_threshold(env_id: str, declared: float | None) -> float | None:
-    """Returns the return at which Gymnasium counts an environment as solved, ``declared`` for one it does not know."""
+    """Returns Gymnasium's reward threshold of an environment, ``declared`` for one that Gymnasium does not have."""
     if env_id in gym.registry:
         return gym.registry[env_id].reward_threshold
     return None if provider(env_id) is not None else declared
 
 
-def _bounded_rightly(space: gym.Space) -> gym.Space:
-    """Returns a space in which what EnvPool bounds by the least positive and the greatest float is unbounded."""
+def _corrected_bounds(space: gym.Space) -> gym.Space:
+    """Returns a space without EnvPool's bounds of the smallest positive and the largest float."""
     if isinstance(space, gym.spaces.Dict):
-        return gym.spaces.Dict({key: _bounded_rightly(part) for key, part in space.spaces.items()})
+        return gym.spaces.Dict({key: _corrected_bounds(part) for key, part in space.spaces.items()})
     if isinstance(space, gym.spaces.Box) and space.dtype.kind == "f":
         limits = np.finfo(space.dtype)
         if (space.low == limits.tiny).all() and (space.high == limits.max).all():

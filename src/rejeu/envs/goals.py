@@ -1,4 +1,4 @@
-"""Rewards of goal environments for goals that were not the agent's own: what hindsight replay calls."""
+"""Reward functions of goal environments, which hindsight replay calls with other goals."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def goal_functions(env: Any) -> GoalFunctions | None:
 
 
 def attribute(env: Any, name: str) -> Any:
-    """Returns an attribute of an environment beneath any wrappers, or None."""
+    """Returns an attribute of an environment or of one of its wrappers, or None."""
     try:
         return env.get_wrapper_attr(name)
     except AttributeError:
@@ -93,7 +93,7 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
 def _whole(
     function: Callable[..., Any], by_row: Callable[..., np.ndarray], achieved: np.ndarray, desired: np.ndarray
 ) -> np.ndarray | None:
-    """Returns what ``function`` says of the whole batch, or None where it does not say the same of the single rows."""
+    """Returns the result of ``function`` for the whole batch, or None if it differs from the results of single rows."""
     n = min(len(achieved), 8)
     try:
         whole = np.asarray(function(achieved, desired, {}))

@@ -1,4 +1,4 @@
-"""Gymnasium vector environments, with the automatic resets that they came with undone."""
+"""Gymnasium vector environments without their automatic resets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rejeu.spaces import leaves, plain
 
 
 class GymnasiumVector(VectorEnv):
-    """A Gymnasium vector environment, with whatever auto-reset it came with undone."""
+    """A Gymnasium vector environment without its automatic resets."""
 
     def __init__(
         self,
@@ -55,20 +55,20 @@ class GymnasiumVector(VectorEnv):
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
         self._flags = (np.zeros(self.n_envs, bool),) * 2
-        """Which have terminated, and which were truncated, and were not reset since; none where they reset themselves."""
-        self._strayed = np.zeros(self.n_envs, bool)
-        """Which have moved on unseen and were not reset since."""
+        """Environments that terminated, and that were truncated, and have not been reset since; none with automatic resets."""
+        self._desynced = np.zeros(self.n_envs, bool)
+        """Environments that were stepped although they were not active, and have not been reset since."""
         self.n_steps = 0
-        """How often the vector was stepped."""
+        """Number of steps of the vector."""
 
     def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        # A vector environment of somebody else's kind may take no list.
+        # Other classes of vector environments may not accept a list.
         given = seed if seed is None or isinstance(seed, int) else for_each(seed, self.n_envs)
         self._obs = self._after_reset = self._reset(seed=given)
         self._flags = (np.zeros(self.n_envs, bool),) * 2
-        self._strayed = np.zeros(self.n_envs, bool)
+        self._desynced = np.zeros(self.n_envs, bool)
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
@@ -105,9 +105,9 @@ class GymnasiumVector(VectorEnv):
         if over.any():
             self._reset(options={"reset_mask": over})
         action = np.array(action)
-        action[rest] = action[np.argmax(active)]  # the rows of those left out may hold anything, yet are stepped
+        action[rest] = action[np.argmax(active)]  # inactive environments are stepped too, with a valid action
         step = self._step_all(action)
-        self._strayed |= rest
+        self._desynced |= rest
         self._obs = replaced(step.obs, rest, before)
         reward = np.where(active, step.reward, np.float32(0.0))
         return Step(self._obs, reward, step.terminated & active, step.truncated & active, step.info)
@@ -116,19 +116,19 @@ class GymnasiumVector(VectorEnv):
         done = np.asarray(done, bool)
         if not self._same_step:
             self._obs = self._reset(options={"reset_mask": done})
-        elif not (done & self._strayed).any():
+        elif not (done & self._desynced).any():
             self._obs = self._after_reset
         elif done.all():
             self._obs = self._after_reset = self.reset()
         elif isinstance(self.env.unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
-            self._obs = self._after_reset = self._reset(options={"reset_mask": done & self._strayed})
+            self._obs = self._after_reset = self._reset(options={"reset_mask": done & self._desynced})
         else:
             raise ValueError(
-                f"{type(self.env.unwrapped).__name__} resets by itself and was stepped while some environments were left "
-                "out, so those cannot begin anew one by one; reset all, or make it with autoreset_mode=DISABLED"
+                f"{type(self.env.unwrapped).__name__} resets by itself and was stepped while some environments were "
+                "inactive, so single ones cannot be reset; reset all, or make it with autoreset_mode=DISABLED"
             )
         self._flags = self._flags[0] & ~done, self._flags[1] & ~done
-        self._strayed = self._strayed & ~done
+        self._desynced = self._desynced & ~done
         return self._obs
 
     def _reset(self, **arguments: Any) -> Any:
@@ -141,21 +141,21 @@ class GymnasiumVector(VectorEnv):
             raise self._bad(None, f"reset returned {error}") from error.__cause__
 
     def _called(self, function: Callable[..., Any], *positional: Any, **arguments: Any) -> Any:
-        """Calls a method of the vector; what goes wrong in the vector itself is blamed on an environment in it.
+        """Calls a method of the vector. An error in the vector itself is attributed to one of its environments.
 
-        It cannot be seen beforehand what the single environments answer. What they raise in this process is raised as
-        it is.
+        The values that single environments return cannot be checked before the vector uses them. Exceptions that an
+        environment raises in this process are not changed.
         """
         try:
             return function(*positional, **arguments)
         except (EOFError, ConnectionError) as error:
             if isinstance(self.env.unwrapped, AsyncVectorEnv):
-                raise ended(self.env.unwrapped) from error
+                raise worker_ended(self.env.unwrapped) from error
             raise
-        except Exception as error:  # whatever a vector says of an answer that does not fit
-            if not in_machinery(error):
+        except Exception as error:  # any exception of the vector for an invalid value
+            if not is_raised_by_vector(error):
                 raise
-            env, fault = culprit(error, self.env.unwrapped)
+            env, fault = find_invalid_env(error, self.env.unwrapped)
             advice = "see rejeu.check_env(env) for what it returns against its spaces"
             raise self._bad(env, fault or f"{type(error).__name__}: {error}; {advice}") from error
 
@@ -184,15 +184,15 @@ class GymnasiumVector(VectorEnv):
         self.env.close()
 
 
-def in_machinery(error: Exception) -> bool:
-    """Returns whether it was raised between the environments, by Gymnasium's vector classes or NumPy, not in one of them."""
+def is_raised_by_vector(error: Exception) -> bool:
+    """Returns whether Gymnasium's vector classes or NumPy raised an error, not one of the environments."""
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][1:]
     machinery = ("gymnasium.vector.", "gymnasium.wrappers.vector.", "numpy", "functools")
     return bool(frames) and all(frame.f_globals.get("__name__", "").startswith(machinery) for frame in frames)
 
 
-def culprit(error: Exception, vector: Any) -> tuple[int | None, str | None]:
-    """Returns which environment's answer made a vector raise, and what is wrong with it, as far as that can be told."""
+def find_invalid_env(error: Exception, vector: Any) -> tuple[int | None, str | None]:
+    """Returns the index of the environment whose value made a vector raise, and what is wrong with it, where known."""
     if isinstance(vector, AsyncVectorEnv):
         return next((i for i, pipe in enumerate(vector.parent_pipes) if pipe is None), None), None
     for i, obs in enumerate(getattr(vector, "_env_obs", ())):
@@ -208,8 +208,8 @@ def culprit(error: Exception, vector: Any) -> tuple[int | None, str | None]:
     return number, None
 
 
-def ended(env: AsyncVectorEnv) -> WorkerError:
-    """Returns the error that says which worker is gone, after ending the others."""
+def worker_ended(env: AsyncVectorEnv) -> WorkerError:
+    """Ends all workers and returns the error that names the one that ended by itself."""
     gone = []
     for i, process in enumerate(env.processes):
         process.join(0.2)  # its pipe may close a moment before it is gone

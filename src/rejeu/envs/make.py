@@ -1,4 +1,4 @@
-"""Many environments stepped as one: :func:`make_vector` chooses and makes the backend.
+"""Creation of vector environments: :func:`make_vector` chooses and makes the backend.
 
 Each backend has a module of its own: :mod:`rejeu.envs.in_process`, :mod:`rejeu.envs.workers.vector`,
 :mod:`rejeu.envs.envpool` and :mod:`rejeu.envs.gymnasium_vector`. Their common interface is :mod:`rejeu.envs.base`.
@@ -51,7 +51,7 @@ def make_vector(
     restart_workers: int = 0,
     **env_kwargs: Any,
 ) -> VectorEnv:
-    """Returns ``n_envs`` environments as one.
+    """Returns a vector environment of ``n_envs`` environments.
 
     Args:
         env: an id; a Gymnasium environment (then ``n_envs`` must be 1); a function that makes one; or a vector

@@ -1,4 +1,4 @@
-"""Finding environments by name: which package registers it, which extra installs that, what was probably meant."""
+"""Environments by id: the package that registers it, the extra that installs it, and similar ids."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from rejeu.errors import MissingExtra
 PLAIN_ID = re.compile(r"[\w./-]{1,200}")
 """Ids that are looked up; one with a colon makes Gymnasium import a module."""
 PLAIN_WORD = re.compile(r"[\w-]{0,60}")
-"""Texts that are neither a path nor an id of anything to import."""
+"""Strings that are neither a path nor importable."""
 LARGEST = 1e6
-"""Largest number that a file may hand to an environment: larger ones could ask for any amount of memory."""
+"""Largest number in the arguments of an environment from a file; larger ones could request any amount of memory."""
 MAKES_OWN = frozenset(("id", "env_id", "render_mode", "disable_env_checker", "vectorization_mode"))
-"""Arguments of ``gymnasium.make`` itself, which are no environment's."""
+"""Arguments of ``gymnasium.make`` itself."""
 ENVPOOL_SIZE = "about 770 MB with its assets"
 """Disk space of EnvPool 1.2.5 with the packages of assets that it depends on."""
 MOST_KWARGS = 100
-"""Most keyword arguments of an environment that are taken from a file."""
+"""Maximum number of keyword arguments of an environment from a file."""
 
 
 class Provider(NamedTuple):
@@ -47,7 +47,7 @@ PROVIDERS: dict[tuple[str, ...], Provider] = {
         "gymnasium_robotics", "gymnasium-robotics", "robotics"
     ),
 }  # fmt: skip
-"""Environments that Gymnasium knows only once another package is imported, by the beginning of their names."""
+"""Packages that register environments, by the prefixes of the ids."""
 
 NEEDS = {
     "Box2D": Provider("Box2D", "box2d", "box2d"),
@@ -76,7 +76,7 @@ def register(env_id: str) -> bool:
 
 
 def _without_notice(module: str) -> None:
-    """Drops what Farama's packages print at their first import, which is about other environments of theirs."""
+    """Suppresses the notices that Farama's packages print at their first import."""
     try:
         from farama_notifications import notifications
     except ImportError:
@@ -85,14 +85,14 @@ def _without_notice(module: str) -> None:
 
 
 def is_plain_id(env_id: object) -> bool:
-    """Returns whether this is an id that imports nothing, which a file may name."""
+    """Returns whether this is an id without an import, which a file may contain."""
     return isinstance(env_id, str) and PLAIN_ID.fullmatch(env_id) is not None
 
 
 def are_plain(env_kwargs: object) -> bool:
-    """Returns whether these are keyword arguments that a file may hand to an environment.
+    """Returns whether a file may contain these keyword arguments of an environment.
 
-    Truth values, words, and numbers up to a million: no paths, and nothing to import.
+    Allowed are booleans, words, and numbers up to a million; no paths, and nothing importable.
 
     >>> are_plain({"sigma": 2.0, "map_name": "8x8"}), are_plain({"xml_file": "/tmp/evil.xml"}), are_plain({"n": 10**9})
     (True, False, False)
@@ -113,7 +113,7 @@ def _is_plain(value: object) -> bool:
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
-    """Returns ``gymnasium.make(env_id)`` without its passive checker, importing what registers the id.
+    """Returns ``gymnasium.make(env_id)`` without its passive checker, after importing the package that registers the id.
 
     Raises:
         ValueError: if no such environment is known, with the nearest names.
@@ -140,7 +140,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 
 def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
-    """Returns a function that makes the environment; it can be sent to a worker process, with what is registered here."""
+    """Returns a function that makes the environment. It can be pickled, together with the registration."""
     return _Maker(env_id, kwargs, gym.registry.get(env_id))
 
 
@@ -157,7 +157,7 @@ class _Maker:
 
 
 def unknown_environment(env_id: str) -> str:
-    """Returns the sentence for an id that nothing registers: what to install, or what was probably meant."""
+    """Returns the error message for an unknown id, with what to install, or similar ids."""
     short = env_id.removeprefix("ALE/")
     elsewhere = f"EnvPool has {short}: backend='envpool' (--backend envpool)" if in_envpool(short) else ""
     if env_id.startswith("ALE/"):
