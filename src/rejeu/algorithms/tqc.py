@@ -25,8 +25,15 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.algorithms.sac.continuous import exploit, explore, policy
-from rejeu.algorithms.sac.state import HIDDEN_LAYERS, State, initial_state, temperature_and_targets
+from rejeu.algorithms.sac.continuous import (
+    HIDDEN_LAYERS,
+    State,
+    exploit,
+    explore,
+    initial_state,
+    policy,
+    temperature_and_targets,
+)
 from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network, QNetwork

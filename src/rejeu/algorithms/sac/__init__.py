@@ -3,8 +3,7 @@
 from gymnasium import spaces
 
 from rejeu.algorithms.sac import continuous, discrete
-from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, actor_loss, critics_loss, policy, td_target
-from rejeu.algorithms.sac.state import Config, State
+from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, Config, State, actor_loss, critics_loss, policy, td_target
 from rejeu.algorithms.sac.temperature import initial_temperature, temperature_loss
 from rejeu.core import Algorithm
 

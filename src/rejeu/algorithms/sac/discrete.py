@@ -22,7 +22,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.sac.state import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
+from rejeu.algorithms.sac.continuous import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
 from rejeu.algorithms.sac.temperature import metrics_of
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network
