@@ -23,8 +23,8 @@ DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BO
 """The dtypes that are read and written, by their names in the format."""
 MAX_TABLE = 4 * 2**20
 """Upper limit on the bytes of a table."""
-MAX_ARRAYS = 10_000
-"""Upper limit on the arrays of a file; more take seconds to list."""
+MAX_QUOTES = 2**18
+"""Upper limit on the quotes in a table, those of some ten thousand arrays; more take seconds to parse."""
 METADATA = "__metadata__"
 
 
@@ -121,8 +121,8 @@ def table(arrays: Mapping[str, Any], metadata: Mapping[str, str]) -> tuple[bytes
         begin = end
     content = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
     content += b" " * (-len(content) % 8)
-    if len(names) > MAX_ARRAYS:
-        raise ValueError(f"{len(names)} arrays, expected at most {MAX_ARRAYS}")
+    if content.count(b'"') > MAX_QUOTES:
+        raise ValueError(f"the header has more than {MAX_QUOTES} quotes; use fewer arrays and strings")
     if len(content) > MAX_TABLE:
         raise ValueError(
             f"the header has {len(content)} bytes, expected at most {MAX_TABLE}; use arrays for many numbers"
@@ -137,8 +137,8 @@ def _check_table(path: Path) -> None:
         if size > MAX_TABLE:  # else the objects built from it could take gigabytes
             raise Malformed(f"its table has {size} bytes, expected at most {MAX_TABLE}")
         content = file.read(size)
-    if content.count(b'"data_offsets"') > MAX_ARRAYS:
-        raise Malformed(f"its table has more than {MAX_ARRAYS} arrays")
+    if content.count(b'"') > MAX_QUOTES:
+        raise Malformed(f"its table has more than {MAX_QUOTES} quotes")
     entries = parse_json(content)  # refuses names that occur twice: readers differ in which one they use
     if not isinstance(entries, dict):
         raise Malformed("its table is not a JSON object")
