@@ -52,6 +52,7 @@ def run_command(argv: Sequence[str]) -> int:
     try:
         argv = parsing.checked(argv, COMMANDS)
         arguments = subcommand_cli_from_dict(COMMANDS, prog="rejeu", description=DESCRIPTION, args=argv)
+        importlib.import_module("rejeu.cli.settings").check_values(arguments)
         for name in arguments.imports:
             importlib.import_module("rejeu.cli.importing").import_source(name)
         return importlib.import_module(f"rejeu.cli.{argv[0]}").run(arguments)

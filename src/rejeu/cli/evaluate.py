@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import closing
 
-from rejeu import validation
 from rejeu.agents import load
 from rejeu.cli import run_folder
 from rejeu.cli.commands import Evaluate
@@ -13,10 +12,8 @@ from rejeu.cli.commands import Evaluate
 def run(arguments: Evaluate) -> int:
     """Evaluates, prints one line, and returns the exit status."""
     episodes, minutes = arguments.episodes, arguments.minutes
-    if minutes is not None:
-        validation.number("--minutes", minutes, above=0)
-    if episodes is not None or minutes is None:
-        episodes = validation.whole("--episodes", 100 if episodes is None else episodes, least=1)
+    if minutes is None and episodes is None:
+        episodes = 100
     model = run_folder.find_model(arguments.run, arguments.which)
     environment = run_folder.environment_of(model, arguments)
     agent = load(model)

@@ -8,16 +8,14 @@ from rejeu.cli.commands import Record
 from rejeu.cli.run_folder import RunFolder
 from rejeu.reporting.text import counted
 from rejeu.reporting.video import record_video
-from rejeu.validation import whole
 
 
 def run(arguments: Record) -> int:
     """Records a video, prints its path, and returns the exit status."""
-    episodes = whole("--episodes", arguments.episodes, least=1)
     model = run_folder.find_model(arguments.run, arguments.which)
     default = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
     out = default if arguments.out is None else arguments.out
     environment = run_folder.environment_of(model, arguments)
-    path = record_video(load(model), out, env=environment.rendering, episodes=episodes, seed=arguments.seed)
-    print(f"{path}: {counted(episodes, 'episode')} of {model} in {environment}", flush=True)
+    path = record_video(load(model), out, env=environment.rendering, episodes=arguments.episodes, seed=arguments.seed)
+    print(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {environment}", flush=True)
     return 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from contextlib import closing
 
-from rejeu import validation
 from rejeu.agents import Agent, agent_of_file
 from rejeu.cli import run_folder
 from rejeu.cli.commands import Resume
@@ -18,12 +17,6 @@ from rejeu.interrupt import Interrupt
 def run(arguments: Resume) -> int:
     """Trains and returns the exit status, as ``rejeu train`` does."""
     stopwatch = Stopwatch()
-    if arguments.steps is not None and arguments.minutes is not None:
-        raise ValueError("--steps and --minutes exclude each other; give one of them")
-    if arguments.steps is not None:
-        validation.whole("--steps", arguments.steps, least=1)
-    if arguments.minutes is not None:
-        validation.number("--minutes", arguments.minutes, above=0)
     folder = RunFolder(arguments.run)
     config = run_folder.read_config(folder)
     kind = agent_of_file(config.algorithm, folder.config)

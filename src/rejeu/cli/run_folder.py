@@ -16,12 +16,11 @@ from msgspec import Meta
 from rejeu.cli import environment
 from rejeu.cli.commands import RunOptions, Which
 from rejeu.cli.environment import Environment
+from rejeu.cli.settings import MAX_EPISODES
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic, checkpoint
 from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json
 
-MAX_EPISODES = 10_000
-"""Upper limit on the episodes of an evaluation while training."""
 MAX_CONFIG_BYTES = 2**20
 """Upper limit on the size of a ``config.json``."""
 

@@ -1,4 +1,4 @@
-"""``--set name=value`` and ``--env-kwargs name=value``: values from the command line."""
+"""Values from the command line: their ranges, ``--set name=value`` and ``--env-kwargs name=value``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,39 @@ import ast
 import json
 from collections.abc import Iterable, Mapping
 from typing import Any
+
+from rejeu.io.records import MAX_ENVS
+from rejeu.validation import number, whole
+
+MAX_EPISODES = 10_000
+"""Upper limit on the episodes of an evaluation while training."""
+INTEGERS = {
+    "steps": (1, 2**63 - 1),
+    "envs": (1, MAX_ENVS),
+    "episodes": (1, 2**63 - 1),
+    "evaluate_every": (1, 2**63 - 1),
+    "evaluate_episodes": (1, MAX_EPISODES),
+    "video_every": (1, 2**63 - 1),
+    "seed": (0, 2**32 - 1),
+}
+"""The smallest and the largest value of options that are whole numbers, in all commands."""
+
+
+def check_values(arguments: Any) -> None:
+    """Raises ``ValueError`` if a number is out of range, or if options exclude each other."""
+    given = {key: value for key, value in vars(arguments).items() if value is not None}
+    if {"steps", "minutes"} <= given.keys():
+        raise ValueError("--steps and --minutes exclude each other; give one of them")
+    for key, value in given.items():
+        option = f"--{key.replace('_', '-')}"
+        if key in INTEGERS:
+            whole(option, value, *INTEGERS[key])
+        elif key == "minutes":
+            number(option, value, above=0)
+        elif key == "checkpoint_minutes":
+            number(option, value, least=0)
+        elif key == "success_threshold":
+            number(option, value)
 
 
 def apply(assignments: Iterable[str], before: Mapping[str, Any], option: str = "--set") -> dict[str, Any]:

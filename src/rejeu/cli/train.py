@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu import presets, validation
-from rejeu.agents import AGENTS, find_agent, whole_seed
+from rejeu.agents import AGENTS, find_agent
 from rejeu.algorithms import config as configs
 from rejeu.cli import environment, run_folder, settings
 from rejeu.cli.commands import Train
@@ -20,14 +20,13 @@ from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
 from rejeu.interrupt import Interrupt
-from rejeu.io.records import MAX_ENVS
 from rejeu.presets import Preset
 
 
 def run(arguments: Train) -> int:
     """Trains and returns the exit status: 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
     stopwatch = Stopwatch()
-    check(arguments)
+    run_folder.check_free(arguments.out)
     algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
     preset = presets.find(made.env_id, algorithm)
@@ -43,25 +42,6 @@ def run(arguments: Train) -> int:
             echo(header(config, made, describe_backend(env, made, preset), folder))
             limits = Limits(config.steps, config.minutes)
             return Session(agent, config, folder, made, evaluation_env, limits, is_new=True).run(stop, stopwatch)
-
-
-def check(arguments: Train) -> None:
-    """Raises ValueError or OSError for invalid arguments, before anything is made."""
-    if arguments.steps is not None and arguments.minutes is not None:
-        raise ValueError("--steps and --minutes exclude each other; give one of them")
-    most = {"envs": MAX_ENVS, "evaluate_episodes": run_folder.MAX_EPISODES}
-    for name in ("steps", "envs", "video_every", "evaluate_every", "evaluate_episodes"):
-        if getattr(arguments, name) is not None:
-            option = f"--{name.replace('_', '-')}"
-            validation.whole(option, getattr(arguments, name), least=1, most=most.get(name, 2**63 - 1))
-    if arguments.minutes is not None:
-        validation.number("--minutes", arguments.minutes, above=0)
-    validation.number("--checkpoint-minutes", arguments.checkpoint_minutes, least=0)
-    if arguments.success_threshold is not None:
-        validation.number("--success-threshold", arguments.success_threshold)
-    if arguments.seed is not None:
-        whole_seed(arguments.seed)
-    run_folder.check_free(arguments.out)
 
 
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
