@@ -204,7 +204,7 @@ def test_an_agent_of_scaled_observations_is_not_shown_raw_ones(tmp_path):
     agent = rejeu.DQN("MlpPolicy", VecNormalize(make_vec_env("CartPole-v1")), **SMALL)
     with pytest.raises(ValueError, match="evaluated in one that has the same statistics"):
         agent.evaluate(1, env="CartPole-v1")
-    with pytest.raises(ValueError, match="wrapped in VecNormalize, which a new one would lack"):
+    with pytest.raises(ValueError, match="wrapped in VecNormalize, which a new one would not have"):
         rejeu.record_video(agent, tmp_path / "video")
 
 
