@@ -42,3 +42,17 @@ def test_a_misspelt_name_is_an_attribute_error():
 
 def test_make_vec_is_make_vector():
     assert rejeu.make_vec is rejeu.make_vector
+
+
+def test_help_imports_no_jax():
+    program = """
+import sys
+from rejeu.cli import main
+for words in (["--help"], ["train", "--help"]):
+    try:
+        main(words)
+    except SystemExit:
+        pass
+print("loaded", sorted({"jax", "equinox", "rejeu.agents"} & set(sys.modules)))
+"""
+    assert fresh(program).endswith("loaded []\n")
