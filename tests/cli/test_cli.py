@@ -464,7 +464,7 @@ def test_resume_explains_what_it_cannot_go_on_with(run, tmp_path, capsys):
     content = json.loads(config.read_text())
     for damage, message in (
         ({"n_envs": "8"}, "n_envs"),
-        ({"algorithm": "os.system"}, "unknown"),
+        ({"algorithm": "os.system"}, "'os.system', which is not registered"),
         ({"seed": None}, "seed"),
     ):
         config.write_text(json.dumps({**content, **damage}))
@@ -524,11 +524,11 @@ def test_check_leaves_out_what_only_the_authors_of_a_package_can_change(capsys):
 
 
 def test_a_warning_is_one_line_on_the_command_line(capsys):
-    argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1", "--minutes", "1"]
+    argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1"]
     with pytest.MonkeyPatch.context() as patch:
-        warn = lambda arguments: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
-        patch.setattr("rejeu.cli.train.check", warn)
-        patch.setattr("rejeu.cli.train.named", lambda *_: (_ for _ in ()).throw(ValueError("over")))
+        warn = lambda out: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
+        patch.setattr("rejeu.cli.run_folder.check_free", warn)
+        patch.setattr("rejeu.cli.environment.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
         with warnings.catch_warnings():
             warnings.simplefilter("always")
             assert main(argv) == 2
