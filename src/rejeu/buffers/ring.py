@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rejeu.buffers.ram import physical_memory
+from rejeu.io.memory import physical_memory
 from rejeu.spaces import Leaf, flat_keys
 
 STEP, TERMINATED, LAST = 0, 1, 2

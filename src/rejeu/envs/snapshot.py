@@ -22,8 +22,6 @@ from gymnasium import wrappers
 from gymnasium.envs import classic_control
 from msgspec import Meta
 
-from rejeu.envs.ball.ball import Ball
-
 STATELESS = (
     wrappers.ClipAction,
     wrappers.ClipReward,
@@ -155,8 +153,8 @@ def is_over(env: gym.Env) -> bool:
         if isinstance(layer, wrappers.TimeLimit) and layer._elapsed_steps is None:
             return True
         layer = layer.env
-    if isinstance(layer, Ball):
-        return layer.over
+    if answers_for_itself(layer):
+        return bool(getattr(layer, "needs_reset", False))
     return "state" in REMEMBERED.get(type(layer), {}) and getattr(layer, "state", None) is None
 
 

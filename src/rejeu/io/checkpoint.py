@@ -22,10 +22,10 @@ import jax
 import numpy as np
 from safetensors import SafetensorError
 
-from rejeu.buffers.ram import physical_memory
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic, tensors
+from rejeu.io.memory import physical_memory
 from rejeu.io.records import Malformed, parse_json, shown
 from rejeu.io.tensors import Spec, TensorFile
 

@@ -86,7 +86,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         """Where the ball is; empty before the first reset. Beyond the wall once it has left."""
         self.n_steps = 0
         """Steps taken in this episode."""
-        self.over = True
+        self.needs_reset = True
         """Whether a reset is due."""
         self._trail: deque[tuple[float, ...]] = deque(maxlen=N_STEPS + 1)
         self._push: list[float] = []
@@ -99,7 +99,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         self.position = self.np_random.uniform(-STRONGEST_PUSH, STRONGEST_PUSH, self.dimension).tolist()
         self.n_steps = 0
-        self.over = False
+        self.needs_reset = False
         self._trail.clear()
         self._trail.append(tuple(self.position))
         self._push = []
@@ -113,7 +113,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: if the episode is over or has not begun.
             ValueError: if the action has another shape or is not a number.
         """
-        if self.over:
+        if self.needs_reset:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
         push = np.asarray(action, np.float64)
         if push.shape != (self.dimension,):
@@ -127,12 +127,12 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self.position = position
         self.n_steps += 1
         held = not lost and self.n_steps >= N_STEPS
-        self.over = lost or held
+        self.needs_reset = lost or held
         self._trail.append(tuple(position))
         self._push = pushes
         self._show()
         reward = LOST_REWARD if lost else HELD_REWARD if held else 1.0
-        return self._observe(), reward, lost, held, {"is_success": held} if self.over else {}
+        return self._observe(), reward, lost, held, {"is_success": held} if self.needs_reset else {}
 
     @property
     def trajectory(self) -> np.ndarray:
@@ -155,7 +155,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         return {
             "position": list(self.position),
             "n_steps": self.n_steps,
-            "over": self.over,
+            "over": self.needs_reset,
             "rng": self.np_random.bit_generator.state,
         }
 
@@ -173,7 +173,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         if not (over or inside) or not all(map(math.isfinite, position)):
             raise ValueError(f"no ball is under way at {position} after {n_steps} steps")
         self.np_random.bit_generator.state = state["rng"]
-        self.position, self.n_steps, self.over = position, n_steps, over
+        self.position, self.n_steps, self.needs_reset = position, n_steps, over
         self._trail.clear()
         self._push = []
         if self.position:
@@ -190,7 +190,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError("nothing is drawn without a render mode: gymnasium.make(..., render_mode='rgb_array')")
         if self._drawing is None:
             self._drawing = BallDrawing(self.dimension, self.render_mode, self.metadata["render_fps"], WALL, N_STEPS)
-        return self._drawing.draw(self._trail, self._push, self.n_steps, self.over)
+        return self._drawing.draw(self._trail, self._push, self.n_steps, self.needs_reset)
 
     def close(self) -> None:
         """Closes the window, if there is one."""
@@ -204,6 +204,6 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
 
     def _observe(self) -> np.ndarray:
         """Returns the position; where the ball has left, the nearest point of the box."""
-        if self.over:
+        if self.needs_reset:
             return np.array([min(max(x, -WALL), WALL) for x in self.position], np.float32)
         return np.array(self.position, np.float32)
