@@ -195,7 +195,9 @@ def test_any_function_of_the_progress_is_a_schedule(tmp_path):
     settings = {"learning_starts": 0, "batch_size": 4, "buffer_size": 100, "seed": 0}
     agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", learning_rate=half_cosine, **settings).learn(20)
     path = agent.save(tmp_path / "model")
-    with pytest.raises(rejeu.CheckpointError, match="its learning_rate is your own, 'half_cosine'"):
+    with pytest.raises(
+        rejeu.CheckpointError, match=r"model\.safetensors: its learning_rate is your own, 'half_cosine'"
+    ):
         rejeu.load(path)
     assert rejeu.load(path, learning_rate=half_cosine).config == agent.config
     assert rejeu.load(path, learning_rate=1e-3).config.learning_rate == 1e-3

@@ -17,6 +17,10 @@ class CheckpointError(ValueError):
     """A file is invalid or does not match what is loaded. The message states the difference."""
 
 
+class MissingObjectError(CheckpointError):
+    """A file names an object of the user's own, such as a torso, which must be given to load it."""
+
+
 class BadEnvironmentError(RuntimeError):
     """An environment returned invalid values, such as NaN or an observation of another shape."""
 

@@ -16,7 +16,7 @@ from rejeu import spaces, validation, xla
 from rejeu.agents.base import AGENT_ARGUMENTS, BEST_WINDOW, BaseAgent, check_policy, whole_seed
 from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
-from rejeu.errors import CheckpointError
+from rejeu.errors import CheckpointError, MissingObjectError
 from rejeu.io import checkpoint
 from rejeu.io.records import Positive, Seed, convert
 from rejeu.networks import settled
@@ -96,7 +96,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         changes: hyper-parameters that the user sets otherwise than they were saved.
 
     Raises:
-        CheckpointError: if the header is damaged.
+        CheckpointError: if the header is damaged, or names an object of the user's own that is not given.
         TypeError, ValueError: if ``changes`` are invalid.
     """
     try:
@@ -107,6 +107,8 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         observation_space = spaces.rebuild(saved.observation_space, largest)
         check_policy(saved.policy, observation_space)
         action_space = spaces.rebuild(saved.action_space, largest)
+    except MissingObjectError:
+        raise
     except WRONG as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
     check_sizes(config, room)

@@ -18,7 +18,7 @@ from rejeu import normalization, schedules
 from rejeu.algorithms import optimizers
 from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
-from rejeu.errors import CheckpointError
+from rejeu.errors import MissingObjectError
 from rejeu.exploration import noise as action_noises
 from rejeu.networks import PolicyConfig, Widths, reads_image, settled
 from rejeu.normalization import NormalizationConfig
@@ -122,7 +122,7 @@ class OffPolicyConfig:
 
     @property
     def hindsight(self) -> HindsightConfig | None:
-        """How goals are relabelled, or None where they are not."""
+        """How goals are relabeled, or None where they are not."""
         settings = self.replay_buffer_kwargs
         return settings if isinstance(settings, HindsightConfig) else None
 
@@ -131,7 +131,7 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
     """Returns the configuration of a file with some settings changed; of ``policy_kwargs`` only the given ones.
 
     Raises:
-        CheckpointError: if the file mentions an object of the user's own, such as a ``torso``, and none is given.
+        MissingObjectError: if the file names an object of the user's own, such as a ``torso``, and none is given.
     """
     merged = {**saved, **changes}
     policy, old = changes.get("policy_kwargs"), saved.get("policy_kwargs")
@@ -142,7 +142,7 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
         argument = f"{keys[-1]}={name}"
         for key in keys[-2::-1]:
             argument = f"{key}=dict({argument})"
-        raise CheckpointError(
+        raise MissingObjectError(
             f"its {keys[-1]} is your own, {name!r}, and no file holds code; give it again: load(path, {argument})"
         )
     return build(kind, merged)
