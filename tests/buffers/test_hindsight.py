@@ -272,8 +272,29 @@ def test_a_function_as_strategy_draws_what_the_named_one_does(strategy, n_envs):
     np.testing.assert_array_equal(one.reward, two.reward)
 
 
-@pytest.mark.parametrize("chosen", [lambda last: last + 1, lambda last: last[1:], lambda last: last + 0.0])
-def test_a_function_that_leaves_the_episode_is_refused(chosen):
+@pytest.mark.parametrize(
+    ("chosen", "received"),
+    [
+        (lambda last: last + 1, r"it returned \d+ where first is \d+ and last is \d+"),
+        (lambda last: last[1:], r"of shape \(32,\); it returned int64 of shape \(31,\)"),
+        (lambda last: last + 0.0, r"it returned float64 of shape \(32,\)"),
+    ],
+)
+def test_a_function_that_leaves_the_episode_is_refused(chosen, received):
     replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, lambda rng, time, first, last: chosen(last))
-    with pytest.raises(ValueError, match="must return whole numbers from first to last"):
+    with pytest.raises(ValueError, match=f"must return whole numbers from first to last.*{received}"):
         replay.sample(np.random.default_rng(0), (40,))
+
+
+class Last(HerReplayBuffer):
+    """The strategy ``final``, by the method that subclasses may override."""
+
+    def goal_index(self, rng, env, time, step):
+        return self.ring.index(env, time + np.where(step["until_end"], step["until_end"], self.ring.head[env] - time))
+
+
+def test_a_subclass_chooses_goals_by_goal_index():
+    named, _ = filled(1, 16, RUNNING_AND_WRAPPED, "final")
+    own = Last(named.ring, named.gamma, named.config, named.goals)
+    one, two = (buffer.sample(np.random.default_rng(0), (200,)) for buffer in (named, own))
+    np.testing.assert_array_equal(one.obs["desired_goal"], two.obs["desired_goal"])

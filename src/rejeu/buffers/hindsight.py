@@ -49,9 +49,12 @@ class GoalSelectionStrategy(str, Enum):
 GoalStrategy = Callable[[np.random.Generator, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """A goal strategy of your own: ``strategy(rng, time, first, last) -> times``.
 
-All arrays have one entry for each relabeled transition, ``int64 (n,)``. ``time`` is when it began; its next observation is at
-``time + 1``. The result says at which time of the same episode the achieved goal is taken, from ``first``, the first time kept
-after a step, to ``last``, the last so far. ``future`` is ``rng.integers(time + 1, last + 1)``, ``final`` is ``last``."""
+All arrays have one entry for each relabeled transition, ``int64 (n,)``. Times count the observations of one environment over
+the whole run, so only their differences matter: ``time`` is that of the transition's observation, ``time + 1`` that of its
+next observation. The result says at which time of the same episode the achieved goal is taken, from ``first`` to ``last``.
+``first`` is the observation after the oldest one of the episode that is stored, ``last`` the newest one. ``future`` is
+``rng.integers(time + 1, last + 1)``, ``final`` is ``last``. A strategy that depends on the goals themselves
+overrides :meth:`HerReplayBuffer.goal_index` instead."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class HindsightConfig:
     """Settings of hindsight replay (Stable-Baselines3's ``replay_buffer_kwargs``)."""
 
     n_sampled_goal: int = 4
-    """Relabelled transitions per original one. Raising it learns more from failures and less from the real goals."""
+    """Relabeled transitions per original one. Raising it learns more from failures and less from the real goals."""
     goal_selection_strategy: str | GoalStrategy = "future"
     """``future``, ``final``, ``episode`` or ``random``, a ``GoalSelectionStrategy``, or a function
     ``(rng, time, first, last) -> times``: see ``rejeu.buffers.hindsight.GoalStrategy``."""
@@ -76,7 +79,7 @@ class HindsightConfig:
                 known = ", ".join(s.value for s in GoalSelectionStrategy)
                 raise ValueError(
                     f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}, or a function "
-                    "(rng, time, first, last) -> times, of which a file holds only the name: give it again to load"
+                    "(rng, time, first, last) -> times. The name of a function is not enough: give the function itself"
                 ) from None
             object.__setattr__(self, "goal_selection_strategy", strategy.value)
         if self.copy_info_dict:
@@ -96,7 +99,10 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
 
 
 class HerReplayBuffer(BaseReplayBuffer):
-    """Draws transitions from a :class:`Ring`, uniformly or by priority, and gives most of them a goal that was reached."""
+    """Draws transitions from a :class:`Ring`, uniformly or by priority, and gives most of them a goal that was reached.
+
+    Subclasses may override :meth:`goal_index`, which chooses these goals.
+    """
 
     def __init__(
         self,
@@ -136,7 +142,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         step, obs = ring.read(rows.position)
         relabeled = relabeled_positions(shape, k)
 
-        goal_index = self._goal_index(rng, rows.env[relabeled], rows.time[relabeled], step[relabeled])
+        goal_index = self.goal_index(rng, rows.env[relabeled], rows.time[relabeled], step[relabeled])
         goal = ring.read_leaf(self.achieved, goal_index)
         steps: int | np.ndarray = 1
         rewards = None
@@ -157,10 +163,15 @@ class HerReplayBuffer(BaseReplayBuffer):
         rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
         return batch(ring, shape, obs, step["action"], reward, next_obs, discount, weight, rewards), drawn
 
-    def _goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.
 
-        The relabeled rows are given by environment and time, ``(n,)``, and by their records ``step`` ``(n,)``.
+        Args:
+            rng: the only source of random numbers.
+            env: environments of the relabeled rows, ``(n,)``.
+            time: their times, as in :data:`GoalStrategy`, ``(n,)``.
+            step: their records, ``(n,)``, with the :func:`counters` of the strategy: ``until_end`` is the number of steps from
+                ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
         """
         ring, strategy = self.ring, self.config.goal_selection_strategy
         if callable(strategy):
@@ -211,7 +222,7 @@ def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
 def custom_goal_index(
     strategy: GoalStrategy, ring: Ring, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray
 ) -> np.ndarray:
-    """Returns the positions of the rows whose achieved goals become the new goals, by a function; see ``_goal_index``.
+    """Returns what :meth:`HerReplayBuffer.goal_index` does, by the user's function.
 
     Raises:
         ValueError: if a time is outside of the episode.
@@ -220,7 +231,12 @@ def custom_goal_index(
     last = time + np.where(step["until_end"], step["until_end"], ring.head[env] - time)
     times = np.asarray(strategy(rng, time, first, last))
     if times.shape != time.shape or times.dtype.kind not in "iu" or ((times < first) | (times > last)).any():
+        received = f"{times.dtype} of shape {times.shape}"
+        if times.shape == time.shape and times.dtype.kind in "iu":
+            wrong = np.flatnonzero((times < first) | (times > last))[0]
+            received = f"{times[wrong]} where first is {first[wrong]} and last is {last[wrong]}"
         raise ValueError(
-            "goal_selection_strategy must return whole numbers from first to last, one for each transition"
+            f"goal_selection_strategy must return whole numbers from first to last, one for each transition, of shape "
+            f"{time.shape}; it returned {received}"
         )
     return ring.index(env, times)
