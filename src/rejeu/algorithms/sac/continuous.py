@@ -1,4 +1,4 @@
-"""Soft actor-critic: an off-policy actor-critic that also maximizes the entropy of its policy.
+"""Soft actor-critic for Box actions: an off-policy actor-critic that also maximizes the entropy of its policy.
 
 Sources: Haarnoja et al. 2018, "Soft Actor-Critic" (arXiv 1801.01290) and "Soft Actor-Critic Algorithms and
 Applications" (arXiv 1812.05905), which introduces the automatic temperature. With policy ``pi``, critics ``Q_i``, target
