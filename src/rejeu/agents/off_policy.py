@@ -212,6 +212,6 @@ class TQC(OffPolicyAgent):
 
 
 class CrossQ(OffPolicyAgent):
-    """SAC with batch renormalisation instead of target networks (Bhatt et al. 2024), for continuous actions."""
+    """SAC with batch renormalization instead of target networks (Bhatt et al. 2024), for continuous actions."""
 
     algorithm: ClassVar[ModuleType] = crossq

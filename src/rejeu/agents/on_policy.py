@@ -109,7 +109,7 @@ class OnPolicyAgent(Agent):
 
 
 class PPO(OnPolicyAgent):
-    """Proximal policy optimisation (Schulman et al. 2017), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
+    """Proximal policy optimization (Schulman et al. 2017), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
 
     algorithm: ClassVar[ModuleType] = ppo
 
