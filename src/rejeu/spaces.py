@@ -174,6 +174,22 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
     return space
 
 
+def check_discrete_action(space: spaces.Space, algorithm: str) -> int:
+    """Returns the number of actions of a Discrete space, whatever its ``start``.
+
+    Raises:
+        ValueError: for another space, naming what to use instead.
+    """
+    if not isinstance(space, spaces.Discrete):
+        instead = (
+            "for this environment use SAC or TD3"
+            if isinstance(space, spaces.Box)
+            else "wrap the environment in a gymnasium.ActionWrapper with a Discrete action space"
+        )
+        raise ValueError(f"{algorithm} needs a Discrete action space, got {space}; {instead}")
+    return int(space.n)
+
+
 def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
     """Returns ``space`` if a stochastic policy can act in it: a Box with an axis, Discrete, MultiDiscrete, MultiBinary.
 

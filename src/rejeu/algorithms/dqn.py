@@ -51,7 +51,7 @@ from rejeu.core import (
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso
 from rejeu.schedules import Exponential, Linear, Schedule, at
-from rejeu.spaces import Leaf, leaves
+from rejeu.spaces import Leaf, check_discrete_action, leaves
 from rejeu.validation import choice, coerce, flag, number, whole
 
 HIDDEN_LAYERS = (64, 64)
@@ -297,19 +297,3 @@ def moved_target(target: PyTree, online: PyTree, moves: Array, tau: float) -> Py
     if tau == 1.0:
         return jax.tree.map(lambda t, o: jnp.where(moves > 0, o, t), target, online)
     return polyak(target, online, 1.0 - (1.0 - tau) ** moves.astype(jnp.float32))
-
-
-def check_discrete_action(space: spaces.Space, algorithm: str) -> int:
-    """Returns the number of actions of a Discrete space, whatever its ``start``.
-
-    Raises:
-        ValueError: for another space, naming what to use instead.
-    """
-    if not isinstance(space, spaces.Discrete):
-        instead = (
-            "for this environment use SAC or TD3"
-            if isinstance(space, spaces.Box)
-            else "wrap the environment in a gymnasium.ActionWrapper with a Discrete action space"
-        )
-        raise ValueError(f"{algorithm} needs a Discrete action space, got {space}; {instead}")
-    return int(space.n)

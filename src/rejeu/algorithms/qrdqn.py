@@ -30,7 +30,6 @@ from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.dqn import (
     HIDDEN_LAYERS,
     QLearningConfig,
-    check_discrete_action,
     epsilon_greedy,
     greedy,
     moved_target,
@@ -53,7 +52,7 @@ from rejeu.core import (
 )
 from rejeu.networks import Network
 from rejeu.schedules import Schedule, at
-from rejeu.spaces import leaves
+from rejeu.spaces import check_discrete_action, leaves
 from rejeu.validation import coerce, whole
 
 
