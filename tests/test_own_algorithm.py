@@ -6,7 +6,9 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import equinox as eqx
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
@@ -15,9 +17,11 @@ import pytest
 
 import rejeu
 from rejeu import presets
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks import Checkpoint
-from rejeu.core import Transition
+from rejeu.core import TD_ERROR, Transition
 from rejeu.errors import CheckpointError
+from rejeu.loops.learner import Learner
 from tests.environments import Reach
 
 ROOT = Path(__file__).parents[1]
@@ -164,6 +168,56 @@ def test_a_later_registration_replaces_the_earlier_one_but_not_rejeus_own(awac):
 
     with pytest.raises(ValueError, match="rejeu has an algorithm 'SAC'; choose another"):
         rejeu.register(Own)
+
+
+@pytest.mark.parametrize("algorithm", [None, SimpleNamespace(Config=OffPolicyConfig, make=None)])
+def test_an_agent_without_a_named_configuration_is_refused(algorithm):
+    class Nameless(rejeu.OffPolicyAgent):
+        pass
+
+    if algorithm is not None:
+        Nameless.algorithm = algorithm
+    with pytest.raises(ValueError, match=r"Nameless needs a class attribute algorithm .* name: ClassVar"):
+        rejeu.register(Nameless)
+
+
+def with_update(awac, change):
+    """An agent whose updates return what ``change`` makes of the state and the metrics."""
+
+    def make(*arguments):
+        algorithm = awac.make(*arguments)
+        return algorithm._replace(update=lambda *inputs: change(*algorithm.update(*inputs)))
+
+    class Changed(rejeu.OffPolicyAgent):
+        algorithm = SimpleNamespace(Config=awac.Config, make=make)
+
+    return Changed
+
+
+def test_prioritized_replay_without_td_errors_is_refused(awac):
+    kind = with_update(awac, lambda state, metrics: (state, {"critic_loss": metrics["critic_loss"]}))
+    with pytest.raises(ValueError, match=r"prioritized replay needs the absolute TD error .* it returned none"):
+        kind("MlpPolicy", "Pendulum-v1", priorities={}, **SMALL).learn(40)
+    kind = with_update(awac, lambda state, metrics: (state, metrics | {TD_ERROR: jnp.float32(1)}))
+    with pytest.raises(ValueError, match=r"TD_ERROR of shape \(batch,\); it returned \(\)"):
+        kind("MlpPolicy", "Pendulum-v1", priorities={}, **SMALL).learn(40)
+
+
+def test_a_state_that_changes_its_shape_or_holds_no_array_is_refused(awac):
+    kind = with_update(awac, lambda state, metrics: (eqx.tree_at(lambda s: s.n_updates, state, jnp.zeros(2)), metrics))
+    with pytest.raises(
+        TypeError, match=r"update returned a state with n_updates: float32\[2\], expected an array int32\[\]"
+    ):
+        kind("MlpPolicy", "Pendulum-v1", **SMALL).learn(40)
+    algorithm = rejeu.Algorithm(lambda key: {"step": 0.5}, None, None, None, None)
+    with pytest.raises(TypeError, match=r"init returned a state with step: 0\.5, expected an array float32\[\]"):
+        Learner(algorithm, None).init(jax.random.PRNGKey(0))
+
+
+def test_a_metric_may_be_a_python_number(awac):
+    kind = with_update(awac, lambda state, metrics: (state, {"constant": 1.5}))
+    agent = kind("MlpPolicy", "Pendulum-v1", **SMALL).learn(40)
+    assert float(agent.run.metrics["constant"]) == 1.5
 
 
 def test_the_file_works_as_a_notebook_cell(forget):

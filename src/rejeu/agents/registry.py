@@ -40,8 +40,15 @@ def register(agent: A, presets: Iterable[Preset] = ()) -> A:
         presets: tuned settings of this algorithm for some environments.
 
     Raises:
-        ValueError: if rejeu has an algorithm of this name, or a preset is for another algorithm.
+        ValueError: if the agent has no configuration with a name, rejeu has an algorithm of this name, or a preset is for
+            another algorithm.
     """
+    config = getattr(getattr(agent, "algorithm", None), "Config", None)
+    if not getattr(config, "name", "") or "__dataclass_fields__" not in vars(config):
+        raise ValueError(
+            f"{agent.__name__} needs a class attribute algorithm = SimpleNamespace(Config=Config, make=make), in which Config "
+            "is a @dataclass(frozen=True, kw_only=True) with name: ClassVar[str] = NAME"
+        )
     name = agent.algorithm.Config.name
     if name in BUILT_IN and agent is not BUILT_IN[name]:
         raise ValueError(f"rejeu has an algorithm {name!r}; choose another Config.name")

@@ -14,6 +14,7 @@ from rejeu import xla
 from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Transition, copy
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
+from rejeu.io.checkpoint import names
 from rejeu.loops import nonfinite
 from rejeu.loops.packing import PackedState, Packing, Readings
 from rejeu.prng import nth
@@ -70,6 +71,8 @@ class Learner:
 
         def step(before: PyTree, batch: Any) -> tuple[PyTree, Metrics]:
             after, metrics = self.algorithm.update(before, batch, clock)
+            check_state(after, self.shapes, "update")
+            metrics = {name: jnp.asarray(value) for name, value in metrics.items()}
             return nonfinite.undo(before, after, metrics) if self.skips else (after, metrics)
 
         before = xla.one_kernel(self.packing.unpack)(state)
@@ -79,11 +82,18 @@ class Learner:
         state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack)(after))
         td_error = metrics.pop(TD_ERROR, None)
         is_weighted = isinstance(batches, Transition) and batches.weight is not None
+        if is_weighted and (td_error is None or td_error.shape != batches.reward.shape):
+            raise ValueError(
+                "prioritized replay needs the absolute TD error of each transition: return it from update among the metrics, "
+                f"as TD_ERROR of shape (batch,); it returned {'none' if td_error is None else td_error.shape}"
+            )
         return state, nonfinite.readings(state, metrics), td_error if is_weighted else None
 
     def _init(self, key: Array) -> PackedState:
         """Returns the state before learning."""
-        return self.packing.pack(self.algorithm.init(key))
+        state = self.algorithm.init(key)
+        check_state(state, self.shapes, "init")
+        return self.packing.pack(state)
 
     def _observe(self, state: PackedState, obs: PyTree, running_return: Array) -> PackedState:
         """Returns the state, which is donated, with observations added to its statistics (see ``Algorithm.observe``)."""
@@ -130,3 +140,19 @@ class Learner:
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""
         return self.explorer.init(self.algorithm.actor(self.shapes), n_envs)
+
+
+def check_state(state: PyTree, expected: PyTree, function: str) -> None:
+    """Raises ``TypeError`` if a leaf of a state differs in shape or dtype from that of ``expected``; runs while tracing.
+
+    ``function`` is that of the algorithm which returned the state.
+    """
+    given, wanted = (dict(zip(names(tree), jax.tree.leaves(tree), strict=True)) for tree in (state, expected))
+    for name in [*wanted, *given]:
+        found, leaf = given.get(name), wanted.get(name)
+        ours, theirs = (
+            "no such leaf" if x is None else f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else repr(x)
+            for x in (leaf, found)
+        )
+        if ours != theirs:
+            raise TypeError(f"{function} returned a state with {name or 'state'}: {theirs}, expected an array {ours}")
