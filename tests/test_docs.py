@@ -6,6 +6,7 @@ reader, it gets from ``PREPARATIONS``.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import re
 import shlex
@@ -130,7 +131,10 @@ def test_the_commands_of_a_page_are_understood(page, arguments, monkeypatch, cap
     given = []
     command = ModuleType("command")
     command.run = lambda known: given.append(known) or 0
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: command)
+    real = importlib.import_module
+    monkeypatch.setattr(
+        cli.importlib, "import_module", lambda name: real(name) if name == "rejeu.cli.settings" else command
+    )
     command.import_source = lambda name: None
     assert cli.main(arguments) == 0, capsys.readouterr().err
     assert len(given) == 1
