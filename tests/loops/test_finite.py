@@ -23,7 +23,7 @@ from rejeu.envs.make import InProcess
 from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
 from rejeu.loops import finite, nonfinite
 from rejeu.loops.packing import Readings
-from rejeu.normalization import merged, nothing
+from rejeu.normalization import merged, no_moments
 from rejeu.spaces import Leaf
 from tests.environments import Counter, Reach, Sampled
 from tests.tiers import crossed, only
@@ -564,14 +564,14 @@ def test_td_errors_that_are_not_finite_leave_priorities_as_they_are(bad):
 def test_statistics_pass_over_what_is_not_finite():
     values = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
     spoilt = np.insert(values, [2, 4], [[np.nan, 0, 0], [0, np.inf, 1]], axis=0).astype(np.float32)
-    one = merged(nothing((3,)), jnp.asarray(values), jnp.ones(6))
-    two = merged(nothing((3,)), jnp.asarray(spoilt), jnp.ones(8))
+    one = merged(no_moments((3,)), jnp.asarray(values), jnp.ones(6))
+    two = merged(no_moments((3,)), jnp.asarray(spoilt), jnp.ones(8))
     jax.tree.map(np.testing.assert_allclose, one, two)
     assert float(two.n_seen) == 6
 
 
 def test_statistics_do_not_overflow():
-    known = merged(nothing((1,)), jnp.ones((4, 1)), jnp.ones(4))
+    known = merged(no_moments((1,)), jnp.ones((4, 1)), jnp.ones(4))
     after = merged(known, jnp.full((2, 1), 1e30), jnp.ones(2))
     jax.tree.map(np.testing.assert_array_equal, known, after)
 
