@@ -86,8 +86,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled_functions_are_dropped() -> Iterator[None]:
-    """Drops compiled functions before there are too many: each is a few memory maps, and Linux allows a process 65,530."""
+    """Drops compiled functions before they take more than about 3 GB; each is a few memory maps."""
     yield
-    if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 30_000:
+    if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 15_000:
         jax.clear_caches()
         gc.collect()
