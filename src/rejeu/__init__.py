@@ -138,7 +138,7 @@ if not TYPE_CHECKING:  # type checkers find the names above, and report misspelt
         module = next((module for module, names in _MODULES.items() if name in names.split()), None)
         if module is not None:
             value = getattr(__import__(module, fromlist=[name]), name)  # a submodule too
-        elif not name.startswith("_") and importlib.util.find_spec(f"rejeu.{name}") is not None:
+        elif name.isidentifier() and not name.startswith("_") and importlib.util.find_spec(f"rejeu.{name}") is not None:
             value = importlib.import_module(f"rejeu.{name}")
         else:
             raise AttributeError(f"module 'rejeu' has no attribute {name!r}")

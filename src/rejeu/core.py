@@ -175,7 +175,10 @@ def without_gradient(function: Callable[..., Any]) -> Callable[..., Any]:
     return outlined(stopped)
 
 
-@one_kernel
+class Elementwise(optax.GradientTransformation):
+    """An optimizer that treats every number of the gradients by itself, which XLA compiles into one kernel on a CPU."""
+
+
 def descend(
     params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: optax.GradientTransformation, rate: Any
 ) -> tuple[PyTree, PyTree]:
@@ -189,6 +192,11 @@ def descend(
         rate: the learning rate, which may be a traced value of a schedule; or one for each part of ``params``, as a
             pytree that is a prefix of it.
     """
+    step = one_kernel(_descend) if isinstance(optimizer, Elementwise) else _descend
+    return step(params, gradients, optimizer_state, optimizer, rate)
+
+
+def _descend(params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: Any, rate: Any) -> Any:
     direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
     step = lambda rate, part, d: jax.tree.map(lambda p, d: p - rate * d, part, d)  # noqa: E731
     return jax.tree.map(step, rate, params, direction), optimizer_state

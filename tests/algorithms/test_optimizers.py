@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from functools import partial
 
 import jax.numpy as jnp
@@ -94,3 +97,30 @@ def test_an_agent_learns_and_loads_with_another_optimizer(tmp_path):
     loaded = rejeu.load(path, optimizer=OWN[2])
     for key, value in agent.get_parameters().items():
         np.testing.assert_array_equal(loaded.get_parameters()[key], value)
+
+
+OWN = """
+import sys
+import jax, numpy as np, optax, rejeu
+
+for kind, env, settings in (
+    ("DQN", "CartPole-v1", {"learning_starts": 10, "train_freq": 1}),
+    ("A2C", "CartPole-v1", {}),
+    ("PPO", "CartPole-v1", {"n_steps": 32, "batch_size": 16, "n_epochs": 1}),
+):
+    optimizer = {"lamb": optax.lamb, "clip": optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0)),
+                 "adafactor": optax.adafactor}[sys.argv[1]]
+    agent = getattr(rejeu, kind)("MlpPolicy", env, optimizer=optimizer, learning_rate=1e-3, seed=0, **settings)
+    before = agent.get_parameters()
+    after = agent.learn(40).get_parameters()
+    assert any((before[name] != after[name]).any() for name in before), kind
+    assert all(np.isfinite(array).all() for array in after.values()), kind
+"""
+
+
+@pytest.mark.parametrize("optimizer", ["lamb", "clip", "adafactor"])
+def test_optimizers_that_look_at_all_gradients_work_in_the_programs_that_users_compile(optimizer):
+    """The tests compile with other options, under which the kernels of these optimizers are never made."""
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run([sys.executable, "-c", OWN, optimizer], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -77,7 +77,7 @@ def find_agent(name: str) -> type[Agent]:
         return agent if agent in AGENTS.values() else register(agent)
     near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
     hint = f"did you mean {known[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
-    raise ValueError(f"no algorithm is called {name!r}; {hint} --import MODULE imports one that registers others")
+    raise ValueError(f"no algorithm is called {name!r}; {hint}; --import MODULE imports one that registers others")
 
 
 def agent_of_file(name: Any, path: str | Path) -> type[Agent]:

@@ -17,7 +17,17 @@ from jax import Array
 from rejeu import spaces, xla
 from rejeu.agents import model_files
 from rejeu.agents.base import BaseAgent, Best, Resumed, whole_seed
-from rejeu.agents.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_files, run_folder
+from rejeu.agents.run_files import (
+    PER_ENV,
+    SCALARS,
+    RowFiles,
+    RunHeader,
+    SavedBest,
+    SavedRun,
+    run_files,
+    run_folder,
+    versions,
+)
 from rejeu.agents.training import fill_windows
 from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
@@ -165,6 +175,13 @@ def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
 
 def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
     """Returns how a run resumes whose environments were restored."""
+    if header.versions != versions():
+        names = "rejeu, JAX or Optax"
+        return Resumed(
+            agent.run.step,
+            False,
+            f"as it was saved, but by another version of {names}, so results may differ in their last bits",
+        )
     here = xla.threads()
     before = here if header.threads is None else header.threads
     if before == here:

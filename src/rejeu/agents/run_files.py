@@ -25,6 +25,7 @@ from typing import Annotated, Any
 import jax
 import msgspec
 import numpy as np
+import optax
 from filelock import FileLock, Timeout
 from msgspec import Meta
 
@@ -113,7 +114,7 @@ class RunFolder:
                 path.unlink(missing_ok=True)
             for path in run_files(self.folder):
                 if step_of(path) > self.agent.run.step:  # a damaged one, which resume has skipped
-                    path.rename(path.with_name(f"{path.name}.damaged"))
+                    path.replace(path.with_name(f"{path.name}.damaged"))
         except BaseException:
             self.close()
             raise
@@ -222,6 +223,15 @@ def step_of(path: Path) -> int:
     return int(found[1])
 
 
+UPDATES = 2
+"""Number of the arithmetic of updates; a change that rounds anything differently raises it."""
+
+
+def versions() -> dict[str, Any]:
+    """Returns the versions that results depend on in their last bits."""
+    return {"updates": UPDATES, "jax": jax.__version__, "optax": optax.__version__}
+
+
 class RunHeader(msgspec.Struct):
     """What the header of a run's checkpoint holds in addition to that of a model file; unknown fields are ignored."""
 
@@ -236,6 +246,8 @@ class RunHeader(msgspec.Struct):
     own_env: Any = False
     threads: Annotated[int, Meta(ge=1, le=1024)] | None = None
     """Of JAX's device; missing in older checkpoints."""
+    versions: Any = None
+    """:func:`versions` of the process that wrote it; missing in older checkpoints."""
 
 
 class SavedBest(msgspec.Struct):
@@ -323,6 +335,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "backend": run.env.backend,
         "own_env": agent.made_from_id,
         "threads": xla.threads(),
+        "versions": versions(),
         "run": json_arrays.encode(everything, arrays, "run"),
     }
     return header, arrays

@@ -18,6 +18,8 @@ from typing import Any
 
 import optax
 
+from rejeu.core import Elementwise
+
 WEIGHT_DECAY = 1e-4
 """Decoupled weight decay of ``"adamw"``, which is multiplied by the learning rate as well."""
 RMSPROP_DECAY = 0.99
@@ -73,7 +75,7 @@ def make(optimizer: Any, **adam: float) -> optax.GradientTransformation:
         adam: the algorithm's settings of Adam (``b1``, ``eps``); an optimizer of your own has its own.
     """
     if isinstance(optimizer, str):
-        return OPTIMIZERS[optimizer](**adam)
+        return Elementwise(*OPTIMIZERS[optimizer](**adam))
     given = optimizer if isinstance(optimizer, optax.GradientTransformation) else optimizer(1.0)
     return optax.chain(given, optax.scale(-1.0))  # Optax adds updates; the direction is subtracted
 

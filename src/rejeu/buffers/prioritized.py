@@ -1,4 +1,4 @@
-"""Prioritised replay: steps are drawn in proportion to how wrong the critic was about them.
+"""Prioritized replay: steps are drawn in proportion to how wrong the critic was about them.
 
 Source: Schaul et al. 2015, "Prioritized Experience Replay" (arXiv 1511.05952), the proportional variant. A step with TD
 error ``delta`` has priority ``p = (|delta| + epsilon)^alpha`` and is drawn with probability ``P = p / sum p``; its loss is

@@ -152,7 +152,9 @@ class RolloutBuffer:
                     f"{list(array.shape)}"
                 )
         if n == self.n_steps:
-            raise ValueError(f"the rollout has {n} steps, and {self.n_steps} are learnt from as soon as they are there")
+            raise ValueError(
+                f"the rollout has {n} steps, and {self.n_steps} are learned from as soon as they are complete"
+            )
         for name, array in own.items():
             array[:n] = arrays[name]
         self.length = n

@@ -27,3 +27,6 @@ if not TYPE_CHECKING:
         if name not in __all__:
             raise AttributeError(f"module 'rejeu.envs' has no attribute {name!r}")
         return getattr(importlib.import_module("rejeu.envs.make"), name)
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

@@ -137,8 +137,13 @@ class NonFiniteMonitor:
         return len(self._unread)
 
     def follow(self, state: PackedState) -> None:
-        """Copies the state unless it is the one that the recorded calls led to; to be called before an update."""
+        """Copies the state unless it is the one that the recorded calls led to; to be called before an update.
+
+        Raises:
+            NonFiniteUpdate: as :meth:`read`, if the state was replaced while updates were still to be looked at.
+        """
         if state is not self._newest and not self._skips:
+            self.read()
             self._begin(state)
 
     def record(self, state: PackedState, function: Callable[..., Any], *arguments: Any, readings: Any = None) -> None:

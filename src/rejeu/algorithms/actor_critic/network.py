@@ -22,7 +22,7 @@ from rejeu.spaces import Leaf, check_action, leaves
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
 POLICY_GAIN, VALUE_GAIN, HIDDEN_GAIN = 0.01, 1.0, math.sqrt(2.0)
-"""Gains of the orthogonal initialisation: a policy that begins nearly the same everywhere explores evenly."""
+"""Gains of the orthogonal initialization: a policy that begins nearly the same everywhere explores evenly."""
 
 
 SDE_EPSILON = 1e-6

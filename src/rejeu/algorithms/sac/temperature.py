@@ -16,14 +16,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from jax import Array
 
+from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import TD_ERROR, Metrics, PyTree, descend
 from rejeu.validation import coerce, number, whole
 
-OPTIMIZER = optax.scale_by_adam()
+OPTIMIZER = optimizers.make("adam")
 """Of the temperature."""
 
 

@@ -44,7 +44,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
     ``sigma=1``, 89 in 100 for ``sigma=2`` and none for ``sigma=3``.
 
     The 500th step is a time limit and no end of the task: nothing in the position tells that it comes, so a value that
-    stopped there could not be learnt. Learners go on bootstrapping from it, as the course from which the environment is
+    stopped there could not be learned. Algorithms bootstrap from it, as the course from which the environment is
     taken (``Bille_Env``) does by ignoring all ends. Mended against the course: the position that is tested for having
     left is the new one and not that of the step before; leaving therefore costs at once, and the time limit comes after
     500 steps rather than 501; a ball that leaves in the last step is lost; the episode is not reset behind the agent's
