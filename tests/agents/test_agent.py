@@ -273,7 +273,7 @@ def test_of_episodes_that_end_together_the_best_counts():
 
 def test_no_best_weights_yet_says_how_many_episodes_it_takes():
     agent = small_sac(counters(1), best_window=3)
-    with pytest.raises(ValueError, match="kept once 3 episodes of training ended"):
+    with pytest.raises(ValueError, match="kept after 3 episodes of training"):
         agent.restore_best()
 
 

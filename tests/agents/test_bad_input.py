@@ -155,7 +155,7 @@ def test_a_stable_baselines3_file_is_named_as_foreign(tmp_path):
 
     with zipfile.ZipFile(tmp_path / "sb3.zip", "w") as file:
         file.writestr("data", "{}")
-    with pytest.raises(CheckpointError, match=r"not a complete safetensors file.*of another program"):
+    with pytest.raises(CheckpointError, match=r"not a complete safetensors file.*from another program"):
         rejeu.SAC.load(tmp_path / "sb3.zip")
 
 

@@ -15,6 +15,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import recurrent_ppo
+from rejeu.algorithms.actor_critic import action_kind
 from rejeu.algorithms.recurrent_ppo import Cell, Config, RecurrentActorCritic, RecurrentConfig
 from rejeu.core import Clock, Rollout
 from rejeu.envs.make import InProcess
@@ -538,7 +539,7 @@ IMAGES = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 def test_policy_and_value_may_read_images_through_convolutions_of_their_own():
     """What one encoder sees moves its own cell's memory, and nothing of the other's."""
     shape = RecurrentConfig(lstm_hidden_size=SIZE, net_arch=(5,), share_features_extractor=False)
-    kind = recurrent_ppo.action_kind(gym.spaces.Discrete(2))
+    kind = action_kind(gym.spaces.Discrete(2))
     network = RecurrentActorCritic(jax.random.PRNGKey(0), leaves(IMAGES), kind, shape)
     blind = jax.tree.map(jnp.zeros_like, network.value_encoder)
     other = eqx.tree_at(lambda n: n.value_encoder, network, blind)
@@ -610,7 +611,7 @@ def test_a_bad_setting_is_refused_with_the_fix(settings, error, message):
 def test_the_network_reads_through_the_encoder():
     """A Discrete observation is one-hot encoded before the cell."""
     shape = RecurrentConfig(lstm_hidden_size=SIZE, net_arch=(5,))
-    kind = recurrent_ppo.action_kind(gym.spaces.Discrete(2))
+    kind = action_kind(gym.spaces.Discrete(2))
     network = RecurrentActorCritic(jax.random.PRNGKey(0), leaves(gym.spaces.Discrete(7)), kind, shape)
     assert network.cells[0].inputs.shape == (7, 4 * SIZE)
     memory = network.remember(network.empty(2), np.int32([0, 6]), np.zeros(2, bool))

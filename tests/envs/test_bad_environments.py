@@ -18,7 +18,7 @@ from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
 from rejeu.envs.workers import pool
 from rejeu.errors import BadEnvironmentError
-from rejeu.loops import run
+from rejeu.loops import checks
 from rejeu.loops.checks import check_finite
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
@@ -263,7 +263,7 @@ def test_observations_far_outside_of_the_declared_bounds_are_told_once(algorithm
 
 def test_observations_are_compared_with_their_bounds_at_steps_twice_as_far_apart_each_time(monkeypatch):
     looked = []
-    monkeypatch.setattr(run.validation, "far_outside", lambda space, obs: looked.append(True))
+    monkeypatch.setattr(checks.validation, "far_outside", lambda space, obs: looked.append(True))
     steps = []
     agent = small_sac(Good(), learning_starts=999)
     agent.learn(200, lambda agent, turn: steps.extend([turn.step] * len(looked)) or looked.clear())

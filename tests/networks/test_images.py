@@ -260,7 +260,7 @@ class Shuffled(gym.ObservationWrapper):
 )
 def test_observations_that_cannot_be_rebuilt_are_refused(env):
     agent = rejeu.SAC("MlpPolicy", env(), frame_stack=3, **SMALL)
-    with pytest.raises(ValueError, match="not made of the frames of the steps before"):
+    with pytest.raises(ValueError, match="does not consist of the frames of the steps before"):
         agent.learn(10)
 
 
