@@ -1,9 +1,9 @@
-"""What was done to environments since they were made, recorded so that it can be done again.
+"""A log of the actions and resets of environments since their creation, which can be replayed.
 
-Environments that keep their state to themselves, but are deterministic given their seed and the actions, are restored by
-replaying them. A log is a sequence of operations: a step of all environments, a step of some, a reset of all, a reset of some.
-An operation is stored as one byte for its kind, a bit per environment where it is for some, and the actions; blocks of about a
-megabyte are compressed.
+Some environments do not expose their state, but are deterministic given their seed and the actions. They are restored
+by replaying the log. A log is a sequence of operations: a step of all environments, a step of some, a reset of all, or
+a reset of some. An operation is stored as one byte for its kind, one bit per environment if it concerns only some, and
+the actions. Blocks of about a megabyte are compressed.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from rejeu.validation import whole
 
 STEP, STEP_SOME, RESET, RESET_SOME = range(4)
 BLOCK = 2**20
-"""Bytes of operations that are compressed together."""
+"""Size of a block before compression, in bytes."""
 MOST_STEPS = 500_000
-"""Environment steps after which a log is full; replaying takes 10 to 60 microseconds a step."""
+"""Environment steps after which a log is full. Replaying takes 10 to 60 microseconds per step."""
 MOST_IMAGE_STEPS = 100_000
-"""The same for environments that draw images, which take about ten times as long."""
+"""The same for environments with image observations, which take about ten times as long."""
 MOST_BYTES = 2**24
-"""Bytes of actions after which a log is full, whatever the number of steps."""
+"""Bytes of actions after which a log is full, regardless of the number of steps."""
 MANY_OPERATIONS = 20_000
-"""Operations from which on replaying shows a progress bar."""
+"""Number of operations from which a progress bar is shown during replay."""
 
 
 class Operation(NamedTuple):
-    """One call of the environments."""
+    """One step or reset of the environments."""
 
     which: np.ndarray | None
     """Indices of the environments, ``int32 (k,)``; None for all."""
     action: np.ndarray | None
-    """Their actions ``(k, ...)`` in the environment's own range; None for a reset."""
+    """Their actions ``(k, ...)`` in the range of the action space; None for a reset."""
 
 
 class ActionLog:
-    """The operations on ``n_envs`` environments since they were made. Mutable."""
+    """The operations on ``n_envs`` environments since their creation. Mutable."""
 
     def __init__(self, n_envs: int, action_space: gym.Space, most_steps: int = MOST_STEPS) -> None:
         self.n_envs = n_envs
         self.n_steps = 0
-        """Environment steps taken, over all environments."""
+        """Number of steps, summed over the environments."""
         self.n_operations = 0
         example = action_scaler(action_space)(random_action(action_space, 1, np.random.default_rng(0)))
         self._space, self._dtype, self._shape = action_space, example.dtype, example.shape[1:]
@@ -60,24 +60,24 @@ class ActionLog:
 
     @property
     def most_operations(self) -> int:
-        """The most operations that a log can hold: a step of one environment each, and a reset after each."""
+        """Maximum number of operations of a log: steps of single environments, each followed by a reset."""
         return 4 * self._most_steps + 2
 
     @property
     def is_full(self) -> bool:
-        """Whether so much was recorded that replaying it would take too long."""
+        """Whether the log is so long that a replay would take too much time."""
         return self.n_steps >= self._most_steps
 
     @property
     def is_dropped(self) -> bool:
-        """Whether nothing is recorded any more, since the log was full long ago and nobody has reset the environments."""
+        """Whether recording has stopped: the environments were not reset for a long time after the log was full."""
         return self.n_steps >= 2 * self._most_steps
 
     def step(self, action: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
-        """Records a step and returns the actions in the form in which they are recorded, ``(k, ...)``.
+        """Records a step and returns the actions as they are recorded, ``(k, ...)``.
 
         Args:
-            action: of all environments, or of those in ``which``.
+            action: actions of all environments, or of those in ``which``.
             which: indices of the environments that are stepped; None for all.
         """
         rows = self.n_envs if which is None else len(which)
@@ -113,7 +113,7 @@ class ActionLog:
         """Yields the operations of a log that :meth:`to_plain` returned, oldest first.
 
         Raises:
-            ValueError: if it is damaged, or of other environments.
+            ValueError: if the log is corrupted, or belongs to other environments.
         """
         n_flags = (self.n_envs + 7) // 8
         longest = BLOCK + 1 + n_flags + self.n_envs * self._row_bytes
@@ -139,10 +139,10 @@ class ActionLog:
 
 
 def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[Operation]:
-    """Yields the operations of a saved log, with a progress bar on a terminal if they are many.
+    """Yields the operations of a saved log. On a terminal, a progress bar is shown for long logs.
 
     Raises:
-        ValueError: if the log is damaged.
+        ValueError: if the log is corrupted.
     """
     n = whole("n_operations", saved["n_operations"], least=0, most=log.most_operations)
     console = Console(stderr=True)
@@ -159,7 +159,7 @@ def _compressed(data: bytearray) -> np.ndarray:
 
 
 def _expanded(block: Any, longest: int) -> bytes:
-    """Returns the bytes of a block, of which there may be at most ``longest``."""
+    """Returns the decompressed bytes of a block, at most ``longest``."""
     if not isinstance(block, np.ndarray) or block.dtype != np.uint8 or block.ndim != 1:
         raise ValueError("a block of the record of actions is no array of bytes")
     reader = zlib.decompressobj()

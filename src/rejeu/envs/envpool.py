@@ -58,9 +58,9 @@ class EnvPool(VectorEnv):
         # Environment i gets seed + i, an int32 in EnvPool.
         taken = seed % (2**31 - self.n_envs) if isinstance(seed, int) else list(seed)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its spaces are declared with bounds that float32 rounds
+            warnings.simplefilter("ignore")  # the declared bounds of its spaces are rounded to float32
             pool = import_envpool().make_gymnasium(self.env_id, num_envs=self.n_envs, seed=taken)
-            pool.observation_space, pool.action_space  # noqa: B018 - made when first asked for, and kept
+            pool.observation_space, pool.action_space  # noqa: B018 - cached at the first access
         return pool
 
     def _new_log(self) -> ActionLog:
@@ -191,14 +191,14 @@ def envpool_knows(env_id: str) -> bool:
 
 
 def reward_threshold(env_id: str, declared: float | None) -> float | None:
-    """Returns Gymnasium's reward threshold of an environment, ``declared`` for one that Gymnasium does not have."""
+    """Returns Gymnasium's reward threshold of an environment, or ``declared`` if Gymnasium does not have it."""
     if env_id in gym.registry:
         return gym.registry[env_id].reward_threshold
     return None if provider(env_id) is not None else declared
 
 
 def _corrected_bounds(space: gym.Space) -> gym.Space:
-    """Returns a space without EnvPool's bounds of the smallest positive and the largest float."""
+    """Returns a space with infinite bounds where EnvPool declares the smallest positive and the largest float."""
     if isinstance(space, gym.spaces.Dict):
         return gym.spaces.Dict({key: _corrected_bounds(part) for key, part in space.spaces.items()})
     if isinstance(space, gym.spaces.Box) and space.dtype.kind == "f":

@@ -1,4 +1,4 @@
-"""Reward functions of goal environments, which hindsight replay calls with other goals."""
+"""Reward functions of goal environments, which HER calls with relabeled goals."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ class GoalFunctions(NamedTuple):
     reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
     """Returns the rewards."""
     terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    """Returns which steps are terminal; None if the environment does not define it. Steps then keep their own."""
+    """Returns which steps are terminal. If this is None, relabeled steps keep their termination flags."""
 
 
 def parking_reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
     """Returns ``-sqrt(weights . |achieved - desired|)``, the reward of ``parking-v0`` without its collision penalty.
 
-    Shapes ``(..., 6)`` to ``(...)``. Equal to highway-env's ``compute_reward`` with the default configuration; like it,
-    it leaves out the -5 that ``step`` adds on a collision.
+    Shapes ``(..., 6)`` to ``(...)``. It is equal to highway-env's ``compute_reward`` with the default configuration,
+    which does not include the -5 that ``step`` adds on a collision either.
     """
     return -np.sqrt(np.abs(achieved - desired) @ PARKING_WEIGHTS.astype(achieved.dtype))
 
 
 def goal_functions(env: Any) -> GoalFunctions | None:
-    """Returns the goal functions of a Gymnasium environment, or None where it has no ``compute_reward``.
+    """Returns the goal functions of a Gymnasium environment, or None if it has no ``compute_reward``.
 
-    ``compute_terminated`` is taken along where the environment has one. Whether its functions accept batches is found
-    out at the first call (see :func:`over_batches`).
+    ``compute_terminated`` is included if the environment has it. Whether the functions accept batches is determined at
+    the first call, see :func:`over_batches`.
     """
     reward = attribute(env, "compute_reward")
     if reward is None:
@@ -48,7 +48,7 @@ def goal_functions(env: Any) -> GoalFunctions | None:
 
 
 def attribute(env: Any, name: str) -> Any:
-    """Returns an attribute of an environment or of one of its wrappers, or None."""
+    """Returns an attribute of an environment or of one of its wrappers, or None if there is none."""
     try:
         return env.get_wrapper_attr(name)
     except AttributeError:
@@ -58,11 +58,11 @@ def attribute(env: Any, name: str) -> Any:
 def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Returns ``function(achieved, desired, info)`` as a function of batches of goals.
 
-    At the first call with two rows or more, it is called once with the whole batch and once for each of the first eight
-    rows; if the two agree it is taken to be vectorised from then on, otherwise it is called row by row.
+    The first call with at least two rows evaluates ``function`` once with the whole batch and once for each of the
+    first eight rows. If the results agree, it is treated as vectorized from then on. Otherwise it is called row by row.
 
     Raises:
-        BadEnvironmentError: by the function that is returned, if what ``function`` gives of one goal is no number.
+        BadEnvironmentError: by the returned function, if ``function`` does not return a number for a single goal.
     """
     vectorised: bool | None = None
 
@@ -97,7 +97,7 @@ def _whole(
     n = min(len(achieved), 8)
     try:
         whole = np.asarray(function(achieved, desired, {}))
-    except Exception:  # whatever a function that expects one row says of many: it is then called row by row
+    except Exception:  # a function of one row can raise anything for a batch; it is then called row by row
         return None
     if whole.shape != (len(achieved),):
         return None

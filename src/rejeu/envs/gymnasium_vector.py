@@ -55,9 +55,9 @@ class GymnasiumVector(VectorEnv):
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
         self._flags = (np.zeros(self.n_envs, bool),) * 2
-        """Environments that terminated, and that were truncated, and have not been reset since; none with automatic resets."""
+        """Flags of terminated and of truncated environments that await a reset. All False with automatic resets."""
         self._desynced = np.zeros(self.n_envs, bool)
-        """Environments that were stepped although they were not active, and have not been reset since."""
+        """Environments that were stepped while inactive, and have not been reset since."""
         self.n_steps = 0
         """Number of steps of the vector."""
 
@@ -192,7 +192,7 @@ def is_raised_by_vector(error: Exception) -> bool:
 
 
 def find_invalid_env(error: Exception, vector: Any) -> tuple[int | None, str | None]:
-    """Returns the index of the environment whose value made a vector raise, and what is wrong with it, where known."""
+    """Returns the index of the environment whose value made a vector raise, and a description, each None if unknown."""
     if isinstance(vector, AsyncVectorEnv):
         return next((i for i, pipe in enumerate(vector.parent_pipes) if pipe is None), None), None
     for i, obs in enumerate(getattr(vector, "_env_obs", ())):
@@ -209,17 +209,17 @@ def find_invalid_env(error: Exception, vector: Any) -> tuple[int | None, str | N
 
 
 def worker_ended(env: AsyncVectorEnv) -> WorkerError:
-    """Ends all workers and returns the error that names the one that ended by itself."""
+    """Terminates all workers, and returns an error that names those that exited unexpectedly."""
     gone = []
     for i, process in enumerate(env.processes):
-        process.join(0.2)  # its pipe may close a moment before it is gone
+        process.join(0.2)  # the pipe may close shortly before the process exits
         if process.exitcode is not None:
             gone.append(f"that of environment {i} with exit code {process.exitcode}")
     for process in env.processes:
         process.terminate()
     for process in env.processes:
         process.join()
-    env.closed = True  # closing it in the ordinary way would wait for answers
+    env.closed = True  # its close method would wait for answers
     return WorkerError(
         f"a worker process ended by itself: {'; '.join(gone) or 'unknown which'}; what it printed may say why"
     )

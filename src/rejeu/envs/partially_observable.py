@@ -1,4 +1,4 @@
-"""An environment that shows only part of its state: ``rejeu/CartPoleNoVelocity-v0``."""
+"""A partially observable environment: ``rejeu/CartPoleNoVelocity-v0``."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from gymnasium.wrappers import TransformObservation
 
 
 def cart_pole_without_velocities(render_mode: str | None = None) -> gym.Env:
-    """Returns Gymnasium's CartPole showing the cart's position and the pole's angle, not how fast they change.
+    """Returns Gymnasium's CartPole without velocities: only cart position and pole angle are observed.
 
-    What to do depends on the velocities, so a policy must remember: an old test of memory (Wierstra et al. 2007, "Solving
-    Deep Memory POMDPs with Recurrent Policy Gradients").
+    The optimal action depends on the velocities, so a policy needs memory. This is an early benchmark of recurrent
+    policies (Wierstra et al. 2007, "Solving Deep Memory POMDPs with Recurrent Policy Gradients").
 
     >>> import rejeu
     >>> gym.make("rejeu/CartPoleNoVelocity-v0").observation_space.shape

@@ -16,21 +16,21 @@ from gymnasium.envs.registration import EnvSpec
 from rejeu.errors import MissingExtra
 
 PLAIN_ID = re.compile(r"[\w./-]{1,200}")
-"""Ids that are looked up; one with a colon makes Gymnasium import a module."""
+"""Pattern of ids that are looked up. An id with a colon makes Gymnasium import a module."""
 PLAIN_WORD = re.compile(r"[\w-]{0,60}")
-"""Strings that are neither a path nor importable."""
+"""Pattern of strings that are neither paths nor importable."""
 LARGEST = 1e6
-"""Largest number in the arguments of an environment from a file; larger ones could request any amount of memory."""
+"""Largest number in the arguments of an environment from a file. Larger ones could allocate any amount of memory."""
 MAKES_OWN = frozenset(("id", "env_id", "render_mode", "disable_env_checker", "vectorization_mode"))
 """Arguments of ``gymnasium.make`` itself."""
 ENVPOOL_SIZE = "about 770 MB with its assets"
-"""Disk space of EnvPool 1.2.5 with the packages of assets that it depends on."""
+"""Disk space of EnvPool 1.2.5, including the asset packages that it depends on."""
 MOST_KWARGS = 100
 """Maximum number of keyword arguments of an environment from a file."""
 
 
 class Provider(NamedTuple):
-    """A package whose import registers environments, and rejeu's extra that installs it, empty if there is none."""
+    """A package whose import registers environments, and rejeu's extra that installs it (empty if there is none)."""
 
     module: str
     package: str
@@ -47,7 +47,7 @@ PROVIDERS: dict[tuple[str, ...], Provider] = {
         "gymnasium_robotics", "gymnasium-robotics", "robotics"
     ),
 }  # fmt: skip
-"""Packages that register environments, by the prefixes of the ids."""
+"""Packages that register environments, by the prefixes of their ids."""
 
 NEEDS = {
     "Box2D": Provider("Box2D", "box2d", "box2d"),
@@ -85,14 +85,14 @@ def _without_notice(module: str) -> None:
 
 
 def is_plain_id(env_id: object) -> bool:
-    """Returns whether this is an id without an import, which a file may contain."""
+    """Returns whether this is an id without a module to import, which is allowed in a file."""
     return isinstance(env_id, str) and PLAIN_ID.fullmatch(env_id) is not None
 
 
 def are_plain(env_kwargs: object) -> bool:
-    """Returns whether a file may contain these keyword arguments of an environment.
+    """Returns whether these keyword arguments of an environment are allowed in a file.
 
-    Allowed are booleans, words, and numbers up to a million; no paths, and nothing importable.
+    Booleans, words, and numbers up to a million are allowed. Paths and importable names are not.
 
     >>> are_plain({"sigma": 2.0, "map_name": "8x8"}), are_plain({"xml_file": "/tmp/evil.xml"}), are_plain({"n": 10**9})
     (True, False, False)
@@ -109,14 +109,14 @@ def are_plain(env_kwargs: object) -> bool:
 def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return PLAIN_WORD.fullmatch(value) is not None
-    return isinstance(value, bool | int | float) and -LARGEST <= value <= LARGEST  # which NaN is not
+    return isinstance(value, bool | int | float) and -LARGEST <= value <= LARGEST  # False for NaN
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """Returns ``gymnasium.make(env_id)`` without its passive checker, after importing the package that registers the id.
 
     Raises:
-        ValueError: if no such environment is known, with the nearest names.
+        ValueError: if the environment is unknown, with similar names.
         MissingExtra: if a package that it needs is not installed.
     """
     if not register(env_id):
@@ -140,7 +140,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 
 def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
-    """Returns a function that makes the environment. It can be pickled, together with the registration."""
+    """Returns a function that makes the environment. It can be pickled, and includes the registration."""
     return _Maker(env_id, kwargs, gym.registry.get(env_id))
 
 

@@ -1,4 +1,4 @@
-"""Seeds of many environments: one number for all of them, or one for each."""
+"""Seeds of vector environments: one number for all environments, or one for each."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 Seed = int | Sequence[int] | None
-"""A number, from which environment i takes the i-th after it; one number for each environment; or None."""
+"""A number ``seed``, so that environment i is seeded with ``seed + i``; one number for each environment; or None."""
 END = 2**31 - 1
-"""Seeds for single environments are below it: EnvPool takes 31 bits."""
+"""Exclusive upper bound of the seeds of single environments, because EnvPool uses 31 bits."""
 
 
 def checked(seed: Any, n_envs: int) -> Seed:
-    """Returns a seed for ``n_envs`` environments, several as a tuple of ints.
+    """Validates a seed for ``n_envs`` environments and returns it, a sequence as a tuple of ints.
 
     Raises:
-        ValueError: for a sequence that has not one whole number from 0 to 2**31 - 2 for each environment.
+        ValueError: if a sequence does not contain one integer from 0 to 2**31 - 2 for each environment.
     """
     if seed is None:
         return None
@@ -32,7 +32,7 @@ def checked(seed: Any, n_envs: int) -> Seed:
 
 
 def for_each(seed: Seed, n_envs: int) -> list[int | None]:
-    """Returns the seed of every environment.
+    """Returns the seed of each environment.
 
     >>> for_each(5, 3), for_each((7, 7, 1), 3), for_each(None, 2)
     ([5, 6, 7], [7, 7, 1], [None, None])

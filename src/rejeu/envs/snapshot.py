@@ -1,13 +1,14 @@
 """Snapshots of running environments, so that a run resumes in the middle of an episode.
 
-Supported are Gymnasium's classic control and MuJoCo environments, the ball, the wrappers of Gymnasium and rejeu listed
-here, and any environment or wrapper with the two methods ::
+Supported are Gymnasium's classic control and MuJoCo environments, ``rejeu/Ball-v0``, the wrappers of Gymnasium and
+rejeu that are listed here, and any environment or wrapper with the two methods ::
 
     get_state() -> a dict of numbers, strings, lists, tuples, dicts and arrays
     set_state(state)
 
-which then cover everything inside, including random numbers. A wrapper with the methods ``get_wrapper_state`` and
-``set_wrapper_state`` covers itself only. Box2D and highway-env are not supported: their worlds are not plain data.
+They must include the state of all wrapped environments and of the random number generators. The methods
+``get_wrapper_state`` and ``set_wrapper_state`` of a wrapper concern only the wrapper itself. Box2D and highway-env are
+not supported, because their state is not plain data.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ STATELESS = (
 )
 """Wrappers without state."""
 ABSENT = "absent"
-"""Value of an attribute that does not exist yet, as ``last_u`` before the first step."""
+"""Value of an attribute that does not exist yet, such as ``last_u`` before the first step."""
 Integer = int | None | Literal["absent"]
 Number = float | None | Literal["absent"]
 
 
 def numbers(n: int) -> Any:
-    """Returns the type of an attribute that holds ``n`` finite numbers, or none yet."""
+    """Returns the type of an attribute with ``n`` finite numbers, or None or missing before the first reset."""
     finite = Annotated[float, Meta(ge=-1e300, le=1e300)]
     return Annotated[list[finite], Meta(min_length=n, max_length=n)] | None | Literal["absent"]
 
@@ -65,7 +66,7 @@ REMEMBERED: dict[type, dict[str, Any]] = {
     classic_control.PendulumEnv: {"state": numbers(2), "last_u": Number},
     classic_control.AcrobotEnv: {"state": numbers(4)},
 }
-"""Attributes of wrappers and environments that hold their whole state except random numbers, and their types in a file."""
+"""Attributes with the full state of wrappers and environments, except for random numbers, and their types in a file."""
 MUJOCO = "gymnasium.envs.mujoco."
 
 
@@ -121,7 +122,7 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
             for name in types:
                 if not (isinstance(state[name], str) and state[name] == ABSENT):
                     setattr(layer, name, state[name])
-            if isinstance(layer, wrappers.PassiveEnvChecker):  # it was checked when the run began
+            if isinstance(layer, wrappers.PassiveEnvChecker):  # the environment was checked at the start of the run
                 vars(layer).update({name: True for name in vars(layer) if name.startswith("checked_")})
         elif is_mujoco(layer):
             _put_mujoco(layer, state)
@@ -143,7 +144,7 @@ def check_count(states: Any, n_envs: int) -> None:
 
 
 def is_over(env: gym.Env) -> bool:
-    """Returns whether an environment must be reset before it can be stepped, as far as its layers say so."""
+    """Returns whether an environment must be reset before the next step, as far as its layers report it."""
     layer = env
     while isinstance(layer, gym.Wrapper):
         if saves_itself(layer) and getattr(layer, "needs_reset", False):
@@ -159,10 +160,10 @@ def is_over(env: gym.Env) -> bool:
 
 
 def check_types(layer: gym.Env, state: Mapping[str, Any], types: Mapping[str, Any]) -> None:
-    """Checks attributes of an environment or wrapper, which come from a file.
+    """Checks attributes of an environment or wrapper that were read from a file.
 
     Raises:
-        ValueError: if names differ, or a value is not of its type.
+        ValueError: if names differ, or a value has the wrong type.
     """
     if {*state} != {*types}:
         raise ValueError(f"the state of {type(layer).__name__} has {sorted(state)}, expected {sorted(types)}")
@@ -175,16 +176,16 @@ def check_types(layer: gym.Env, state: Mapping[str, Any], types: Mapping[str, An
 
 
 def _builtin(value: Any) -> Any:
-    """Returns arrays and NumPy's numbers as lists and numbers of Python."""
+    """Converts arrays and NumPy scalars to Python lists and numbers."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return [_builtin(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def answers_for_itself(layer: gym.Env) -> bool:
-    """Returns whether an environment or wrapper has ``get_state`` and ``set_state`` of its own."""
+    """Returns whether an environment or wrapper defines ``get_state`` and ``set_state``."""
     has = callable(getattr(type(layer), "get_state", None)) and callable(getattr(type(layer), "set_state", None))
-    return has and not is_mujoco(layer)  # whose set_state is of another form
+    return has and not is_mujoco(layer)  # MuJoCo's set_state has a different signature
 
 
 def saves_itself(layer: gym.Env) -> bool:
@@ -194,7 +195,7 @@ def saves_itself(layer: gym.Env) -> bool:
 
 
 def is_mujoco(layer: gym.Env) -> bool:
-    """Returns whether an environment is one of Gymnasium's own on MuJoCo."""
+    """Returns whether an environment is one of Gymnasium's MuJoCo environments."""
     return type(layer).__module__.startswith(MUJOCO)
 
 
@@ -216,7 +217,7 @@ def _put_mujoco(env: Any, state: dict[str, Any]) -> None:
         raise ValueError(f"the state is of another model than {type(env).__name__}'s")
     mujoco.mj_setState(env.model, env.data, given, kind)
     mujoco.mj_forward(env.model, env.data)
-    mujoco.mj_setState(env.model, env.data, given, kind)  # what the solver starts from was moved by mj_forward
+    mujoco.mj_setState(env.model, env.data, given, kind)  # mj_forward changed the warm start of the solver
 
 
 def _rng(env: gym.Env) -> Any:

@@ -1,4 +1,4 @@
-"""A time limit that counts as a terminal state."""
+"""A wrapper that treats time limits as terminal states."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import gymnasium as gym
 
 
 class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):
-    """Reports an episode that is cut off as one that has terminated, so that nothing is bootstrapped from its end.
+    """Reports truncated episodes as terminated, so that agents do not bootstrap from the last observation.
 
-    Some older exercises treat the limit so: their last transition has no next state. It is right where the limit belongs to
-    the task, and the observation tells how much time is left. Elsewhere it teaches that the same observation is worth
-    little at one time and much at another; without it agents bootstrap through limits.
+    Some older exercises treat the time limit this way: the last transition has no next state. This is correct if the
+    limit is part of the task and the observation contains the remaining time. Otherwise, the same observation has a low
+    value at one time and a high value at another. Without this wrapper, agents bootstrap through time limits.
 
     >>> env = TimeLimitTerminates(gym.make("MountainCar-v0", max_episode_steps=2))
     >>> _ = env.reset(seed=0)
@@ -25,6 +25,6 @@ class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Returns the environment's step, with truncated episodes as terminated ones."""
+        """Steps the environment, and reports truncation as termination."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return obs, reward, terminated or truncated, False, info

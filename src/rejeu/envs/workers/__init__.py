@@ -1,1 +1,1 @@
-"""Environments in processes of their own."""
+"""Environments in worker processes."""

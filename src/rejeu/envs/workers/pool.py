@@ -1,7 +1,7 @@
-"""Environments in worker processes: started safely beside JAX, waited for no longer than is said, started anew if asked.
+"""Environments in worker processes, with timeouts and optional restarts.
 
-A process that uses JAX has threads, and forking it is unsafe, so workers are forked from a server that has none (Linux) or
-started anew (elsewhere). Both run the main script again, up to its ``if __name__ == "__main__":``.
+A process that uses JAX has threads, so forking it is unsafe. On Linux, workers are forked from a server process without
+threads. On other systems they are spawned. Both run the main script again, up to its ``if __name__ == "__main__":``.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from rejeu.errors import WorkerError
 
 START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 TIMEOUT = 300.0
-"""Seconds that a worker has for a step or a reset, unless said otherwise."""
+"""Default timeout of a step or a reset, in seconds."""
 START_SECONDS = 600.0
-"""How long a worker has to make its environment, where there is a time-out at all."""
+"""Minimum timeout for making an environment, in seconds. It does not apply if there is no timeout."""
 CLOSE_SECONDS = 5.0
-"""How long the processes have to end before they are ended."""
+"""Seconds that the processes have to exit before they are terminated."""
 RESTARTED = "worker_restarted"
-"""Where an info says why the worker of an environment was started anew."""
+"""Key of ``info`` with the reason why the worker of an environment was restarted."""
 
 
 class Restarted(NamedTuple):
-    """Stands for the answer of a worker that was lost and has been replaced."""
+    """Returned instead of the answer of a worker that was lost and has been replaced."""
 
     why: str
 
 
 class Lost(Exception):
-    """A worker process ended by itself, or gave no answer in time; the message says which of them, and at what."""
+    """A worker process exited unexpectedly or timed out. The message states which worker and which request."""
 
 
 class Worker:
-    """A process with one environment in it, as this process sees it."""
+    """A handle of a worker process, which runs one environment."""
 
     def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, *shared: Any) -> None:
-        """Starts the process; ``shared`` is handed to :func:`rejeu.envs.workers.process.serve`."""
+        """Starts the process. ``shared`` is passed to :func:`rejeu.envs.workers.process.serve`."""
         self.number = number
         self.asked: str | None = "make"
-        """What it has not yet answered; None if nothing."""
+        """The pending request, None if there is none."""
         self._ended: str | None = None
         self.pipe, theirs = context.Pipe()
         arguments = (theirs, CloudpickleWrapper(make), number, *(shared or (None,)))
@@ -63,16 +63,19 @@ class Worker:
         theirs.close()
 
     def ask(self, request: str, *arguments: Any) -> None:
-        """Sends a request, whose answer is to be fetched."""
+        """Sends a request. The answer must be fetched with :meth:`answer`."""
         self.asked = arguments[0].__name__.strip("_") if request == "call" else request
         process.send(self.pipe, (request, *arguments))
 
     def answer(self, deadline: float | None) -> Any:
-        """Returns the answer, waiting for it until ``deadline`` (by ``time.monotonic``; None: for ever).
+        """Waits for the answer and returns it.
+
+        Args:
+            deadline: in the time of ``time.monotonic``. None waits without limit.
 
         Raises:
-            Lost: if there is none.
-            WorkerError: if it cannot be read here.
+            Lost: if there is no answer.
+            WorkerError: if the answer cannot be unpickled in this process.
         """
         seconds = None if deadline is None else max(deadline - time.monotonic(), 0.0)
         try:
@@ -86,7 +89,7 @@ class Worker:
             ) from None
         except Lost:
             raise
-        except Exception as error:  # whatever reading an object of a class that is not known here raises
+        except Exception as error:  # unpickling an object of an unknown class can raise anything
             self.asked = None
             raise WorkerError(f"what environment {self.number} sent cannot be read in this process: {error}") from error
         self.asked = None
@@ -94,16 +97,16 @@ class Worker:
 
     @property
     def alive(self) -> bool:
-        """Whether the process is there."""
+        """Whether the process is running."""
         return self._ended is None and self.process.is_alive()
 
     def end(self) -> str:
-        """Ends the process, whatever it is doing, and returns what it ended with, in words."""
+        """Terminates the process immediately, and returns its exit code as text."""
         if self._ended is not None:
             return self._ended
         self.pipe.close()
         process = self.process
-        process.join(0.2)  # its pipe may close a moment before it is gone
+        process.join(0.2)  # the pipe may close shortly before the process exits
         for stop in (process.terminate, process.kill):
             if process.is_alive():
                 stop()
@@ -117,10 +120,11 @@ class Worker:
 
 
 class Workers:
-    """One worker process for each environment; they are asked together and answer in any order.
+    """A pool of worker processes with one environment each.
 
-    A worker that is lost costs ``WorkerError`` and the other processes are ended, or, as often as ``restarts`` allows, a
-    warning, and it is replaced by a new one.
+    Requests are sent to several workers at once, and the answers may arrive in any order. A lost worker is replaced
+    with a warning, up to ``restarts`` times in total. After that, a lost worker raises ``WorkerError`` and terminates the
+    other processes.
     """
 
     def __init__(
@@ -132,20 +136,20 @@ class Workers:
         shared: Callable[[Any], tuple[Any, ...]] = lambda context: (None,),
         preload: str | None = None,
     ) -> None:
-        """Starts all of them, and waits until their environments are made.
+        """Starts all workers, and waits until their environments are made.
 
         Args:
-            makes: functions that each make an environment; they are sent to the workers.
-            start_method: of ``multiprocessing``; None: :data:`START_METHOD`.
-            timeout: seconds to wait for the answers to a request; None: for ever.
-            restarts: how many lost workers are replaced.
-            shared: given the context, returns what else each worker gets.
-            preload: name of a further module that the workers need.
+            makes: functions that make one environment each. They are sent to the workers.
+            start_method: start method of ``multiprocessing``. None uses :data:`START_METHOD`.
+            timeout: seconds to wait for the answers to a request. None waits without limit.
+            restarts: maximum number of lost workers that are replaced.
+            shared: takes the ``multiprocessing`` context and returns further arguments of each worker.
+            preload: name of an additional module that the workers need.
 
         Raises:
-            TypeError: if a function cannot be sent.
-            ValueError: for a bad number.
-            WorkerError: if an environment cannot be made, or this cannot be called here.
+            TypeError: if a function cannot be pickled.
+            ValueError: if ``timeout`` or ``restarts`` is invalid.
+            WorkerError: if an environment cannot be made, or if the main script would start workers recursively.
         """
         check_options(timeout, restarts)
         for make in makes:
@@ -159,7 +163,7 @@ class Workers:
         self._makes = list(makes)
         self._context: Any = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
-            # Imported once, in the server: a worker is then there in milliseconds. It starts no threads.
+            # Imported once, in the server, so that a worker starts in milliseconds. The import starts no threads.
             self._context.set_forkserver_preload([process.__name__, *([] if preload is None else [preload])])
         self._shared = shared(self._context)
         self.timeout = timeout
@@ -176,14 +180,14 @@ class Workers:
 
     @property
     def closed(self) -> bool:
-        """Whether the processes were ended."""
+        """Whether the processes were terminated."""
         return not self._finalizer.alive
 
     def _start(self, number: int) -> Worker:
         return Worker(number, self._makes[number], self._context, *self._shared)
 
     def _made(self, worker: Worker) -> Description:
-        """Waits for an environment to be made and returns what it is."""
+        """Waits until an environment is made, and returns its description."""
         try:
             made = worker.answer(None if self.timeout is None else time.monotonic() + max(self.timeout, START_SECONDS))
         except Lost as lost:
@@ -196,12 +200,15 @@ class Workers:
         return made
 
     def ask(self, requests: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
-        """Sends requests by the number of the environment; returns the answers likewise, see :meth:`answers`."""
+        """Sends requests and returns the answers, both by the index of the environment. See :meth:`answers`."""
         self.send(requests)
         return self.answers(requests)
 
     def send(self, requests: Mapping[int, tuple[Any, ...]]) -> None:
-        """Sends requests by the number of the environment; answers that nobody fetched, after Ctrl-C, are dropped."""
+        """Sends requests by the index of the environment.
+
+        Answers to earlier requests that were not fetched, for example after Ctrl-C, are discarded.
+        """
         if self.closed:
             raise WorkerError("the worker processes were ended; make the environments anew")
         late = [number for number in requests if self.workers[number].asked is not None]
@@ -211,17 +218,17 @@ class Workers:
             self.workers[number].ask(*request)
 
     def answers(self, numbers: Iterable[int]) -> dict[int, Any]:
-        """Waits for the answers to requests and returns them: each what the environment said, or how it failed.
+        """Waits for the answers to requests and returns them by the index of the environment.
 
-        A worker that was lost and could be replaced has answered :class:`Restarted`; its environment is made, and must be
-        reset.
+        Each is the answer of the environment, or a :class:`~rejeu.envs.workers.process.Failure`. For a worker that was
+        lost and replaced, it is :class:`Restarted`. Its environment is made, and must be reset.
 
         Raises:
-            WorkerError: if a worker was lost for good; then all are ended.
+            WorkerError: if a worker was lost and cannot be replaced. All workers are then terminated.
         """
         deadline = None if self.timeout is None else time.monotonic() + self.timeout
         found: dict[int, Any] = {}
-        for number in numbers:  # all of them, or the next request would get the rest
+        for number in numbers:  # all answers, otherwise the next request would receive the remaining ones
             try:
                 found[number] = self.workers[number].answer(deadline)
             except Lost as lost:
@@ -232,7 +239,7 @@ class Workers:
         return found
 
     def _replaced(self, number: int, lost: Lost) -> Restarted:
-        """Starts a worker anew; raises if it may not be."""
+        """Restarts a worker. Raises ``WorkerError`` if no restarts are left."""
         worker = self.workers[number]
         why, advice = str(lost), "what it printed may say why"
         if worker.alive:
@@ -259,7 +266,7 @@ class Workers:
         return Restarted(why)
 
     def close(self) -> None:
-        """Asks the processes to close their environments, and ends those that do not; a second call does nothing."""
+        """Closes the environments, and terminates processes that do not respond. Further calls do nothing."""
         if self.closed:
             return
         for worker in self.workers:
@@ -272,7 +279,7 @@ class Workers:
         self.end()
 
     def end(self) -> None:
-        """Ends the processes, whatever they are doing."""
+        """Terminates the processes immediately."""
         self._finalizer()
 
 
@@ -285,7 +292,7 @@ def _end(workers: Sequence[Worker]) -> None:
 
 
 def check_options(timeout: float | None, restarts: int) -> None:
-    """Raises ``ValueError`` unless these are seconds to wait (None: for ever) and a number of restarts."""
+    """Raises ``ValueError`` unless ``timeout`` is positive seconds or None, and ``restarts`` a non-negative integer."""
     if timeout is not None and not (isinstance(timeout, int | float) and 0 < timeout < math.inf):
         raise ValueError(f"worker_timeout={timeout!r} must be a number of seconds above 0, or None to wait for ever")
     if isinstance(restarts, bool) or not isinstance(restarts, int) or restarts < 0:
@@ -293,10 +300,10 @@ def check_options(timeout: float | None, restarts: int) -> None:
 
 
 def check_sendable(make_one: Callable[[], gym.Env]) -> None:
-    """Raises ``TypeError`` unless the function can be sent to another process."""
+    """Raises ``TypeError`` unless the function can be pickled and sent to another process."""
     try:
         ForkingPickler.dumps(CloudpickleWrapper(make_one))
-    except Exception as error:  # whatever the things that it refers to raise
+    except Exception as error:  # pickling the objects that it refers to can raise anything
         raise TypeError(
             f"the function that makes environments is sent to worker processes, and cannot be pickled: {error}; let it "
             "make what it needs instead of referring to it, or use backend='gymnasium'"
@@ -304,15 +311,15 @@ def check_sendable(make_one: Callable[[], gym.Env]) -> None:
 
 
 def main_runs_again() -> bool | None:
-    """Returns whether a worker process, which imports the main script, would come by the present statement again.
+    """Returns whether a worker process, which imports the main script, would execute the current statement again.
 
-    None if that cannot be told: in another thread than the main one, or without the script's text.
+    None if this is unknown: in a thread other than the main thread, or if the source of the script is unavailable.
     """
     main = sys.modules["__main__"]
     spec = getattr(main, "__spec__", None)
     path = getattr(main, "__file__", None)
     if path is None or (spec is not None and spec.name.endswith("__main__")):
-        return False  # an interactive session, or a package that is run: neither is imported by a worker
+        return False  # interactive, or a package run with -m: a worker imports neither
     frame, here = sys._getframe(), None
     while frame is not None:
         if frame.f_globals is vars(main) and frame.f_code.co_name == "<module>":

@@ -1,4 +1,4 @@
-"""What runs in a worker process: one environment, which answers what it is asked through a pipe."""
+"""The code of a worker process: it runs one environment and answers requests through a pipe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rejeu.spaces import leaves
 
 
 class Failure(NamedTuple):
-    """What went wrong in a worker, in words: not every exception can be sent from one process to another."""
+    """An error in a worker, as text, since not every exception can be pickled."""
 
     kind: Literal["raised", "bad answer", "no attribute"]
     message: str
@@ -28,7 +28,7 @@ class Failure(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What a worker says once its environment is made."""
+    """Sent by a worker when its environment is made."""
 
     observation_space: gym.Space
     action_space: gym.Space
@@ -37,23 +37,26 @@ class Description(NamedTuple):
 
 
 def send(pipe: Connection, what: Any) -> None:
-    """Sends anything, lambdas and classes of a script too; what it said last can be read from a side that has gone."""
+    """Sends an object, which may contain lambdas and classes of the main script.
+
+    A closed pipe is ignored, so that the last message of a process that exited can still be received.
+    """
     try:
         data = ForkingPickler.dumps(what)
-    except Exception:  # whatever the things in it raise when they are pickled
+    except Exception:  # pickling its parts can raise anything
         data = ForkingPickler.dumps(CloudpickleWrapper(what))
     with suppress(BrokenPipeError, ConnectionResetError):
         pipe.send_bytes(data)
 
 
 def receive(pipe: Connection) -> Any:
-    """Returns what the other side sent; waits for it."""
+    """Waits for an object from the other process and returns it."""
     what = pipe.recv()
     return what.fn if isinstance(what, CloudpickleWrapper) else what
 
 
 def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarray]:
-    """Returns shared memory as the leaves of a batch of observations, ``(n_envs, *leaf.shape)`` each."""
+    """Returns views of shared memory as the leaves of a batch of observations, each ``(n_envs, *leaf.shape)``."""
     sized = [(leaf, n_envs * leaf.nbytes) for leaf in leaves(space)]
     return [
         np.frombuffer(buffer, np.uint8, size).view(leaf.dtype).reshape(n_envs, *leaf.shape)
@@ -64,16 +67,16 @@ def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarr
 def serve(
     pipe: Connection, make: CloudpickleWrapper, number: int, buffers: Sequence[Any] | None, n_envs: int = 0
 ) -> None:
-    """Serves one environment until it is told to close or the other side is gone.
+    """Answers requests for one environment, until it is closed or the main process exits.
 
     Args:
-        pipe: to the process that asks.
+        pipe: connection to the main process.
         make: makes the environment.
-        number: of the environment.
-        buffers: shared memory for the observations of ``n_envs`` environments; None if there is none.
-        n_envs: how many there are in all.
+        number: index of the environment.
+        buffers: shared memory for the observations of ``n_envs`` environments. None sends them through the pipe.
+        n_envs: total number of environments.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the main process, which may want another step
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
     env: gym.Env | None = None
     try:
         env = make.fn()
@@ -85,7 +88,7 @@ def serve(
             send(pipe, _answered(env, request, put, number))
     except (EOFError, ConnectionResetError):
         pass
-    except Exception as error:  # whatever making the environment raised: the other side raises it
+    except Exception as error:  # any exception of the constructor: the main process raises it
         send(pipe, Failure("raised", str(error), traceback.format_exc()))
     finally:
         if env is not None:
@@ -94,7 +97,7 @@ def serve(
 
 
 def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None, number: int) -> Any:
-    """Returns what the environment answers, or how it failed."""
+    """Returns the answer of the environment, or a :class:`Failure`."""
     try:
         answer = _answer(env, *request)
         if put is None or request[0] not in ("step", "reset"):
@@ -103,13 +106,13 @@ def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None
         return answer[1:]
     except BadEnvironmentError as error:
         return Failure("bad answer", str(error), traceback.format_exc())
-    except Exception as error:  # whatever the environment raises
+    except Exception as error:  # the environment can raise anything
         kind: Literal["raised", "no attribute"] = "no attribute" if isinstance(error, AttributeError) else "raised"
         return Failure(kind, str(error), traceback.format_exc())
 
 
 def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
-    """Returns what an environment says to one request."""
+    """Returns the answer of an environment to one request."""
     if name == "step":
         return checked_step(env, arguments[0])
     if name == "reset":
@@ -125,10 +128,10 @@ def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
 
 
 def checked_step(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """Returns what a step of an environment returned, its numbers as plain ones.
+    """Steps an environment and returns the result, with numbers as Python scalars.
 
     Raises:
-        BadEnvironmentError: if that is something else than the five values, or an observation does not fit its space.
+        BadEnvironmentError: if ``step`` does not return the five values, or the observation does not match its space.
     """
     answer = env.step(action)
     fault = validation.step_fault(answer, env.observation_space)

@@ -1,4 +1,4 @@
-"""Environments that each step in a worker process of their own, with their observations in shared memory."""
+"""A vector environment with one worker process per environment and observations in shared memory."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from rejeu.spaces import leaves, structure
 
 
 class InWorkers(VectorEnv):
-    """Environments in worker processes, stepped at the same time.
+    """Environments in worker processes that are stepped in parallel.
 
-    Where a worker that was lost is replaced, its episode ends as by a time limit: the step has the reward 0 and
-    ``truncated``, the observation before it is repeated as the successor, and its info says why under
-    ``"worker_restarted"``.
+    If a lost worker is replaced, its episode is truncated. The step has reward 0 and ``truncated=True``, the previous
+    observation is repeated as the next observation, and ``info["worker_restarted"]`` contains the reason.
 
     Args:
-        make_one: makes an environment; it is sent to the workers, and called once here.
-        n_envs: how many.
-        seed: of the first reset. A worker that is started anew draws a seed from that and its number.
-        worker_timeout: seconds that the workers have for a step or a reset; None: for ever.
-        restart_workers: how many lost workers are replaced, over all of them.
+        make_one: makes an environment. It is sent to the workers, and called once in this process.
+        n_envs: number of environments.
+        seed: seed of the first reset. The seed of a restarted worker is derived from the last seed of its environment.
+        worker_timeout: timeout of a step or a reset, in seconds. None waits without limit.
+        restart_workers: maximum number of lost workers that are replaced, in total.
 
     Raises:
-        TypeError: if ``make_one`` cannot be sent.
+        TypeError: if ``make_one`` cannot be pickled.
         WorkerError: if a worker cannot be started, or fails to make its environment.
     """
 
@@ -56,15 +55,15 @@ class InWorkers(VectorEnv):
         one.close()
         self.n_envs = n_envs
         self.n_steps = 0
-        """How often the vector was stepped."""
+        """Number of steps of the vector."""
         self._lost: dict[int, Restarted] = {}
-        """Environments whose process was replaced between two steps; the next step says so."""
+        """Environments whose process was replaced between two steps. The next step reports it."""
         self._anew: set[int] = set()
-        """Environments in new processes, which were not reset yet."""
+        """Environments in new processes that have not been reset yet."""
         self._make_one = make_one
         self._seed = seed
         self._seeds: list[int | None] = [None] * n_envs
-        """What each environment was last seeded with."""
+        """Last seed of each environment."""
         self._leaves = leaves(self.observation_space)
         self._stores = [np.zeros((n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
@@ -78,7 +77,7 @@ class InWorkers(VectorEnv):
                 )
 
     def _share(self, context: Any) -> tuple[list[Any], int]:
-        """Makes the memory that the observations are shared in, and returns what each worker needs to write to it."""
+        """Allocates shared memory for the observations, and returns the arguments with which workers use it."""
         buffers = [context.RawArray(ctypes.c_byte, max(self.n_envs * leaf.nbytes, 1)) for leaf in self._leaves]
         self._rows = process.rows(self.observation_space, buffers, self.n_envs)
         return buffers, self.n_envs
@@ -92,7 +91,7 @@ class InWorkers(VectorEnv):
         return self._reset(dict.fromkeys(np.flatnonzero(done).tolist()))
 
     def _reset(self, seeds: Mapping[int, int | None]) -> Any:
-        """Resets the environments that are the keys; again where a worker was lost at that."""
+        """Resets the environments in ``seeds``, and repeats the reset of those whose worker was lost during it."""
         for i, seed in seeds.items():
             self._lost.pop(i, None)
             if seed is not None:
@@ -106,7 +105,7 @@ class InWorkers(VectorEnv):
         return self._obs
 
     def _next_seed(self, i: int) -> int | None:
-        """Returns the seed of a new process's environment, for which there is none but the old one's; else None."""
+        """Returns a seed derived from the last one for an environment in a new process, None for others."""
         if i not in self._anew:
             return None
         self._anew.discard(i)
@@ -141,13 +140,13 @@ class InWorkers(VectorEnv):
         return Step(self._obs, reward, terminated, truncated, info)
 
     def _take(self, which: Sequence[int]) -> None:
-        """Copies observations out of shared memory, to which a worker that was given up may still have written."""
+        """Copies observations out of shared memory, to which a lost worker may still have written."""
         rows: Any = slice(None) if len(which) == self.n_envs else which
         for store, shared in zip(self._stores, self._rows, strict=True):
             store[rows] = shared[rows]
 
     def _heard(self, said: dict[int, Any], what: str) -> dict[int, Any]:
-        """Returns the answers, none of which is a failure."""
+        """Returns the answers. Raises if one of them is a failure."""
         self._anew.update(i for i, answer in said.items() if isinstance(answer, Restarted))
         failed = {i: answer for i, answer in said.items() if isinstance(answer, Failure)}
         if not failed:
@@ -167,7 +166,7 @@ class InWorkers(VectorEnv):
     def snapshot(self) -> list[Any] | None:
         said = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
         self._lost |= {i: answer for i, answer in said.items() if isinstance(answer, Restarted)}
-        known = all(isinstance(one, list) for one in said.values())  # None: not offered
+        known = all(isinstance(one, list) for one in said.values())  # None: not supported
         return [said[i] for i in range(self.n_envs)] if known else None
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
@@ -183,5 +182,5 @@ class InWorkers(VectorEnv):
         return [i for i, is_over in replies.items() if is_over]
 
     def close(self) -> None:
-        """Ends the processes; a second call does nothing."""
+        """Closes the environments and ends the processes. Further calls do nothing."""
         self.workers.close()
