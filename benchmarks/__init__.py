@@ -1,1 +1,1 @@
-"""What is measured, and what came out of it; see ``scripts/bench`` and the scripts beside this file."""
+"""Benchmarks and their results. Run ``scripts/bench`` or the scripts in this folder."""

@@ -1,10 +1,10 @@
-"""Environment steps per second of each backend, for the environments that have presets and for LunarLander.
+"""Measures environment steps per second of each backend, for the environments with presets and for LunarLander.
 
     python benchmarks/backends.py
 
-Random actions, resets included, in several rounds, of which the median counts. Worker processes are measured where a step
-in this process takes a millisecond or more. Written to
-``benchmarks/results/backends.json``, and printed as the table of ``docs/environments.md``.
+Actions are random and resets are included. The result is the median of several rounds. Worker processes are measured
+for environments whose step takes a millisecond or more in this process. The results are written to
+``benchmarks/results/backends.json`` and printed as the table of ``docs/environments.md``.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ CASES = {
     "parking-v0": (1, 16),
     "rejeu/Ball-v0": (8,),
 }
-"""Numbers of environments to measure with."""
+"""Numbers of environments that are measured."""
 BACKENDS = ("envpool", "gymnasium", "gymnasium-async")
 SLOW_STEP = 1e-3
-"""Seconds that a step must take in this process for worker processes to be measured."""
+"""Minimum duration of a step in this process, in seconds, for worker processes to be measured."""
 ROUND_SECONDS = 0.1
-"""Duration of one measurement."""
+"""Duration of one measurement, in seconds."""
 
 
 def measure(env_id: str, n_envs: int, rounds: int) -> dict[str, float]:
@@ -59,7 +59,7 @@ def measure(env_id: str, n_envs: int, rounds: int) -> dict[str, float]:
 
 
 def rate(env_id: str, n_envs: int, backend: str) -> float:
-    """Returns environment steps per second on a backend."""
+    """Returns the environment steps per second of a backend."""
     with closing(rejeu.make_vector(env_id, n_envs, backend, seed=0)) as vector:
         space = batch_space(vector.action_space, n_envs)
         space.seed(0)

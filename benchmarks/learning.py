@@ -1,11 +1,11 @@
-"""Trains a preset on several seeds and records what each came to: the evidence behind what the documentation claims.
+"""Trains a preset on several seeds and records the results, which the documentation reports.
 
     python benchmarks/learning.py Pendulum-v1 SAC --seeds 0 1 2 3 4
 
-trains as ``rejeu train`` does, without its evaluations on the way, and evaluates the last weights on 100 fresh episodes.
-With ``--best`` it is evaluated on the way, as often as the preset says and as ``rejeu train`` does, and the best weights by
-those evaluations are evaluated again, on fresh episodes. The result is written to
-``benchmarks/results/learning/ENV-ALGO.json`` with the command, the versions and the hyper-parameters.
+Training is the same as with ``rejeu train``, but without periodic evaluations. The final weights are evaluated on 100
+new episodes. With ``--best``, the agent is also evaluated during training, as often as the preset specifies. The best
+weights of these evaluations are then evaluated on new episodes. The results are written to
+``benchmarks/results/learning/ENV-ALGO.json``, with the command, the versions and the hyperparameters.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def main() -> None:
 
 
 def summary(values: list) -> dict | None:
-    """Returns mean, least and largest over seeds, and the 95 % interval of the mean by Student's t."""
+    """Returns the mean, minimum and maximum over seeds, and the 95 % confidence interval of the mean (Student's t)."""
     if any(value is None for value in values):
         return None
     mean, n = float(np.mean(values)), len(values)

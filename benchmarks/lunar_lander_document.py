@@ -1,14 +1,15 @@
-"""PPO on LunarLanderContinuous-v3 with a course's budget, beside the course's own algorithm.
+"""Compares PPO on LunarLanderContinuous-v3 with the algorithm of a course, with the same budget.
 
     python benchmarks/lunar_lander_document.py --seeds 0 1 2 3 4
 
-The course trains PPO in its plainest form, 10 iterations of one whole episode of each of 20 actors: fixed standard deviation,
-returns-to-go minus value, two optimizers, 5 epochs. That algorithm is a setting of rejeu's PPO and is run here as ``plain``,
-for exactly those 200 episodes. ``tuned`` takes as many environment steps as the course's runs did (23,000), with
-hyper-parameters chosen on seeds 100 to 103. Both are timed whole, from making the environments to the last update,
-compilation included, each run in a process of its own. The result is written to
-``benchmarks/results/lunar_lander_document.json``: the mean return and success rate (200 or more) of the last 20 training
-episodes, which is what the course reports, and of 100 episodes of the deterministic policy afterwards.
+The course trains a simple form of PPO for 10 iterations, each with one complete episode of each of 20 actors. It has a
+fixed standard deviation, advantages that are returns-to-go minus value, two optimizers and 5 epochs. ``plain`` runs
+this algorithm with rejeu's PPO for exactly these 200 episodes. ``tuned`` takes as many environment steps as the runs of
+the course (23,000), with hyperparameters chosen on seeds 100 to 103. Timing covers everything from the construction of
+the environments to the last update, including compilation. Each run has its own process. The results are written to
+``benchmarks/results/lunar_lander_document.json``. They contain the mean return and the success rate (return of 200 or
+more) of the last 20 training episodes, which the course reports, and of 100 episodes of the deterministic policy after
+training.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import numpy as np
 RESULT = Path(__file__).parent / "results" / "lunar_lander_document.json"
 ENV = "LunarLanderContinuous-v3"
 LAST = 20
-"""Episodes of an iteration of the course."""
+"""Episodes per iteration of the course."""
 PLAIN: dict[str, Any] = {
     "n_episodes": 1,
     "n_epochs": 5,
@@ -60,11 +61,11 @@ VARIANTS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
     "plain": (20, PLAIN, {"episodes": 200}),
     "tuned": (16, TUNED, {"total_timesteps": 23_000}),
 }
-"""Environments, hyper-parameters, and how long ``learn`` lasts."""
+"""Environments, hyperparameters, and the duration of ``learn``."""
 
 
 def child(variant: str, seed: int) -> None:
-    """Trains once and prints what it came to as JSON."""
+    """Trains once and prints the result as JSON."""
     import rejeu
 
     n_envs, settings, budget = VARIANTS[variant]

@@ -1,13 +1,15 @@
-"""Deep Q-learning on MountainCar-v0 with the hyper-parameters of a well-known exercise, several seeds.
+"""Deep Q-learning on MountainCar-v0 with the hyperparameters of a well-known exercise, on several seeds.
 
-450 episodes, hidden layers 128-128, batches of 128 from the last 10,000 steps, Adam at 3e-4, gamma 0.99, one gradient step
-a step of the environment, the target copied every 10 of them, squared loss, gradients clipped by value at 100, and epsilon
-falling from 0.9 to 0.01 by the same factor every episode. As in the exercise, the 200-step limit counts as a terminal
-state; ``--bootstrap`` lets values go on through it, rejeu's usual way. In the runs that we made so, none ever found the
-flag: all values fell to -1 / (1 - gamma) = -100 before the car had been anywhere.
+Training takes 450 episodes, with hidden layers 128-128 and batches of 128 from the last 10,000 steps. The optimizer is
+Adam at 3e-4, gamma is 0.99, and there is one gradient step per environment step. The target is copied every 10 gradient
+steps. The loss is squared and gradients are clipped by value at 100. Epsilon decays from 0.9 to 0.01 by a constant
+factor per episode. As in the exercise, the 200-step limit counts as a terminal state; ``--bootstrap`` bootstraps
+through it, as rejeu does by default. Without bootstrapping, none of our runs reached the flag: all values converged to
+-1 / (1 - gamma) = -100 before the car had explored.
 
-Prints, a line for each seed, the share of training episodes that reached the flag, that of the last 100, the return of the
-greedy policy over 50 episodes, and the wall time of training, compilation included::
+Prints one line per seed: the fraction of training episodes that reached the flag, the same for the last 100 episodes,
+the
+return of the greedy policy over 50 episodes, and the wall time of training, including compilation::
 
     python benchmarks/mountain_car_document.py --seeds 0 1 2
 """
@@ -44,7 +46,7 @@ HYPERPARAMETERS = {
 
 
 def run(seed: int, bootstrap: bool) -> dict[str, float]:
-    """Returns what one run of training and 50 greedy episodes gave."""
+    """Returns the results of one training run and 50 greedy episodes."""
     env = gym.make("MountainCar-v0")
     agent = rejeu.DQN("MlpPolicy", env if bootstrap else rejeu.TimeLimitTerminates(env), seed=seed, **HYPERPARAMETERS)
     began = time.perf_counter()

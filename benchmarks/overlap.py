@@ -1,10 +1,11 @@
-"""What acting with the weights of the update before the newest does to learning.
+"""Measures how acting with the weights of the second-newest update affects learning.
 
     python benchmarks/overlap.py
 
-With ``overlap=True``, the default, the environments step while the newest update is computed; with False every action
-waits for it. Both train the preset of each environment on the same seeds, in turn; the last weights play 100 episodes.
-Means over the seeds and 95 % intervals by Student's t go to ``benchmarks/results/overlap.json``.
+With ``overlap=True``, the default, the environments step while the newest update is computed. With ``overlap=False``,
+every action waits for it. Both train the preset of each environment on the same seeds. The final weights are evaluated
+on 100 episodes. Means over seeds and 95 % confidence intervals (Student's t) are written to
+``benchmarks/results/overlap.json``.
 """
 
 from __future__ import annotations

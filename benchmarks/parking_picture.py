@@ -1,4 +1,4 @@
-"""Draws the README's picture from a run folder: its learning curve, and four moments of an episode of its best model.
+"""Plots the README's figure from a run folder: the learning curve and four frames of the best model's episode.
 
 rejeu train parking-v0 --seed 0 --out RUN
 python benchmarks/parking_picture.py RUN docs/images/parking-run.png
@@ -22,10 +22,10 @@ MOMENTS = 4
 
 
 def episode(agent: rejeu.agents.Agent, env_id: str, seed: int) -> list[np.ndarray]:
-    """Returns what an episode looks like, before its first step and after each.
+    """Returns the frames of an episode: one before the first step and one after each step.
 
     Raises:
-        RuntimeError: if it is no success, which the picture is to show.
+        RuntimeError: if the episode is not a success.
     """
     env = shown_to(agent, make_env(env_id, render_mode="rgb_array"))
     obs, _ = env.reset(seed=seed)
@@ -50,7 +50,7 @@ def main() -> None:
     curve = matplotlib.image.imread(given.run / "curve.png")
     frames = episode(rejeu.load(given.run / "best"), "parking-v0", given.episode_seed)
     height, width = frames[0].shape[:2]
-    share = curve.shape[1] / curve.shape[0] / (width / height / MOMENTS)  # width of the curve to that of the frames
+    share = curve.shape[1] / curve.shape[0] / (width / height / MOMENTS)  # width of the curve relative to the frames
     figure = Figure(figsize=(8 * (1 + 1 / share), 8 * curve.shape[0] / curve.shape[1]), dpi=120, facecolor="white")
     grid = figure.add_gridspec(
         MOMENTS, 2, width_ratios=[share, 1], left=0, right=1, top=1, bottom=0, wspace=0.01, hspace=0.04

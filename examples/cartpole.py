@@ -1,4 +1,4 @@
-"""Trains PPO on CartPole, evaluates it, and saves and loads the model."""
+"""Trains PPO on CartPole, evaluates the agent, and saves and loads the model."""
 
 import rejeu
 

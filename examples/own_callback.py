@@ -11,7 +11,7 @@ from rejeu.loops.run import Progress
 
 
 def watch_returns(agent: Agent, progress: Progress) -> bool:
-    """Returns whether training goes on."""
+    """Returns whether to continue training."""
     returns = [episode.episode_return for episode in agent.history.last(10)]
     if returns and progress.step % 2_000 == 0:
         print(f"step {progress.step}: mean return {np.mean(returns):.0f} over {len(returns)} episodes")

@@ -1,4 +1,4 @@
-"""Gives SAC hidden layers of your own: an ``equinox.Module`` that maps a batch of features to ``n_outputs`` features."""
+"""Gives SAC custom hidden layers: an ``equinox.Module`` that maps a batch of features to ``n_outputs`` features."""
 
 import equinox as eqx
 import jax
@@ -31,4 +31,4 @@ print(agent.summary())
 agent.learn(10_000, progress_bar=True)
 print(agent.evaluate(episodes=20))
 agent.save("residual")
-agent = rejeu.load("residual", policy_kwargs={"torso": Residual})  # a model file holds no code
+agent = rejeu.load("residual", policy_kwargs={"torso": Residual})  # a model file contains no code

@@ -1,7 +1,7 @@
-"""Parks a car with SAC and hindsight experience replay, in 16 environments at once.
+"""Trains SAC with hindsight experience replay to park a car, in 16 environments at once.
 
-The observations of parking-v0 hold the goal: the pose in which the car must stop. Needs ``pip install 'rejeu[parking]'``,
-or EnvPool, which rejeu uses where it is installed.
+Observations of parking-v0 contain the goal: the pose in which the car must stop. Requires ``pip install
+'rejeu[parking]'`` or EnvPool, which rejeu uses if it is installed.
 """
 
 import rejeu

@@ -1,4 +1,4 @@
-"""A script for Stable-Baselines3 of which only the imports were changed."""
+"""A script for Stable-Baselines3 in which only the imports were changed."""
 
 from rejeu.sb3 import PPO
 from rejeu.sb3.common.callbacks import EvalCallback

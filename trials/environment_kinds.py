@@ -1,7 +1,8 @@
-"""Environments of many kinds, good and bad, for ``trials/environments.py``: what each is and what must come of training in it.
+"""Valid and invalid environments for ``trials/environments.py``, each with the expected outcome of training.
 
-To those of ``tests/bad_environments.py``, which answer one thing wrongly, come spaces of every kind, spaces that nothing can
-be learned in, ways in which episodes may go, and environments that raise, exit, hang or end their process.
+They include the environments of ``tests/bad_environments.py``, each of which has one fault. This module adds all kinds
+of spaces, spaces in which nothing can be learned, different lengths and ends of episodes, and environments that raise,
+exit, hang or end their process.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ class Kind(NamedTuple):
 
     make: Callable[[], gym.Env]
     must: str
-    """What must come of training in it, one of the four above."""
+    """Expected outcome of training, one of the four above."""
     error: str = ""
-    """Name of the error that it raises itself."""
+    """Name of the exception that the environment raises."""
     sac: str = ""
-    """What must come of training in it with SAC, where that is something else."""
+    """Expected outcome of training with SAC, if it is different."""
 
 
 class Spaces(Good):
-    """Observations drawn from any space, actions of any space; episodes of ten steps."""
+    """Samples observations from any space and accepts any action space. Episodes have ten steps."""
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Space | None = None) -> None:
         self.observation_space = observation_space
@@ -60,7 +61,7 @@ class Spaces(Good):
 
 
 class Course(Good):
-    """Episodes that go as ``ends(time)`` says: terminated and truncated."""
+    """Ends episodes by ``ends(time)``, which returns ``(terminated, truncated)``."""
 
     def __init__(self, ends: Callable[[int], tuple[Any, Any]]) -> None:
         self.ends = ends
@@ -82,7 +83,7 @@ class Rewards(Good):
 
 
 class Acts(Good):
-    """Does something at the third step of its fifth episode, or wherever ``where`` says."""
+    """Calls a function at the third step of its fifth episode, or where ``where`` specifies."""
 
     def __init__(self, act: Callable[[], Any], where: str = "step") -> None:
         self.act, self.where, self.episode = act, where, 0
@@ -106,7 +107,7 @@ class Acts(Good):
 
 
 class Spoils(Good):
-    """Writes into the action that it is given."""
+    """Modifies the action array that it receives."""
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict]:
         answer = super().step(action)
@@ -115,21 +116,21 @@ class Spoils(Good):
 
 
 class Infinite(Good):
-    """An observation that is not finite."""
+    """Returns an observation that is not finite."""
 
     def observe(self) -> Any:
         return np.array([0.0, np.inf if self.late else 0.0, 0.0], np.float32)
 
 
 class Far(Good):
-    """Observations a million times larger than declared."""
+    """Returns observations a million times larger than declared."""
 
     def observe(self) -> Any:
         return 1e6 * super().observe()
 
 
 class Vast(Good):
-    """Observations whose squares float32 cannot hold: SAC's losses are not finite, and PPO's tanh is saturated."""
+    """Returns observations whose squares overflow float32: SAC's losses are not finite, and PPO's tanh saturates."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 
@@ -138,28 +139,28 @@ class Vast(Good):
 
 
 class ListInfo(Good):
-    """The info is a list."""
+    """Returns a list as info."""
 
     def step(self, action: Any) -> Any:
         return *super().step(action)[:4], ["no dict"] if self.late else {}
 
 
 class ResetWithoutInfo(Good):
-    """Reset gives None in place of the info."""
+    """Returns None as the info of ``reset``."""
 
     def reset(self, **kwargs: Any) -> Any:
         return super().reset(**kwargs)[0], None
 
 
 class ThreeFromReset(Good):
-    """Reset gives three values."""
+    """Returns three values from ``reset``."""
 
     def reset(self, **kwargs: Any) -> Any:
         return *super().reset(**kwargs), {}
 
 
 class NothingFromStep(Good):
-    """Step gives None."""
+    """Returns None from ``step``."""
 
     def step(self, action: Any) -> Any:
         answer = super().step(action)
@@ -209,7 +210,7 @@ OBSERVATIONS: dict[str, tuple[spaces.Space, str]] = {
     "a graph": (spaces.Graph(SIGHT, None), REFUSED),
     "an empty dict": (spaces.Dict(), REFUSED),
 }
-"""Observation spaces and what must come of them."""
+"""Observation spaces and their expected outcomes."""
 ACTIONS: dict[str, tuple[spaces.Space, str]] = {
     "asymmetric bounds": (spaces.Box(np.float32([-3, 1]), np.float32([-1, 7]), dtype=np.float32), TRAINS),
     "two axes": (box((2, 2)), TRAINS),
@@ -225,9 +226,9 @@ ACTIONS: dict[str, tuple[spaces.Space, str]] = {
     "a dict": (spaces.Dict(a=SIGHT), REFUSED),
     "a tuple": (spaces.Tuple([SIGHT]), REFUSED),
 }
-"""Action spaces, likewise."""
+"""Action spaces and their expected outcomes."""
 WITH_SAC = {"action: unbounded": REFUSED, "action: whole numbers": TRAINS}
-"""What must come of those in which SAC and PPO differ."""
+"""Expected outcomes of spaces for which SAC and PPO differ."""
 
 NEVER = (False, False)
 COURSES: dict[str, Callable[[], gym.Env]] = {
@@ -250,11 +251,11 @@ COURSES: dict[str, Callable[[], gym.Env]] = {
     "a goal": Line,
     "good": Good,
 }
-"""Ways in which episodes go that training must bear."""
+"""Valid lengths and ends of episodes."""
 
 
 def kinds() -> dict[str, Kind]:
-    """Returns every kind that is tried in this process, by name."""
+    """Returns all environments that run in this process, by name."""
     found: dict[str, Kind] = {}
     for name, (space, must) in OBSERVATIONS.items():
         found[f"observation: {name}"] = Kind(lambda space=space: Spaces(space), must)
@@ -327,4 +328,4 @@ WORKERS: dict[str, tuple[Callable[[], gym.Env], str]] = {
     "four values": (EVERY["four values"].make, ENDS),
     "only observation from reset": (EVERY["only observation"].make, ENDS),
 }
-"""Kinds that are tried in worker processes; functions that can be sent there."""
+"""Environments that run in worker processes. The functions can be sent to other processes."""

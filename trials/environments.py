@@ -1,14 +1,16 @@
-"""Trains in environments of many kinds, good and bad, and looks at what comes of each.
+"""Trains in valid and invalid environments of many kinds and checks the outcomes.
 
     python trials/environments.py
 
-Every kind of ``trials/environment_kinds.py`` is trained in for 240 steps, with PPO and with SAC where SAC takes its actions,
-and a checkpoint every 100. A run must end as its kind says: with all its steps and finite weights; with
-``BadEnvironmentError``, whose one message names the environment and what was wrong; with the environment's own error; or by
-being refused when the agent is made. After an error there must be a checkpoint of that very step, which loads, with finite
-weights. Then kinds that break worker processes: the error must say so, and no process may be left.
+PPO trains in every environment of ``trials/environment_kinds.py`` for 240 steps with a checkpoint every 100 steps. SAC
+does the same if it supports the action space. Every run must have the expected outcome. It can complete all steps with
+finite weights. It can raise ``BadEnvironmentError``, whose message must name the environment and the fault. It can
+raise the environment's own exception, or be rejected when the agent is created. After an exception there must be a
+checkpoint of the last step that loads and has finite weights. Further environments break worker processes: the
+exception must report this, and no process may remain.
 
-Each run has a minute. ``trials/results/environments.json`` holds totals and every run that was not as it must be.
+Each run has a timeout of one minute. ``trials/results/environments.json`` contains totals and every run with an
+unexpected outcome.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compiling is most of the time
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compilation takes most of the time
 
 import numpy as np
 import psutil
@@ -50,12 +52,12 @@ OURS = (rejeu.errors.BadEnvironmentError, rejeu.errors.WorkerError)
 
 
 class TooLongError(BaseException):
-    """A run took longer than it may."""
+    """Raised when a run exceeds its time limit."""
 
 
 @contextlib.contextmanager
 def bounded(seconds: float) -> Iterator[None]:
-    """Raises ``TooLongError`` after so many seconds."""
+    """Raises ``TooLongError`` after a number of seconds."""
 
     def late(number: int, frame: Any) -> None:
         raise TooLongError
@@ -74,7 +76,7 @@ def policy_of(space: spaces.Space) -> str:
 
 
 def outcome(error: BaseException | None, began: bool) -> str:
-    """Returns what came of a run: one of the four of :mod:`trials.environment_kinds`, or what it should never be."""
+    """Returns the outcome of a run: one of the four of :mod:`trials.environment_kinds`, or an invalid one."""
     if error is None:
         return TRAINS
     if isinstance(error, OURS):
@@ -89,7 +91,7 @@ def is_sound(agent: rejeu.Agent) -> bool:
 
 
 def checkpoint_of(agent: rejeu.Agent, folder: Path, kind: Kind) -> str:
-    """Returns what is wrong with the checkpoint that an error left, empty if nothing is."""
+    """Returns the fault of the checkpoint saved after an exception, empty if there is none."""
     files = run_files(folder)
     if not files:
         return "there is no checkpoint"
@@ -102,7 +104,7 @@ def checkpoint_of(agent: rejeu.Agent, folder: Path, kind: Kind) -> str:
 
 
 def attempt(kind: Kind, algorithm: str, folder: Path) -> dict[str, Any]:
-    """Trains once and returns what came of it."""
+    """Trains once and returns the outcome."""
     agent, error, began = None, None, time.perf_counter()
     try:
         with bounded(SECONDS), contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
@@ -127,7 +129,7 @@ def said(error: BaseException | None) -> str:
 def wrong(
     found: dict[str, Any], error: BaseException | None, agent: rejeu.Agent | None, kind: Kind, folder: Path
 ) -> list[str]:
-    """Returns in which ways a run was not as it must be."""
+    """Returns the differences between a run and its expected outcome."""
     faults = []
     if found["outcome"] != kind.must:
         faults.append(f"{found['outcome']}, and must be: {kind.must}")
@@ -147,7 +149,7 @@ def wrong(
 
 
 def fitting(kind: Kind) -> list[str]:
-    """Returns the algorithms to try a kind with: PPO, and SAC where it takes such actions."""
+    """Returns the algorithms to run: PPO, and SAC if it supports the action space."""
     try:
         space: Any = kind.make().action_space
     except OSError:
@@ -173,7 +175,7 @@ def in_process() -> list[dict[str, Any]]:
 
 
 def in_workers() -> list[dict[str, Any]]:
-    """Trains SAC in two worker processes of each kind, and says which processes are left afterwards."""
+    """Trains SAC in two worker processes of each environment, and returns the processes that remain afterwards."""
     found, process = [], psutil.Process()
     for name, (make, must) in WORKERS.items():
         error, agent, vector, began = None, None, None, time.perf_counter()
@@ -208,7 +210,7 @@ def two_good() -> Any:
 
 
 def is_worker(process: psutil.Process) -> bool:
-    """Returns whether a process runs an environment, rather than helping Python to start others."""
+    """Returns whether a process runs an environment, as opposed to a helper process of ``multiprocessing``."""
     with contextlib.suppress(psutil.Error):
         command = " ".join(process.cmdline())
         return "resource_tracker" not in command and "forkserver" not in command
@@ -216,7 +218,7 @@ def is_worker(process: psutil.Process) -> bool:
 
 
 def restarted() -> dict[str, Any]:
-    """Trains in workers that are killed now and then and started again, and returns how many steps were taken."""
+    """Trains in workers that are killed repeatedly and restarted, and returns the number of steps taken."""
     from trials.environment_kinds import killed
 
     vector = rejeu.make_vector(killed, 2, "gymnasium-async", seed=0, restart_workers=40)

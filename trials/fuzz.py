@@ -1,15 +1,15 @@
-"""Fuzzes everything that reads a file, guided by coverage, and records what came of it.
+"""Coverage-guided fuzzing of all functions that read files.
 
-It needs atheris, which is no dependency of rejeu's (Linux and macOS)::
+Requires atheris, which is not a dependency of rejeu (Linux and macOS)::
 
     pip install atheris
     python trials/fuzz.py --seconds 300 --target all
 
-Each target runs in a process of its own, seeded with the recorded files of ``tests/golden``, or with checkpoints of runs that
-it makes first (``run`` and ``rows``; see ``fuzz_runs.py``, which says what is asked of them). Inputs are mutated as bytes,
-as JSON, as arrays and as tables; most of the time checksums and lengths are put right afterwards, so that what lies behind
-them is reached. A finding is any exception but ``CheckpointError``, any input that takes too long, and any
-file that is read and then cannot be used. Findings are saved in ``trials/results/findings``, and counts in
+Each target runs in its own process. Its seeds are the recorded files of ``tests/golden``, or checkpoints of runs that
+it creates first (``run`` and ``rows``; see ``fuzz_runs.py``). Inputs are mutated as bytes, as JSON, as arrays and as
+tables. Most of the time checksums and lengths are corrected afterwards, so that the code behind these checks is
+reached. A finding is any exception other than ``CheckpointError``, any input that exceeds its time limit, and any file
+that loads but cannot be used. Findings are saved in ``trials/results/findings``, and counts in
 ``trials/results/fuzz.json``.
 """
 
@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 RESULTS = ROOT / "trials" / "results"
 SECONDS = {"agent": 20.0, "run": 20.0, "rows": 20.0}
-"""Longest that any input may take on a processor, two seconds where not said; building networks includes compiling them."""
+"""Maximum processor time per input in seconds; two by default. Creating networks includes their compilation."""
 SEEDS = {
     "table": ("sac", "td3", "dqn", "ppo", "replay", "vec_normalize"),
     "header": ("sac", "td3", "dqn", "ppo"),
@@ -46,10 +46,10 @@ SEEDS = {
     "run": (),
     "rows": (),
 }
-"""The targets, and the files of ``tests/golden`` that each begins with; ``fuzz_runs.py`` makes those of the last two."""
+"""The targets and their seed files from ``tests/golden``. ``fuzz_runs.py`` creates the seeds of the last two."""
 AFRESH = {"run": 0.7, "rows": 0.7}
-"""How often a whole file is changed in place of an input that reached something new. Most of those are refused, and stay so;
-of these targets what comes after reading is as much."""
+"""Probability that a seed file is mutated instead of an input that increased coverage. Most such inputs are
+rejected, and so are their mutations. For these targets the code that runs after reading is equally important."""
 VALUES = (
     None,
     True,
@@ -97,11 +97,11 @@ VALUES += (
     "HerReplayBuffer",
 )
 VALUES += ("SAC", "DDPG", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO", "A2C", "RecurrentPPO", "MaskablePPO")
-"""What values of a header are exchanged for, besides each other."""
+"""Replacements for values of a header, in addition to each other."""
 
 
 def main() -> None:
-    """Runs the targets that were asked for, one after the other, and writes the result."""
+    """Runs the selected targets one after the other and writes the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=int, default=300, help="time for each target")
     parser.add_argument("--target", choices=["all", *SEEDS], default="all")
@@ -121,7 +121,7 @@ def main() -> None:
 
 
 def in_process(target: str, seconds: int) -> dict[str, Any]:
-    """Fuzzes one target in a new process and returns what is to be recorded of it."""
+    """Fuzzes one target in a new process and returns the results to record."""
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
         command = [sys.executable, __file__, "--child", "--target", target, "--seconds", str(seconds)]
@@ -140,7 +140,7 @@ def in_process(target: str, seconds: int) -> dict[str, Any]:
 
 
 def fuzz(target: str, seconds: int) -> None:
-    """Fuzzes one target in this process, which ends with it."""
+    """Fuzzes one target in this process, which then exits."""
     import atheris
 
     with atheris.instrument_imports(include=["rejeu"]):
@@ -162,7 +162,7 @@ def fuzz(target: str, seconds: int) -> None:
         seeds.append(content)
         (corpus / f"{target}-{i}").write_bytes(content)
     afresh = AFRESH.get(target, 0.0)
-    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size), afresh)  # Mutate is another once it fuzzes
+    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size), afresh)  # fuzzing replaces Mutate
     flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=3600", "-len_control=0"]
     flags.append(f"-artifact_prefix={folder}{os.sep}")
     atheris.Setup([sys.argv[0], str(corpus), *flags], watched, custom_mutator=mutate)
@@ -170,20 +170,20 @@ def fuzz(target: str, seconds: int) -> None:
 
 
 class Watched:
-    """Gives inputs to a target, counts outcomes and saves findings."""
+    """Passes inputs to a target, counts outcomes and saves findings."""
 
     def __init__(self, target: str, folder: Path) -> None:
         self.target, self.folder = target, folder
         self.path = folder / "input.safetensors"
         self.seeds: list[bytes] = []
-        """What the target begins with beside recorded files."""
+        """Seeds of the target in addition to recorded files."""
         self.read = READERS[target](self.path) if target in READERS else self.whole_runs()
         self.counts = {"executions": 0, "refused": 0, "read": 0, "findings": 0}
         self.seen: set[str] = set()
         self.written = 0.0
 
     def whole_runs(self) -> Callable[[], None]:
-        """Makes runs, and returns what resumes one of which a file was replaced by the input."""
+        """Creates runs, and returns a function that resumes one of them with a file replaced by the input."""
         import fuzz_runs
 
         self.seeds, read = fuzz_runs.reader(self.target, self.folder)
@@ -211,10 +211,10 @@ class Watched:
             self.written = time.monotonic()
             new = self.folder / "counts.new"
             new.write_text(json.dumps(self.counts), encoding="utf-8")
-            new.replace(self.folder / "counts.json")  # whole, whenever the process ends
+            new.replace(self.folder / "counts.json")  # atomic, so that the file is complete when the process ends
 
     def note(self, data: bytes, what: str) -> None:
-        """Saves an input, once for each place where it went wrong."""
+        """Saves an input, once per location of the failure."""
         where = "".join(re.findall(r"File .*line \d+", what)) or what.split(":")[0]
         if where in self.seen:
             return
@@ -230,7 +230,7 @@ class Watched:
 def mutator(
     seeds: list[bytes], mutate: Callable[[bytes, int], bytes], afresh: float = 0.0
 ) -> Callable[[bytes, int, int], bytes]:
-    """Returns what makes a new input of an old one, or with the probability ``afresh`` of one of the seeds."""
+    """Returns a function that mutates an input or, with probability ``afresh``, one of the seeds."""
     from tests import hostile_files
 
     def mutated(data: bytes, max_size: int, seed: int) -> bytes:
@@ -325,7 +325,7 @@ def change_array(arrays: dict[str, Any], draw: random.Random) -> None:
 
 
 def table_reader(path: Path) -> Callable[[], None]:
-    """Returns what reads the table, the header and the arrays."""
+    """Returns a function that reads the table, the header and the arrays."""
     from rejeu.io import checkpoint
 
     def read() -> None:
@@ -341,7 +341,7 @@ def table_reader(path: Path) -> Callable[[], None]:
 
 
 def header_reader(path: Path) -> Callable[[], None]:
-    """Returns what interprets headers, of whichever algorithm, and builds nothing."""
+    """Returns a function that validates headers of any algorithm without creating networks."""
     from rejeu import agents
     from rejeu.agents import model_files
     from rejeu.io import checkpoint
@@ -355,7 +355,7 @@ def header_reader(path: Path) -> Callable[[], None]:
 
 
 def agent_reader(path: Path) -> Callable[[], None]:
-    """Returns what loads models; those of one configuration share what is compiled, which takes most of the time."""
+    """Returns a function that loads models. Models with equal configurations share compiled functions, to save time."""
     import fuzz_runs
 
     import rejeu
@@ -369,7 +369,7 @@ def agent_reader(path: Path) -> Callable[[], None]:
 
 
 def replay_reader(path: Path) -> Callable[[], None]:
-    """Returns what loads replay buffers, checks that refused ones change nothing, and draws from those that are read."""
+    """Returns a function that loads replay buffers and samples from them. Rejected files must change nothing."""
     import numpy as np
 
     from rejeu.errors import CheckpointError
@@ -393,7 +393,7 @@ def replay_reader(path: Path) -> Callable[[], None]:
 
 
 def statistics_reader(path: Path) -> Callable[[], None]:
-    """Returns what loads statistics of a wrapper, and uses those that are read."""
+    """Returns a function that loads the statistics of a wrapper and uses them."""
     import numpy as np
 
     from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize

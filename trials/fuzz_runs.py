@@ -1,11 +1,12 @@
-"""What ``trials/fuzz.py`` reads checkpoints of whole runs with: runs to begin with, and what is done with each input.
+"""The targets ``run`` and ``rows`` of ``trials/fuzz.py``, which read checkpoints of complete runs.
 
-An input of the target ``run`` is the file of a run, whose rows are whole; one of ``rows`` is a file of rows, whose run is
-whole. Both are read by ``Agent.resume(folder)``. ``CheckpointError`` alone may come of it: the file is always there, so there
-is no reason for ``FileNotFoundError``. What was resumed must learn on for some steps with checkpoints in the same folder, and
-what those hold must be read again as it is. While it learns, ``NonFiniteError`` and ``BadEnvironmentError`` are answers too:
-weights and states of environments may be any finite numbers, and what follows from them may be too large. So is what the
-ball says of actions that are no numbers, which such weights lead to.
+An input of ``run`` replaces the file of a run whose rows are valid. An input of ``rows`` replaces a file of rows of a
+valid run. Both are read by ``Agent.resume(folder)``. The only exception allowed is ``CheckpointError``.
+``FileNotFoundError`` is not allowed, because the file always exists. A resumed run must train for some steps with
+checkpoints in the same folder, and these checkpoints must load again with equal contents. During training,
+``NonFiniteError`` and ``BadEnvironmentError`` are also allowed. Weights and states of environments may be any finite
+numbers, and results computed from them may overflow. The error of the ball for actions that are NaN is allowed too,
+because such weights can cause it.
 """
 
 from __future__ import annotations
@@ -21,22 +22,22 @@ from pathlib import Path
 from typing import Any
 
 N_STEPS = 8
-"""Environment steps that a resumed run must be able to go on for."""
+"""Environment steps for which a resumed run must train."""
 BALL, BITS, CART_POLE = "rejeu/Ball-v0", "fuzz/Bits-v0", "rejeu/CartPoleNoVelocity-v0"
 DIVERGED = "is not a number; the policy has diverged"
-"""What the ball says where the policy's action is none."""
+"""Message of the ball for an action that is NaN."""
 COSTLY = {"batch_size": 64, "n_steps": 64, "gradient_steps": 16, "n_epochs": 8, "n_episodes": 8, "n_quantiles": 64}
-"""Hyper-parameters that ask for more work the larger they are, and up to where the work is done here."""
+"""Hyperparameters that increase the cost of training, with the largest values for which training is run here."""
 MOST_EXTRA_STEPS = 100
-"""Gradient steps up to which a file may say that they are due."""
+"""Maximum number of pending gradient steps in a file for which training is run here."""
 LEARN_ONE_IN = 12
-"""Of runs whose configuration is none of the first ones, so that learning has to be compiled, one in so many learns."""
+"""Runs with other configurations than the seeds must be compiled. Only one in this many of them trains."""
 LAST_STEP = 2**32 - 2**16
-"""Runs cannot be longer than some four thousand million steps; those near to it do not learn here."""
+"""Runs are limited to about four billion steps. Runs close to the limit do not train here."""
 
 
 def make_runs(folder: Path) -> list[tuple[Path, list[Path]]]:
-    """Makes the runs in a folder, and returns for each its newest file and its rows, oldest first."""
+    """Creates the runs in a folder. Returns, for each, its newest file and its files of rows, oldest first."""
     import gymnasium as gym
 
     import rejeu
@@ -64,7 +65,7 @@ def make_runs(folder: Path) -> list[tuple[Path, list[Path]]]:
         policy = "MultiInputPolicy" if env_id == BITS else "MlpPolicy"
         env = rejeu.make_vector(env_id, n_envs, "gymnasium", seed=1)
         agent = rejeu.AGENTS[name](policy, env, **settings)
-        agent.made_from_id = True  # it was made from its id, so resume needs none
+        agent.made_from_id = True  # created from its id, so resume() needs no environment
         watching: list[Any] = [evaluation()] if i == 0 else []
         run = folder / str(i)
         agent.learn(60, [*watching, Checkpoint(run, every=8, keep=1), lambda agent, turn: turn.step < 26])
@@ -73,7 +74,7 @@ def make_runs(folder: Path) -> list[tuple[Path, list[Path]]]:
 
 
 def bits() -> Any:
-    """Returns bits to be flipped, which say where they stand."""
+    """Returns a bit-flipping environment whose state can be saved."""
     from tests.bit_flipping import BitFlipping
 
     class Bits(BitFlipping):
@@ -93,17 +94,17 @@ def bits() -> Any:
 
 
 def evaluation() -> Any:
-    """Returns a callback that has something to remember."""
+    """Returns a callback with state."""
     from rejeu.callbacks import Evaluate
 
     return Evaluate(BALL, every=20, episodes=1, seed=0)
 
 
 class Runs:
-    """Whole runs beneath a folder, and what reads one of them of which a file was replaced."""
+    """Complete runs in a folder, and a function that reads one of them with a file replaced."""
 
     def __init__(self, folder: Path) -> None:
-        """Makes the runs, and a file for each input to begin with."""
+        """Creates the runs and a seed for each file."""
         from rejeu.io import checkpoint
 
         share_compiled()
@@ -117,7 +118,7 @@ class Runs:
         self.configs = {json.dumps(header["config"]) for header in self.headers}
 
     def seeds(self, target: str) -> list[bytes]:
-        """Returns what mutations begin with. Files of rows are marked with the run that they belong to, and their place."""
+        """Returns the seeds. Files of rows are marked with their run and their position."""
         from tests import hostile_files
 
         if target == "run":
@@ -130,7 +131,7 @@ class Runs:
         return seeds
 
     def read_run(self, path: Path) -> None:
-        """Resumes and uses the run of a file."""
+        """Resumes and uses a run with this file."""
         header = header_of(path, "run")
         name = header.get("algorithm")
         self.put_files(self.rows.values())
@@ -138,7 +139,7 @@ class Runs:
         self.resume(name if isinstance(name, str) else "", path)
 
     def read_rows(self, path: Path) -> None:
-        """Resumes and uses a run one of whose files of rows is this one."""
+        """Resumes and uses a run with this file of rows."""
         try:
             i, j = header_of(path, "rows")["of"]
             run, rows = self.runs[i]
@@ -151,17 +152,17 @@ class Runs:
         self.resume(self.headers[i]["algorithm"], path)
 
     def put_files(self, paths: Any) -> None:
-        """Empties the folder and puts whole files there; they are never written to, only replaced."""
+        """Empties the folder and adds the valid files. These are only replaced, never modified."""
         for path in self.folder.iterdir():
             path.unlink()
         for path in paths:
             os.link(path, self.folder / path.name)
 
     def resume(self, name: str, path: Path) -> None:
-        """Resumes what stands in the folder, lets it learn on, and reads what it saved.
+        """Resumes the run in the folder, trains, and reads the new checkpoints.
 
         Raises:
-            CheckpointError: if it is refused.
+            CheckpointError: if the run is rejected.
         """
         import rejeu
         from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
@@ -175,7 +176,7 @@ class Runs:
             try:
                 self.learn_on(agent)
             except CheckpointError as error:
-                if "remembered" in str(error):  # what callbacks did is theirs to judge, once they are there
+                if "remembered" in str(error):  # callbacks validate their own state once they are given
                     raise
                 raise AssertionError(f"it was resumed, but: {error}") from error
             except (NonFiniteError, BadEnvironmentError):
@@ -196,7 +197,7 @@ class Runs:
             raise AssertionError(f"{again.run.step} steps were read where {agent.run.step} were written")
 
     def learn_on(self, agent: Any) -> None:
-        """Goes on with the call that was cut off, if it is not over, with checkpoints in the folder of the run."""
+        """Continues the interrupted call of ``learn``, if any steps remain, with checkpoints in the run's folder."""
         from rejeu.callbacks import Checkpoint
 
         run, call, before = agent.run, agent.training_call, agent.run.step
@@ -213,7 +214,7 @@ class Runs:
         agent.predict(agent.observation_space.sample())
 
     def is_affordable(self, agent: Any, path: Path) -> bool:
-        """Returns whether to learn: what is asked for is little, and compiled already, most of the time."""
+        """Returns whether to train: if training is cheap and, in most cases, already compiled."""
         from rejeu.algorithms import config as configs
 
         config, run = vars(agent.config), agent.run
@@ -230,7 +231,7 @@ class Runs:
 
 
 def header_of(path: Path, kind: str) -> dict[str, Any]:
-    """Returns the header of a file, nothing where there is none."""
+    """Returns the header of a file, empty if there is none."""
     from rejeu.io import checkpoint
 
     try:
@@ -240,7 +241,7 @@ def header_of(path: Path, kind: str) -> dict[str, Any]:
 
 
 def share_compiled() -> None:
-    """Lets agents of one configuration share what is compiled, which takes most of the time."""
+    """Lets agents with equal configurations share compiled functions, because compilation takes most of the time."""
     import jax
 
     from rejeu import spaces
@@ -266,6 +267,6 @@ def share_compiled() -> None:
 
 
 def reader(target: str, folder: Path) -> tuple[list[bytes], Callable[[Path], None]]:
-    """Returns the inputs that a target begins with, and what reads one."""
+    """Returns the seeds of a target and a function that reads an input."""
     runs = Runs(folder)
     return runs.seeds(target), runs.read_run if target == "run" else runs.read_rows

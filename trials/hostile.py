@@ -1,13 +1,14 @@
-"""Reads every damaged and hostile file there is to make, and records what came of each.
+"""Reads all kinds of damaged and malicious files and records the outcomes.
 
-The larger version of ``tests/io/test_hostile_files.py``: truncation at every byte and a flip of every bit, of every kind of
-file and both schemas, beside the corpus of ``tests/hostile_files.py``::
+This is the larger version of ``tests/io/test_hostile_files.py``. It truncates every kind of file, in both schemas, at
+every
+byte and flips every bit. It also reads the corpus of ``tests/hostile_files.py``::
 
     python trials/hostile.py --sb3-python path/to/python/with/stable-baselines3
 
-The last argument adds an attempt to run code: a model file of Stable-Baselines3's own format, in which one object is a
-pickle that makes an empty file when it is opened, is given to Stable-Baselines3's ``load``; the same bytes are put into
-every place of a rejeu file that holds a text, and given to ours. Results go to ``trials/results/hostile.json``.
+The last argument adds an attempt to execute code. One object of a Stable-Baselines3 model file is replaced by a pickle
+that creates an empty file when it is loaded. Stable-Baselines3 loads this file. The same bytes are inserted at every
+string of a rejeu file, which rejeu loads. Results are written to ``trials/results/hostile.json``.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ SPECIAL = {
 
 
 def main() -> None:
-    """Makes and reads the files, and writes the result."""
+    """Creates and reads the files, and writes the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sb3-python", type=Path, help="Python of an environment that has stable-baselines3")
     arguments = parser.parse_args()
@@ -88,7 +89,7 @@ def main() -> None:
 
 
 def readers() -> dict[str, Callable[[Path], object]]:
-    """Returns what reads a file of each kind."""
+    """Returns the function that reads each kind of file."""
     agent = record_files.replay_agent().learn(7)
     env = DummyVecEnv([lambda: Counter((5,))])
     return {
@@ -99,7 +100,7 @@ def readers() -> dict[str, Callable[[Path], object]]:
 
 
 def outcome(read: Callable[[Path], object], path: Path) -> str:
-    """Returns ``refused``, ``read``, or the name of what was raised instead of our own error."""
+    """Returns ``refused``, ``read``, or the name of any other exception."""
     try:
         read(path)
     except rejeu.CheckpointError:
@@ -110,7 +111,7 @@ def outcome(read: Callable[[Path], object], path: Path) -> str:
 
 
 def count(contents: Iterator[bytes], read: Callable[[Path], object], path: Path) -> dict[str, Any]:
-    """Reads files and returns how often each outcome came, and the longest time that one took, in seconds."""
+    """Reads files and returns the count of each outcome and the longest time of one file in seconds."""
     found: collections.Counter[str] = collections.Counter()
     longest = 0.0
     with path.open("w+b", buffering=0) as file:
@@ -125,17 +126,17 @@ def count(contents: Iterator[bytes], read: Callable[[Path], object], path: Path)
 
 
 def cuts(content: bytes) -> Iterator[bytes]:
-    """Yields a file cut short at every byte."""
+    """Yields a file truncated at every byte."""
     return (content[:length] for length in range(len(content)))
 
 
 def flips(content: bytes) -> Iterator[bytes]:
-    """Yields a file with each of its bits the other way round."""
+    """Yields a file with each of its bits flipped."""
     return (hostile_files.flipped(content, bit) for bit in range(8 * len(content)))
 
 
 def by_kind(kind: str, content: bytes, read: Callable[[Path], object], path: Path) -> dict[str, Any]:
-    """Returns the outcomes of the corpus, by what is wrong with the files."""
+    """Returns the outcomes of the corpus, by fault."""
     groups = collections.defaultdict(list)
     for variant in (*hostile_files.variants(content), *SPECIAL[kind](content)):
         groups[variant.kind].append(variant.content)
@@ -143,7 +144,7 @@ def by_kind(kind: str, content: bytes, read: Callable[[Path], object], path: Pat
 
 
 def holes(content: bytes, read: Callable[[Path], str], path: Path) -> dict[str, Any]:
-    """Returns the outcomes of sparse files, and the longest time that one took, in seconds."""
+    """Returns the outcomes of sparse files, and the longest time of one file in seconds."""
     found: collections.Counter[str] = collections.Counter()
     longest = 0.0
     for one in hostile_files.sparse(content):
@@ -157,7 +158,7 @@ def holes(content: bytes, read: Callable[[Path], str], path: Path) -> dict[str, 
 
 
 def runs(folder: Path) -> dict[str, Any]:
-    """Returns the outcomes of checkpoints of which one file was replaced: all of the corpus, by the file that was."""
+    """Returns the outcomes of checkpoints with one file replaced by each file of the corpus, by the replaced file."""
     found: dict[str, Any] = {}
     for name in ("replay", "rollout"):
         with compiled_once():
@@ -182,7 +183,7 @@ def runs(folder: Path) -> dict[str, Any]:
 
 
 def replaced_by(run: Any, folder: Path, whole: Path, path: Path) -> str:
-    """Returns what becomes of a run one of whose files is replaced by one with a hole."""
+    """Returns the outcomes of runs with one file replaced by a sparse one."""
     shutil.copytree(run[1], folder, dirs_exist_ok=True)
     (folder / whole.name).unlink()
     path.rename(folder / whole.name)
@@ -191,12 +192,12 @@ def replaced_by(run: Any, folder: Path, whole: Path, path: Path) -> str:
 
 
 def peak_memory() -> int:
-    """Returns the most bytes that this process ever held."""
+    """Returns the peak memory of this process in bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 class Payload:
-    """What makes a file, and nothing else, when it is unpickled."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, marker: Path) -> None:
         self.marker = marker
@@ -206,7 +207,7 @@ class Payload:
 
 
 def code_in_ours(folder: Path) -> dict[str, Any]:
-    """Puts a pickle that runs code into every text of a model file, and in the file's place; returns what came of it."""
+    """Inserts a pickle that executes code at every string of a model file, and as the file; returns outcomes."""
     marker = folder / "ours-was-run"
     raw = pickle.dumps(Payload(marker))
     text = base64.b64encode(raw).decode()
@@ -225,7 +226,7 @@ def code_in_ours(folder: Path) -> dict[str, Any]:
 
 
 def texts(tree: Any) -> list[tuple[Any, Any]]:
-    """Returns where the values of a header stand."""
+    """Returns the paths of all values of a header."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     return [place for key, value in items for place in [(tree, key), *texts(value)]]
 
@@ -254,7 +255,7 @@ except Exception as error:
 
 
 def code_in_theirs(python: Path, folder: Path) -> dict[str, Any]:
-    """Gives Stable-Baselines3 a model in which one object is a pickle that runs code; returns what came of it."""
+    """Loads a Stable-Baselines3 model in which one object is a pickle that executes code; returns the outcome."""
     marker = folder / "theirs-was-run"
     payload = base64.b64encode(pickle.dumps(Payload(marker))).decode()
     command = [str(python), "-c", THEIRS, str(folder / "good.zip"), str(folder / "evil.zip"), payload]

@@ -1,17 +1,17 @@
-"""Kills a training run at random moments, hundreds of times, and lets it go on each time; then the same with a peer.
+"""Kills a training run at random moments, hundreds of times, and resumes it. Does the same with Stable-Baselines3.
 
     python trials/kill.py --kills 200 --sb3-python PATH
 
-The run is SAC on ``rejeu/Ball-v0`` with a checkpoint every 100 environment steps. Each life of it is a process of its own
-that goes on from the newest checkpoint and says every step that it takes; ``SIGKILL`` ends it at a random moment, two lives
-out of three as soon as a file is being written. After every death the folder must hold a checkpoint that loads and is at
-most one interval older than the last step said. At the end the run is taken to a fixed step and compared, bit for bit, with
-one that nothing interrupted.
+The run is SAC on ``rejeu/Ball-v0`` with a checkpoint every 100 environment steps. Every process resumes from the newest
+checkpoint and prints each step that it takes. ``SIGKILL`` ends it at a random moment, in two of three cases as soon as
+a file is being written. After every kill the folder must contain a checkpoint that loads and is at most one interval
+older than the last printed step. At the end the run continues to a fixed step and is compared, bit for bit, with an
+uninterrupted run.
 
-With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2) SAC on Pendulum is killed there in two ways: saving as most
-people do, by ``CheckpointCallback`` with its replay buffer every 100 steps, where every file has a new name; and saving model
-and replay buffer over and over under the same names, as a run that keeps its newest model does. It is counted how often what
-was left cannot be loaded, and how many steps the newest files that can be are behind.
+With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2), SAC on Pendulum is killed in two configurations.
+The first uses ``CheckpointCallback`` with the replay buffer every 100 steps, where every file has a new name. The
+second repeatedly saves the model and the replay buffer to the same paths. The results are the number of files that
+cannot be loaded, and the number of steps since the newest files that can be loaded.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def make() -> object:
 
 
 def live(folder: str, last: int) -> None:
-    """Trains until step ``last``, from the newest checkpoint if there is one, and says every step."""
+    """Trains until step ``last``, from the newest checkpoint if there is one, and prints every step."""
     import rejeu
     from rejeu.agents.run_files import run_files
     from rejeu.callbacks import Checkpoint
@@ -58,7 +58,7 @@ def live(folder: str, last: int) -> None:
 
 
 def live_sb3(folder: str) -> None:
-    """Saves a model and its replay buffer with Stable-Baselines3, over and over, under the same names."""
+    """Saves a model and its replay buffer with Stable-Baselines3, repeatedly, to the same paths."""
     from stable_baselines3 import SAC
 
     model = SAC("MlpPolicy", "Pendulum-v1", seed=7, **SETTINGS)
@@ -70,7 +70,7 @@ def live_sb3(folder: str) -> None:
 
 
 def live_sb3_callback(folder: str) -> None:
-    """Trains with Stable-Baselines3's checkpoints, which have new names, and says every step."""
+    """Trains with Stable-Baselines3's checkpoints, which have new names, and prints every step."""
     from stable_baselines3 import SAC
     from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
@@ -100,7 +100,7 @@ def check_sb3_callback(folder: str) -> None:
         ):
             try:
                 load()
-            except Exception as error:  # whatever it is, the file is lost
+            except Exception as error:  # with any exception the file is lost
                 text = f"{what}: {type(error).__name__}: {error}".replace(folder, "FOLDER")
                 errors.append(text.replace(f"_{step}_", "_N_")[:100])
         if len(errors) == n:
@@ -121,13 +121,13 @@ def check_sb3(folder: str) -> None:
                 model = SAC("MlpPolicy", "Pendulum-v1", **SETTINGS)
                 model.load_replay_buffer(f"{folder}/replay")
             said[what] = ""
-        except Exception as error:  # whatever it is, the file is lost
+        except Exception as error:  # with any exception the file is lost
             said[what] = f"{type(error).__name__}: {error}".replace(folder, "FOLDER")[:100]
     print(json.dumps(said))
 
 
 class Life:
-    """A process that is to be killed."""
+    """A process to kill."""
 
     def __init__(self, command: list[str]) -> None:
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
@@ -136,7 +136,7 @@ class Life:
         self._rest = b""
 
     def listen(self) -> int:
-        """Takes in what it said so far and returns the last number, -1 for none."""
+        """Reads the output so far and returns the last number, or -1 if there is none."""
         while part := self._read():
             *lines, self._rest = (self._rest + part).split(b"\n")
             if lines:
@@ -150,7 +150,7 @@ class Life:
             return b""
 
     def kill(self) -> int:
-        """Kills it and returns the last number that it said."""
+        """Kills the process and returns the last number that it printed."""
         self.process.send_signal(signal.SIGKILL)
         self.process.wait()
         said = self.listen()
@@ -159,7 +159,7 @@ class Life:
 
 
 def wait_for_a_write(folder: Path, seconds: float) -> bool:
-    """Waits until a temporary file is there, so that something is being written."""
+    """Waits until a temporary file exists, that is, until a file is being written."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if any(name.endswith(".tmp") for name in os.listdir(folder)):
@@ -179,7 +179,7 @@ def kill_rejeu(kills: int, rng: random.Random) -> dict[str, object]:
         lost, unreadable, during_writes, leftovers = [], 0, 0, 0
         for k in range(kills):
             life = Life([sys.executable, __file__, "--live", str(folder), str(10**9)])
-            first, early = None, k % 10 == 0  # one in ten dies while it starts, before its first update
+            first, early = None, k % 10 == 0  # one in ten is killed during startup, before its first update
             while first is None or (not early and life.said < first + EVERY):
                 if life.process.poll() is not None:
                     raise SystemExit(f"the run could not go on after {k} kills")
@@ -258,7 +258,7 @@ def kill_sb3_callback(python: str, kills: int, rng: random.Random) -> dict[str, 
             while life.listen() < 2 * EVERY and life.process.poll() is None:
                 time.sleep(0.01)
             time.sleep(rng.uniform(0, 1.0))
-            if k % 3 != 0:  # as soon as a new file is there
+            if k % 3 != 0:  # as soon as a new file exists
                 names = set(os.listdir(folder))
                 until = time.monotonic() + 10.0
                 while set(os.listdir(folder)) == names and time.monotonic() < until:

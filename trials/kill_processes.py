@@ -1,12 +1,12 @@
-"""Kills runs of many kinds at random moments, resumes each in a new process, and compares with a run that nothing interrupted.
+"""Kills many kinds of runs at random moments, resumes each in a new process, and compares it with an uninterrupted run.
 
     python trials/kill_processes.py --kills 20 --only parking lunar
     python trials/kill_processes.py --kills 4
 
-Every life of a run is a process of its own, as ``rejeu resume`` is: large networks, many environments, EnvPool, worker
-processes, priorities, n-step returns, hindsight, normalization and noise on parameters. The run that is not interrupted saves
-no checkpoints. Everything learned, the buffers, the history but its clock, the generator's state and the best weights are
-compared bit for bit.
+Every resumption is a new process, as with ``rejeu resume``. The runs cover large networks, many environments, EnvPool,
+worker processes, prioritized replay, n-step returns, hindsight, normalization and parameter noise. The uninterrupted
+run saves no checkpoints. All weights, the buffers, the history except its times, the state of the random generator and
+the best weights are compared bit for bit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ REPLAY = {"learning_starts": 200, "batch_size": 64, "buffer_size": 4000}
 
 
 class Case(NamedTuple):
-    """One kind of run."""
+    """A configuration of a run."""
 
     algorithm: str
     env_id: str
@@ -97,7 +97,7 @@ def vector(case: Case) -> Any:
 
 
 def live(name: str, folder: str, kept: bool) -> None:
-    """Trains to the end, from the newest checkpoint if there is one; says where it began and a digest of all at the end."""
+    """Trains to the end, from the newest checkpoint if there is one. Prints the first step and a final digest."""
     import rejeu
     from rejeu.agents.run_files import run_files
     from rejeu.callbacks import Checkpoint
@@ -130,7 +130,7 @@ def live(name: str, folder: str, kept: bool) -> None:
 
 
 def say_that_it_learns() -> Callable[[Any, Any], None]:
-    """Returns a callback that says once that this life has made updates, and so compiled everything."""
+    """Returns a callback that prints a line once this process has performed updates, so that everything is compiled."""
     before: list[int] = []
 
     def callback(agent: Any, turn: Any) -> None:
@@ -149,12 +149,12 @@ def say(**what: Any) -> None:
 
 
 def digest(agent: Any) -> dict[str, str]:
-    """Returns a hash of each array that a run consists of."""
+    """Returns a hash of each array of a run."""
     import jax
     import numpy as np
 
     rows = agent.history.table()
-    rows[:, 5] = 0.0  # the clock
+    rows[:, 5] = 0.0  # times
     run = agent.run
     best = {} if agent.best is None else {f"best.{i}": leaf for i, leaf in enumerate(agent.best.state)}
     arrays = {
@@ -176,13 +176,13 @@ def start(name: str, folder: Path, kept: bool) -> subprocess.Popen[bytes]:
 
 
 def said(process: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """Returns the next thing that a life says, empty if it has ended."""
+    """Returns the next message of a process, empty if it has ended."""
     line = process.stdout.readline()
     return json.loads(line) if line else {}
 
 
 def finished(process: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """Returns what a life says at its end."""
+    """Returns the last message of a process."""
     last: dict[str, Any] = {}
     while one := said(process):
         last = one
@@ -207,9 +207,9 @@ def try_case(name: str, kills: int, rng: random.Random) -> dict[str, Any]:
                 end = finished(process)
                 break
             second = said(process)
-            time.sleep(rng.uniform(0.0, 1.4 * whole["trained"] / kills))  # random, once it learns
+            time.sleep(rng.uniform(0.0, 1.4 * whole["trained"] / kills))  # a random moment during training
             if process.poll() is not None or "digest" in second:
-                end = second if "digest" in second else finished(process)  # it was over before its last kill
+                end = second if "digest" in second else finished(process)  # the run ended before its last kill
                 break
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()

@@ -1,16 +1,18 @@
-"""Cuts the power of a training run: on paper between any two of its file operations, and for real on an ext4 file system.
+"""Simulates power failures of a training run: between any two file operations, and on a real ext4 file system.
 
     python trials/power_loss.py --cuts 40
 
-On paper: the file operations of some runs are recorded, and every state is made that POSIX allows a power cut to leave
-(``tests/crash_states.py``): contents as of the last ``fsync``, with a part of what came later, and names as of the folder's
-last ``fsync``, with any of the changes since. In each the run must be resumed, at most one interval older. The same is counted
-where calls of ``fsync``, of files or of folders, are taken out of the record: runs must then be lost, else the trial is blind.
+Simulation: the file operations of some runs are recorded. Every state that POSIX allows after a power failure is then
+created (``tests/crash_states.py``). Files have their contents at the last ``fsync`` and a part of later writes. Folders
+have their names at the last ``fsync`` of the folder and any subset of later changes. From each state the run must
+resume, at most one interval older. For comparison, calls of ``fsync`` on files or on folders are removed from the
+record. Runs must then be lost, otherwise the simulation cannot detect errors.
 
-For real (as root on Linux): SAC on the ball trains on an ext4 file system in a file, with a checkpoint every 100 steps, in a
-process of its own. At random moments, two of three while a file is being written, the file system is shut down as by a power
-cut (``EXT4_IOC_SHUTDOWN`` without flushing the journal); what was not on disk is gone. It is mounted again, and the run
-resumed. At the end the run is compared, bit for bit, with one without cuts. Again without ``fsync`` for comparison.
+Real file system (as root on Linux): SAC trains on the ball on an ext4 file system in a file, in its own process, with a
+checkpoint every 100 steps. At random moments, in two of three cases while a file is being written, the file system is
+shut down as by a power failure (``EXT4_IOC_SHUTDOWN`` without flushing the journal). All data that was not on disk is
+lost. The file system is mounted again and the run is resumed. At the end the run is compared, bit for bit, with an
+uninterrupted run. For comparison, everything is repeated without ``fsync``.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from provenance import provenance
 
 RESULT = Path(__file__).parent / "results" / "power_loss.json"
 SHUTDOWN, WITHOUT_FLUSHING = 0x8004587D, 2
-"""The request to shut an ext4 file system down, and how."""
+"""The ioctl request that shuts down an ext4 file system, and its flag."""
 OFF: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 20, "batch_size": 8, "seed": 3}
 ON: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 16, "batch_size": 16, "seed": 3}
 RUNS: dict[str, tuple[str, int, dict[str, Any]]] = {
@@ -51,7 +53,7 @@ WITHOUT = {"": (), "without fsync of files": ("sync",), "without fsync of folder
 
 
 def on_paper(root: Path) -> dict[str, Any]:
-    """Tries every state of every run; returns totals."""
+    """Checks every state of every run; returns totals."""
     import rejeu
     from tests.agents.test_resume import compiled_once
     from tests.crash_states import crash_states
@@ -83,7 +85,7 @@ def on_paper(root: Path) -> dict[str, Any]:
 
 @contextmanager
 def mounted(image: Path, folder: Path) -> Iterator[None]:
-    """While entered, the file system in a file is mounted; renames bring no data to disk that fsync has not."""
+    """Context in which the file system in a file is mounted. Renames do not write data to disk without fsync."""
     subprocess.run(["mount", "-o", "loop,noauto_da_alloc", str(image), str(folder)], check=True)
     try:
         yield
@@ -92,7 +94,7 @@ def mounted(image: Path, folder: Path) -> Iterator[None]:
 
 
 def cut_power(folder: Path) -> None:
-    """Shuts down the file system of a folder; what is not on disk is gone."""
+    """Shuts down the file system of a folder. Data that is not on disk is lost."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.ioctl(handle, SHUTDOWN, struct.pack("I", WITHOUT_FLUSHING))
@@ -101,7 +103,7 @@ def cut_power(folder: Path) -> None:
 
 
 def for_real(cuts: int, root: Path, rng: random.Random, fsync: bool) -> dict[str, Any]:
-    """Cuts the power of a run many times; returns totals."""
+    """Simulates many power failures of a run; returns totals."""
     import numpy as np
 
     import rejeu
@@ -149,7 +151,7 @@ def for_real(cuts: int, root: Path, rng: random.Random, fsync: bool) -> dict[str
 
 
 def wait_until_it_learns(life: kill.Life, k: int, rng: random.Random) -> int:
-    """Waits until a process has taken an interval of steps, and some more; returns the last step that it said."""
+    """Waits until a process has taken one interval of steps and some more; returns the last step that it printed."""
     first = None
     while first is None or life.said < first + kill.EVERY:
         if life.process.poll() is not None:
@@ -162,7 +164,7 @@ def wait_until_it_learns(life: kill.Life, k: int, rng: random.Random) -> int:
 
 
 def live(folder: str, fsync: str) -> None:
-    """Trains from the newest checkpoint, with or without bringing files to disk."""
+    """Trains from the newest checkpoint, with or without ``fsync``."""
     if fsync == "no fsync":
         os.fsync = lambda handle: None
     warnings.simplefilter("ignore", UserWarning)

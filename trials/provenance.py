@@ -1,4 +1,4 @@
-"""What every file of results says of its origin: commit, date, command and machine."""
+"""Origin of results: commit, date, command and machine."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ ROOT = Path(__file__).parents[1]
 
 
 def provenance(names: dict[str, str] | None = None) -> dict[str, str]:
-    """Returns where results come from that this command is about to record.
+    """Returns the origin of the results that this command is about to record.
 
     Args:
-        names: what stands for an argument, such as a path of this machine, in the command.
+        names: replacements of arguments, such as paths of this machine, in the recorded command.
     """
     arguments = [(names or {}).get(argument, argument) for argument in sys.argv[1:]]
     script = Path(sys.argv[0]).resolve().relative_to(ROOT).as_posix()
@@ -30,7 +30,7 @@ def provenance(names: dict[str, str] | None = None) -> dict[str, str]:
 
 
 def commit() -> str:
-    """Returns the commit of the working tree, and whether its sources differ from it."""
+    """Returns the commit of the working tree, and whether its sources differ from the commit."""
     head = git("rev-parse", "--short", "HEAD")
     return f"{head}, with changes" if git("status", "--porcelain", "--", "src", "tests", "trials/*.py") else head
 

@@ -2,9 +2,8 @@
 
 python trials/report.py
 
-Every section names the commit, the date and the command of its figures. Older results do not contain their commit;
-then the commit
-that recorded them is shown. Trials without results are left out.
+Every section names the commit, the date and the command of its results. Older results do not contain their commit. For
+these, the commit that recorded them is shown. Trials without results are omitted.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ COMMANDS = {
     "hostile": "python trials/hostile.py --sb3-python PATH",
     "fuzz": "python trials/fuzz.py --seconds 300 (600 for run and rows)",
 }
-"""Commands of older results, which do not say them."""
+"""Commands of older results, which do not contain them."""
 NOT_TESTED = """- **Other systems.** All trials were run on Linux with local disks: not on macOS or Windows, on
 network file
   systems or on a GPU.
@@ -47,7 +46,7 @@ def read(name: str) -> Any:
 
 
 def origins(name: str) -> list[tuple[str, str, str]]:
-    """Returns commit, date and command of results, several if parts were recorded separately."""
+    """Returns the commit, date and command of results; several if parts were recorded separately."""
     found = read(name)
     parts = [found] if "command" in found or "date" in found else [p for p in found.values() if isinstance(p, dict)]
     recorded, day = git("log", "-1", "--format=%h %as", "--", f"trials/results/{name}.json").split() or ("", "")
@@ -60,7 +59,7 @@ def origins(name: str) -> list[tuple[str, str, str]]:
 
 
 def origin(name: str) -> str:
-    """Returns the same as text."""
+    """Returns the origin of results as text."""
     return "; ".join(f"Commit {commit}, {date}, {command}" for commit, date, command in origins(name)) + "."
 
 
@@ -331,7 +330,7 @@ through the loaders.
 
 
 def refused_of(counts: list[dict[str, Any]]) -> str:
-    """Returns how many files were refused, and other outcomes."""
+    """Returns the number of rejected files, and other outcomes."""
     outcomes: dict[str, int] = {}
     for count in counts:
         for outcome, n in count.items():
@@ -445,7 +444,7 @@ Memory increased by {found["growth_percent"]:.2f} %, {
 
 
 def wrapped(page: str) -> str:
-    """Returns a page with filled paragraphs and list items."""
+    """Returns a page with its paragraphs and list items wrapped."""
     blocks = []
     for block in re.split(r"\n{2,}", page.strip()):
         if block.startswith("- "):
@@ -471,7 +470,7 @@ SECTIONS: dict[str, Callable[[], str]] = {
     "environments": environments,
     "soak": soaked,
 }
-"""The trials in the order of the page, by the name of their results."""
+"""The trials in the order of the page, by the names of their results."""
 
 
 def main() -> None:

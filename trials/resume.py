@@ -1,12 +1,12 @@
-"""Cuts runs off at a random step and lets them go on, for every algorithm and environment; compares with unbroken runs.
+"""Interrupts and resumes runs of every algorithm and environment, and compares them with uninterrupted runs.
 
     python trials/resume.py --sb3-python PATH
 
-Of each case three runs are made: one without a break, one that a callback stops at a random step, leaving a checkpoint, and
-one that goes on from there. Parameters, replay buffer or rollout, episodes, counters and rows of statistics must be equal,
-bit for bit, wherever the state of the environment can be carried; elsewhere what was learnt and the buffer must be those of
-the moment of the break. With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2) the same is tried there by what
-it offers: model and replay buffer saved and loaded, episodes begun anew.
+Each case has three runs: one without interruption, one that a callback stops at a random step with a checkpoint, and
+one that resumes from the checkpoint. Parameters, replay buffer or rollout, episodes, counters and rows of statistics
+must be equal, bit for bit, if the state of the environment can be saved. Otherwise weights and buffer must equal those
+at the interruption. With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2), the same is done with
+Stable-Baselines3: model and replay buffer are saved and loaded, and training continues with new episodes.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ NOT_CARRIED = {
     "CartPole-v1": ("PPO", "envpool"),
     "parking-v0": ("SAC", "gymnasium"),
 }
-"""Environments whose state no file can hold, an algorithm to try them with, and the backend."""
+"""Environments whose state cannot be saved, with an algorithm and a backend for each."""
 
 
 def facts(agent: Any) -> dict[str, Any]:
     import numpy as np
 
     rows = agent.history.table()
-    rows[:, 5] = 0.0  # the clock
+    rows[:, 5] = 0.0  # times
     counters = np.array([agent.num_timesteps, agent.n_updates])
     buffer = {f"buffer.{key}": value for key, value in agent.run.replay.arrays().items()}
     return {**agent.get_parameters(), **buffer, "history": rows, "counters": counters}
@@ -61,7 +61,7 @@ def same(one: dict[str, Any], two: dict[str, Any]) -> bool:
 
 
 class Rows:
-    """Keeps rows of statistics without what depends on the clock."""
+    """Collects rows of statistics without values that depend on wall time."""
 
     def __init__(self) -> None:
         self.rows: list[str] = []
@@ -70,7 +70,7 @@ class Rows:
         self.rows.append(repr([step, *((k, v) for k, v in metrics.items() if not k.startswith("time/"))]))
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Does nothing; there are no resources to release."""
 
 
 def make(algorithm: str, env_id: str, n_envs: int, backend: str) -> Callable[[], Any]:
@@ -97,7 +97,7 @@ def vector(env_id: str, n_envs: int, backend: str) -> Any:
 
 @contextlib.contextmanager
 def compiled_once() -> Iterator[None]:
-    """Within, agents of one kind share what is compiled, which holds no state: compiling takes most of the time."""
+    """Context in which equal agents share compiled functions (they have no state), to save compilation time."""
     from unittest import mock
 
     import rejeu
@@ -152,7 +152,7 @@ def cases() -> list[tuple[str, str, int, str]]:
 
 
 def sb3(seed: int) -> None:
-    """Prints how far parameters of broken and unbroken runs are apart in Stable-Baselines3."""
+    """Prints the difference of parameters between interrupted and uninterrupted runs of Stable-Baselines3."""
     import numpy as np
     import stable_baselines3
 

@@ -1,14 +1,15 @@
-"""Sends Ctrl-C and SIGTERM to ``rejeu train`` at random moments of its whole life, and looks at what is left.
+"""Sends Ctrl-C and SIGTERM to ``rejeu train`` at random moments and checks the state that it leaves behind.
 
     python trials/signals.py --signals 48
 
-The run is SAC on ``rejeu/Ball-v0``: imports, compiling, training with evaluations and checkpoints, the last evaluation, the
-curve and the video. Its length is measured once without a signal; then each run gets a signal at a random moment of it, or
-two in a row. Afterwards the exit status must be 130 for Ctrl-C and 143 for SIGTERM, standard error must hold one line at
-most and no traceback, both models in the folder must load, and if there is a checkpoint the run must resume and train on.
+The run is SAC on ``rejeu/Ball-v0``: imports, compilation, training with evaluations and checkpoints, the last
+evaluation, the learning curve and the video. Its duration is measured once without a signal. Each further run receives
+a signal, or two in succession, at a random moment. The exit status must then be 130 for Ctrl-C and 143 for SIGTERM.
+Standard error must contain at most one line and no traceback. Both models in the folder must load. If there is a
+checkpoint, the run must resume and train.
 
-A signal that comes before Python has begun to import rejeu is Python's own affair; such runs are counted apart (Linux says
-whether the handler is installed).
+A signal that arrives before Python imports rejeu is handled by Python. Such runs are counted separately (Linux
+reports whether the handler is installed).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ PHASES = ("before rejeu", "imports and compiling", "training", "evaluation, curv
 
 
 def start(root: Path, number: int) -> tuple[subprocess.Popen[bytes], Path]:
-    """Starts a run, every other one by the script ``rejeu``, with its output in files."""
+    """Starts a run with its output in files. Every second run uses the script ``rejeu``."""
     script = Path(sys.executable).with_name("rejeu")
     program = [str(script)] if number % 2 and script.exists() else [sys.executable, "-m", "rejeu"]
     run = root / "run"
@@ -59,7 +60,7 @@ def start(root: Path, number: int) -> tuple[subprocess.Popen[bytes], Path]:
 
 
 def handles(process: subprocess.Popen[bytes]) -> bool:
-    """Returns whether a process handles SIGTERM, as only rejeu makes it do."""
+    """Returns whether a process handles SIGTERM, which only rejeu installs a handler for."""
     try:
         status = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
     except OSError:
@@ -77,7 +78,7 @@ def phase(root: Path, process: subprocess.Popen[bytes]) -> str:
 
 
 def attempt(number: int, seconds: float, rng: random.Random) -> dict[str, Any] | None:
-    """Runs, sends a signal and returns what came of it; None if the run was over before."""
+    """Starts a run, sends a signal and returns the outcome; None if the run ended first."""
     sent = rng.choice([signal.SIGINT, signal.SIGTERM])
     twice = rng.random() < 0.15
     with tempfile.TemporaryDirectory() as folder:
@@ -110,7 +111,7 @@ def attempt(number: int, seconds: float, rng: random.Random) -> dict[str, Any] |
 
 
 def left_by(run: Path) -> str:
-    """Returns what is wrong with a run folder, or how it goes on: ``resumed``, ``no checkpoint`` or ``no folder``."""
+    """Returns the fault of a run folder, or else ``resumed``, ``no checkpoint`` or ``no folder``."""
     import rejeu
 
     if not run.exists():
@@ -124,7 +125,7 @@ def left_by(run: Path) -> str:
         env = rejeu.make_vector("rejeu/Ball-v0", 1, "gymnasium")
         agent = rejeu.SAC.resume(run / "checkpoints", env)
         agent.learn(20, reset_num_timesteps=False)
-    except Exception as error:  # whatever it is, the folder is of no use
+    except Exception as error:  # with any exception the folder is unusable
         return f"{type(error).__name__}: {error}"[:200]
     return "resumed"
 
@@ -136,7 +137,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rng = random.Random(arguments.seed)
     lengths = []
-    for number in range(2):  # the first fills the cache of compiled programs
+    for number in range(2):  # the first run fills the compilation cache
         with tempfile.TemporaryDirectory() as folder:
             began = time.monotonic()
             process, _ = start(Path(folder), number)

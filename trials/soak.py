@@ -1,11 +1,12 @@
-"""Trains for an hour with everything switched on and watches memory, open files, threads and processes.
+"""Trains for an hour with all features enabled and monitors memory, open files, threads and processes.
 
     python trials/soak.py --minutes 60
 
-SAC with hindsight replay on parking-v0, 8 EnvPool environments, with evaluation every 20,000 steps, a checkpoint every minute,
-a film every 100,000 steps, tables and a progress bar. The replay buffer is full, and every part has run more than once, long
-before the warm-up is over; from then on nothing may grow. ``trials/results/soak.json`` holds what was seen every ten seconds,
-``docs/images/soak.png`` shows it. Needs psutil.
+The run is SAC with hindsight experience replay on parking-v0 in 8 EnvPool environments. It has an evaluation every
+20,000 steps, a checkpoint every minute, a video every 100,000 steps, tables and a progress bar. Before the end of the
+warm-up the replay buffer is full and every feature has run more than once. After the warm-up no resource may grow.
+``trials/results/soak.json`` contains the measurements, one every ten seconds, and ``docs/images/soak.png`` shows them.
+Requires psutil.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ RESULT = Path(__file__).parent / "results" / "soak.json"
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "soak.png"
 EVERY_SECONDS = 10.0
 WARM_UP = 0.25
-"""Share of the hour after which nothing may grow."""
+"""Fraction of the run after which no resource may grow."""
 
 
 class Watch(threading.Thread):
-    """Notes what the process holds, every ten seconds."""
+    """Records the resources of the process every ten seconds."""
 
     def __init__(self, began: float) -> None:
         super().__init__(daemon=True)
@@ -104,7 +105,7 @@ def train(minutes: float, folder: Path, watch: Watch) -> dict[str, object]:
 
 
 def judge(rows: list[dict[str, float]], minutes: float) -> dict[str, float]:
-    """Compares the last tenth with the first tenth after the warm-up."""
+    """Compares the last tenth of the run with the first tenth after the warm-up."""
     late = [row for row in rows if row["seconds"] >= WARM_UP * 60 * minutes]
     tenth = max(len(late) // 10, 1)
     first, last = late[:tenth], late[-tenth:]
@@ -113,7 +114,7 @@ def judge(rows: list[dict[str, float]], minutes: float) -> dict[str, float]:
     slope = np.polyfit([row["seconds"] / 3600 for row in late], [row["mib"] for row in late], 1)[0]
     return {
         "minutes": minutes,
-        "minutes_suspended": float(gaps[gaps > EVERY_SECONDS].sum() / 60),  # by something else on the machine
+        "minutes_suspended": float(gaps[gaps > EVERY_SECONDS].sum() / 60),  # by another program on the machine
         "mib_after_warm_up": mean(first, "mib"),
         "mib_at_the_end": mean(last, "mib"),
         "growth_percent": 100 * (mean(last, "mib") / mean(first, "mib") - 1),

@@ -1,13 +1,14 @@
-"""Draws transitions from replay buffers in use, and compares each with what the environments say that happened.
+"""Samples transitions from replay buffers during training, and compares each with the records of the environments.
 
     python trials/transitions.py
 
-Agents train on environments that write down everything they answer. Between two calls of ``learn`` batches are drawn from
-the replay buffer, and every transition is computed again from those records, step by step in plain Python that shares no
-code with the buffers: observation, action, n-step reward, discount, next observation, goal, priority and weight. Cases are
-uniform and prioritized replay, 1 and 3 steps, all four strategies of hindsight with and without ``compute_terminated``, and
-stacked frames, each with 1 and 3 environments. Episodes are short and end by terminal states and by time limits; buffers are
-so small that they wrap many times; calls of ``learn`` end within episodes, and within a step of all environments.
+The agents train in environments that record everything they return. Between two calls of ``learn``, batches are sampled
+from
+the replay buffer. Every transition is recomputed from the records in plain Python that shares no code with the buffers:
+observation, action, n-step reward, discount, next observation, goal, priority and weight. The cases are uniform and
+prioritized replay, 1 and 3 steps, all four hindsight strategies with and without ``compute_terminated``, and frame
+stacking, each with 1 and 3 environments. Episodes are short and end by termination and by truncation. The buffers are
+so small that they wrap around many times. Calls of ``learn`` end within episodes, and within a vector step.
 """
 
 from __future__ import annotations
@@ -34,37 +35,37 @@ RESULT = Path(__file__).parent / "results" / "transitions.json"
 GAMMA, ALPHA, EPSILON, BETA = 0.9, 0.6, 1e-3, (0.4, 1.0)
 K, STACK, SIDE = 4, 4, 36
 ROWS, CALLS = 50, 24
-"""Rows of the buffer for each environment, and calls of ``learn``."""
+"""Buffer size in rows per environment, and number of calls of ``learn``."""
 BATCHES, BATCH = 2, 64
 NEAR = 0.5
-"""Distance at which a goal is reached. All positions are multiples of 1/8, so that sums are exact in any precision."""
+"""Distance at which a goal is reached. All positions are multiples of 1/8, so sums are exact in any precision."""
 
 
 class Case(NamedTuple):
-    """One kind of replay."""
+    """A configuration of the replay buffer."""
 
     n_envs: int
     n_steps: int
     prioritized: bool
     strategy: str | None = None
-    """Of hindsight; None without."""
+    """Hindsight strategy; None without hindsight."""
     ends: bool = False
-    """Whether the environment offers ``compute_terminated``."""
+    """Whether the environment has ``compute_terminated``."""
     frames: bool = False
-    """Whether observations are stacks of frames."""
+    """Whether observations are stacked frames."""
 
 
 class Row:
-    """One observation and, once it was taken, the step from it."""
+    """An observation and, once it has been taken, the step from it."""
 
     def __init__(self, serial: int, episode: int, obs: Any) -> None:
         self.serial, self.episode, self.obs = serial, episode, obs
         self.step: tuple[Any, float, bool] | None = None
-        """Action, reward and whether a terminal state was entered."""
+        """Action, reward and whether the step terminated."""
 
 
 class Recorded(gym.Env):
-    """Writes down what it answers. Episodes last 1 to 9 steps; half of them end in a terminal state."""
+    """Records everything that it returns. Episodes have 1 to 9 steps; half of them terminate."""
 
     def __init__(self, number: int, case: Case) -> None:
         self.number, self.case = number, case
@@ -94,7 +95,7 @@ class Recorded(gym.Env):
         if self.case.strategy is None:
             reward = float(self.on_grid(80)[0])
         else:
-            reward = reward_of(self.position, self.goal) - 5.0 * terminated  # a crash, which no goal explains
+            reward = reward_of(self.position, self.goal) - 5.0 * terminated  # a penalty, independent of the goal
             terminated = terminated or (self.case.ends and distance(self.position, self.goal) <= NEAR)
         self.rows[-1].step = (np.array(action), reward, bool(terminated))
         return self.observe(), reward, bool(terminated), over, {}
@@ -117,7 +118,7 @@ class Recorded(gym.Env):
 
 
 class Goals(Recorded):
-    """The same with goals; the third number of an achieved goal says which it is, and has no part in the reward."""
+    """A version with goals. The third component of an achieved goal is its id, which the reward ignores."""
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
         apart = np.abs(achieved - desired)[..., :2].sum(axis=-1)
@@ -125,7 +126,7 @@ class Goals(Recorded):
 
 
 class EndingGoals(Goals):
-    """The same, saying which goals end an episode."""
+    """A version that also defines at which goals an episode terminates."""
 
     def compute_terminated(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
         return np.abs(achieved - desired)[..., :2].sum(axis=-1) <= NEAR
@@ -141,17 +142,17 @@ def reward_of(achieved: Any, desired: Any) -> float:
 
 
 class Truth:
-    """What a buffer with room for so many rows of each environment must hold, by the environments' records."""
+    """The expected contents of a buffer with a given number of rows per environment, from the environments' records."""
 
     def __init__(self, envs: list[Recorded], case: Case, rows: int) -> None:
         self.envs, self.case, self.rows = envs, case, rows
         self.largest, self.priority = 1.0, {}
-        """The largest priority so far, and those of all steps, by environment and serial number."""
+        """The largest priority so far, and the priorities of all steps by environment and serial number."""
 
     def look(self) -> None:
-        """Takes in what was recorded since the last time."""
+        """Adds the steps that were recorded since the last call."""
         self.first = [max(len(env.rows) - self.rows, 0) for env in self.envs]
-        """Place of the oldest row that is kept, by environment."""
+        """Index of the oldest stored row, by environment."""
         self.place = [{row.serial: i for i, row in enumerate(env.rows)} for env in self.envs]
         self.steps = [
             (e, row.serial)
@@ -159,12 +160,12 @@ class Truth:
             for row in env.rows[self.first[e] :]
             if row.step is not None
         ]
-        """All steps that can be drawn."""
+        """All steps that can be sampled."""
         for key in self.steps:
             self.priority.setdefault(key, self.largest)
 
     def give(self, keys: list[tuple[int, int]], errors: np.ndarray) -> None:
-        """Takes TD errors; of steps that are no longer kept, as such."""
+        """Applies TD errors, also those of steps that are no longer stored."""
         priorities = [(abs(float(error)) + EPSILON) ** ALPHA for error in errors]
         kept = {*self.steps}
         self.priority.update({key: p for key, p in zip(keys, priorities, strict=True) if key in kept})
@@ -176,7 +177,7 @@ class Truth:
         return self.priority[key] / math.fsum(self.priority[one] for one in self.steps)
 
     def goals(self, env: int, at: int) -> list[tuple[int, int]]:
-        """Returns which achieved goals the step at a place may be given, as environment and place."""
+        """Returns the achieved goals that the step at an index can be relabeled with, as environment and index."""
         strategy, rows = self.case.strategy, self.envs[env].rows
         if strategy == "random":
             return [(e, self.place[e][serial] + 1) for e, serial in self.steps]
@@ -185,7 +186,7 @@ class Truth:
         return [(env, i) for i in chosen]
 
     def transition(self, env: int, at: int, goal: Any = None) -> tuple[float, int, float]:
-        """Returns reward, place of the next observation and discount of the step at a place, for a new goal if given."""
+        """Returns reward, next observation's index and discount of the step at an index, for a new goal if given."""
         rows, total, factor = self.envs[env].rows, 0.0, 1.0
         for i in range(at, at + self.case.n_steps):
             step = rows[i].step
@@ -203,7 +204,7 @@ class Truth:
         return total, at + self.case.n_steps, factor
 
     def observation(self, env: int, at: int) -> Any:
-        """Returns the observation at a place; frames that are no longer kept, or of another episode, are repeated."""
+        """Returns the observation at an index. It repeats frames that are not stored or of another episode."""
         rows = self.envs[env].rows
         if not self.case.frames:
             return rows[at].obs
@@ -212,13 +213,13 @@ class Truth:
 
 
 class Tally:
-    """Counts what was compared and what differed."""
+    """Counts of comparisons and differences."""
 
     def __init__(self) -> None:
         self.transitions = self.relabeled = self.n_ends = self.cut = 0
         self.wrong: list[str] = []
         self.shares: list[float] = []
-        """Where among the goals that were possible the goal stood, in [0, 1]."""
+        """Position of the sampled goal among the possible goals, in [0, 1]."""
 
     def check(self, good: Any, what: str) -> None:
         if not good:
@@ -232,7 +233,7 @@ def same(one: Any, two: Any) -> bool:
 
 
 def name(case: Case, obs: Any) -> tuple[int, int]:
-    """Returns environment and serial number of an observation that was drawn."""
+    """Returns the environment and serial number of a sampled observation."""
     if case.frames:
         e, high, low = (int(n) for n in obs[-1, 0, :3])
         return e, 256 * high + low
@@ -245,7 +246,7 @@ def rows_of(tree: Any, index: tuple[int, ...]) -> Any:
 
 
 def compare(truth: Truth, batch: Any, weights: np.ndarray | None, tally: Tally) -> list[tuple[int, int]]:
-    """Compares batches ``(batches, size)`` with the truth and returns which steps they hold, in order."""
+    """Compares batches ``(batches, size)`` with the expected values and returns the sampled steps in order."""
     case, keys = truth.case, []
     n_batches, size = batch.reward.shape
     share = int(size * K / (K + 1)) if case.strategy is not None else 0
@@ -309,10 +310,10 @@ def make(case: Case) -> tuple[list[Recorded], Any]:
 
 
 def learn(agent: Any, envs: list[Recorded], n: int) -> None:
-    """Takes ``n`` steps, and corrects the records by what the last turn must leave out.
+    """Takes ``n`` steps and removes from the records what the last vector step discards.
 
-    Where the number of environments does not divide ``n``, the last turn steps all of them, keeps the steps of the first
-    ones, and gives up the episodes of the others.
+    If the number of environments does not divide ``n``, the last vector step steps all environments but stores only the
+    steps of the first ones. The episodes of the others are discarded.
     """
     agent.learn(n, reset_num_timesteps=False)
     for env in envs[n % len(envs) :] if n % len(envs) else ():
@@ -329,7 +330,7 @@ def try_case(case: Case, seed: int) -> dict[str, Any]:
     for _ in range(CALLS):
         learn(agent, envs, int(rng.integers(1, 40)))
         truth.look()
-        if pending is not None:  # one call later, as some of the steps were overwritten
+        if pending is not None:  # one call later, because some of the steps were overwritten
             drawn, keys, errors = pending
             buffer.update_priorities([(drawn, errors)])
             truth.give(keys, errors)

@@ -1,1 +1,1 @@
-"""How fast rejeu is, beside its peers and beside what the machine allows: ``scripts/bench``, and the page it writes."""
+"""Compares the speed of rejeu with other libraries and with the limits of the machine. Used by ``scripts/bench``."""

@@ -1,15 +1,15 @@
-"""``scripts/bench``: rejeu, its peers and the machine's own limits, measured in turn in one run; then the page about it.
+"""Measures rejeu, other libraries and the machine's limits in one run, and writes a page with the results.
 
-    scripts/bench                                        # makes environments for the peers, takes about 35 minutes
-    scripts/bench --sb3-python PATH --sbx-python PATH    # with environments that are there
-    scripts/bench --resume                               # goes on where Ctrl-C ended
-    scripts/bench --report                               # writes the page anew from the samples
+    scripts/bench                                        # creates the other libraries' environments; 35 minutes
+    scripts/bench --sb3-python PATH --sbx-python PATH    # uses existing environments
+    scripts/bench --resume                               # continues an interrupted run
+    scripts/bench --report                               # rewrites the page from existing samples
 
-Every measurement runs in a fresh process, the libraries in turn, several rounds. Samples are kept as they come in
-``benchmarks/results/bench.jsonl``; in the end all of them, with what they were measured on, go to
-``benchmarks/results/bench.json``, and ``docs/performance.md`` with its pictures is written from that file.
+Every measurement runs in a new process. The libraries alternate, in several rounds. Each sample is appended to
+``benchmarks/results/bench.jsonl`` as soon as it is measured. At the end, all samples and a description of the machine
+are written to ``benchmarks/results/bench.json``. ``docs/performance.md`` and its figures are generated from that file.
 
-The machine must be quiet: other programs' work makes timings worthless, so a busy machine is refused.
+Other programs distort the timings, so the command refuses to run on a busy machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TAKES_PATHS = ("--sb3-python", "--sbx-python", "--peers", "--out", "--page")
 
 
 def parser() -> argparse.ArgumentParser:
-    """Returns the command line."""
+    """Parses the command line."""
     found = argparse.ArgumentParser(
         "scripts/bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -60,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def shown_command(arguments: Sequence[str]) -> str:
-    """Returns the command as anybody could run it: paths of this machine left out.
+    """Returns the command without paths of this machine.
 
     >>> shown_command(["--rounds", "2", "--sb3-python", "envs/sb3/python"])
     'scripts/bench --rounds 2 --sb3-python PATH'
@@ -74,10 +74,10 @@ def shown_command(arguments: Sequence[str]) -> str:
 
 
 def interpreters(arguments: argparse.Namespace) -> dict[str, str]:
-    """Returns the interpreter of each library, environments made where none was given.
+    """Returns the Python interpreter of each library, and creates the environments that are not given.
 
     Raises:
-        SystemExit: if one lacks something.
+        SystemExit: if an environment lacks a required module.
     """
     root = arguments.peers or Path(platformdirs.user_cache_dir("rejeu", appauthor=False)) / "bench-peers"
     found = {"rejeu": sys.executable}
@@ -92,7 +92,7 @@ def interpreters(arguments: argparse.Namespace) -> dict[str, str]:
 
 
 def header_of(arguments: argparse.Namespace, pythons: dict[str, str], command: str) -> dict[str, Any]:
-    """Returns what the file of results says about the run."""
+    """Returns the metadata of the run for the results file."""
     settings = {"rounds": arguments.rounds, "quick": arguments.quick, "cases": arguments.cases}
     settings["libraries"] = arguments.libraries
     return {
@@ -105,7 +105,7 @@ def header_of(arguments: argparse.Namespace, pythons: dict[str, str], command: s
 
 
 def write_results(path: Path, kept: runner.Samples) -> dict[str, Any]:
-    """Writes all samples with what they were measured on, one line a sample, and returns the same."""
+    """Writes all samples and the metadata to the results file, one sample per line, and returns them."""
     head = json.dumps(kept.header, indent=1)[:-2]
     rows = ",\n".join("  " + json.dumps(sample) for sample in kept.samples)
     path.write_text(f'{head},\n "samples": [\n{rows}\n ]\n}}\n', encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What is measured on: its description, how busy it is, and whether its speed stays the same."""
+"""The machine: its description, its current load, and whether its speed is constant."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ PACKAGES = {
     "sb3": ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "highway-env", "box2d", "numpy"),
     "sbx": ("sbx-rl", "stable-baselines3", "jax", "jaxlib", "flax", "optax", "torch", "gymnasium", "box2d", "numpy"),
 }
-"""Those whose versions a report names, by library."""
+"""Packages whose versions are reported, by library."""
 BUSY = 0.35
-"""Cores that other programs may use before the machine counts as busy."""
+"""Number of cores that other programs may use before the machine counts as busy."""
 CALIBRATION_SIZE, CALIBRATION_ROUNDS = 384, 40
 VERSIONS = """
 import json, platform, sys
@@ -36,7 +36,7 @@ print(json.dumps(found))
 
 
 def describe() -> dict[str, Any]:
-    """Returns processor, cores, memory and system."""
+    """Returns the processor, number of cores, memory and operating system."""
     return {
         "processor": processor(),
         "cores": cores(),
@@ -46,7 +46,7 @@ def describe() -> dict[str, Any]:
 
 
 def processor() -> str:
-    """Returns the processor's name as the system tells it."""
+    """Returns the name of the processor as reported by the system."""
     info = Path("/proc/cpuinfo")
     if info.exists():
         for line in info.read_text(encoding="utf-8").splitlines():
@@ -56,12 +56,12 @@ def processor() -> str:
 
 
 def cores() -> int:
-    """Returns how many processors this process may use."""
+    """Returns the number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def memory_gib() -> float | None:
-    """Returns the memory in GiB, None where that is not told."""
+    """Returns the memory in GiB, or None if the system does not report it."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
     except (AttributeError, ValueError, OSError):
@@ -69,7 +69,7 @@ def memory_gib() -> float | None:
 
 
 def versions(python: str, library: str) -> dict[str, str | None]:
-    """Returns the versions of Python and of the packages that a library's figures depend on, None for what is missing."""
+    """Returns the versions of Python and of a library's packages; None for packages that are not installed."""
     command = [python, "-c", VERSIONS, *PACKAGES[library]]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -78,13 +78,13 @@ def versions(python: str, library: str) -> dict[str, str | None]:
 
 
 SETTLE = 0.3
-"""Seconds that the threads of a matrix product go on spinning after it."""
+"""Time that the threads of a matrix product keep spinning after it, in seconds."""
 
 
 def others_busy(seconds: float = 0.25) -> float | None:
-    """Returns how many cores other programs use at this moment, None where the system does not tell.
+    """Returns the number of cores that other programs currently use, or None if the system does not report it.
 
-    This process sleeps meanwhile, so what is not idle is theirs.
+    This process sleeps during the measurement, so all CPU time that is not idle belongs to other programs.
     """
     stat = Path("/proc/stat")
     if not stat.exists():
@@ -102,7 +102,7 @@ def others_busy(seconds: float = 0.25) -> float | None:
 
 
 def calibrate() -> float:
-    """Returns the milliseconds of one fixed matrix product, the median of many: if it changes, so did the machine's speed.
+    """Returns the median duration of a fixed matrix product in milliseconds, to detect changes of the speed.
 
     >>> 0.0 < calibrate() < 1000.0
     True
@@ -117,15 +117,15 @@ def calibrate() -> float:
 
 
 def load() -> float | None:
-    """Returns the load average of the last minute, None where there is none."""
+    """Returns the load average of the last minute, or None if the system has none."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
 def why_busy() -> str | None:
-    """Returns what makes timings worthless now, None if the machine is quiet.
+    """Returns the reason why timings are currently unreliable, or None if the machine is idle.
 
-    Where the system tells how busy it is at this moment, the load average does not count: it still remembers what ended a
-    minute ago, a run of this program that is now resumed for one.
+    The load average is ignored if the system reports its current usage. It includes programs that ended within the last
+    minute, such as a run of this program that is being resumed.
     """
     busy, average = others_busy(2.0), load()
     if busy is not None:

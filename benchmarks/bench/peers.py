@@ -1,4 +1,4 @@
-"""Virtual environments for the libraries that rejeu is measured against."""
+"""Virtual environments of the libraries that rejeu is compared with."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import venv
 from pathlib import Path
 
 TORCH = "torch==2.13.0"
-"""Installed first, by whatever pip is set up to take it from: only its CPU build is needed."""
+"""Package that is installed first, from the index that pip is configured to use. Only its CPU build is needed."""
 PEERS = {
     "sb3": [
         "stable-baselines3==2.9.2",
@@ -25,20 +25,20 @@ NEEDED = {
     "sb3": ("stable_baselines3", "sb3_contrib", "highway_env", "Box2D"),
     "sbx": ("sbx", "stable_baselines3", "Box2D"),
 }
-"""Modules without which a library's measurements would fail."""
+"""Modules that the measurements of a library require."""
 FIND = "import importlib.util, sys; print(*[n for n in sys.argv[1:] if importlib.util.find_spec(n) is None])"
 
 
 def python_of(folder: Path) -> Path:
-    """Returns the interpreter of a virtual environment."""
+    """Returns the path of the Python interpreter of a virtual environment."""
     return folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
 
 
 def make(peer: str, root: Path) -> str:
-    """Returns the interpreter of a peer's virtual environment in ``root``, made now unless it is there.
+    """Returns the interpreter of a library's virtual environment in ``root``, which is created if missing.
 
     Raises:
-        SystemExit: if something cannot be installed; the environment is then made anew the next time.
+        SystemExit: if a package cannot be installed. The next call then creates the environment again.
     """
     folder, wanted = root / peer, [TORCH, *PEERS[peer]]
     python, mark = python_of(folder), folder / "installed.json"
@@ -56,10 +56,10 @@ def make(peer: str, root: Path) -> str:
 
 
 def missing(python: str, library: str) -> list[str]:
-    """Returns the modules that an interpreter lacks for a library's measurements.
+    """Returns the modules required by a library's measurements that an interpreter lacks.
 
     Raises:
-        SystemExit: if it cannot be run.
+        SystemExit: if the interpreter cannot be run.
     """
     try:
         done = subprocess.run([python, "-c", FIND, *NEEDED[library]], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""The pictures of the page."""
+"""Figures of the performance page."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STYLE = {
 
 
 def number(value: float, _: Any = None) -> str:
-    """Returns a number with three figures that count.
+    """Formats a number with three significant figures.
 
     >>> [number(x) for x in (0.1234, 2.5, 1234.0)]
     ['0.123', '2.5', '1,234']
@@ -41,7 +41,7 @@ def number(value: float, _: Any = None) -> str:
 def draw_steps(
     seconds: Mapping[str, Mapping[str, Spread]], limits: Mapping[str, Limit | None], path: Path, title: str
 ) -> None:
-    """Draws milliseconds of a step by case and library as bars, spreads as whiskers, limits as lines across rejeu's bars."""
+    """Plots milliseconds per step as bars by case and library, ranges as whiskers and rejeu's limits as lines."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(9, 4.4), layout="constrained")
         width = 0.26
@@ -86,13 +86,14 @@ def draw_rollouts(
     path: Path,
     title: str,
 ) -> None:
-    """Draws steps per second against the number of environments, a panel an algorithm, a line a library and backend.
+    """Plots steps per second against the number of environments, with one panel per algorithm.
 
     Args:
-        rates: by algorithm, by line (``rejeu``, ``rejeu, EnvPool``, ``sb3``, ``sbx``), by number of environments.
-        limits: steps per second likewise, dashed.
-        path: of the picture.
-        title: above it.
+        rates: steps per second by algorithm, by line (``rejeu``, ``rejeu, EnvPool``, ``sb3``, ``sbx``) and by number
+            of environments.
+        limits: limits in the same structure, plotted as dashed lines.
+        path: path of the image.
+        title: title of the figure.
     """
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(1, len(rates), figsize=(9, 4), layout="constrained", squeeze=False)
@@ -115,7 +116,7 @@ def draw_rollouts(
 
 
 def draw_replay(seconds: Mapping[str, Mapping[int, Spread]], path: Path, title: str) -> None:
-    """Draws microseconds of a batch against the size of the buffer, a line each; ``sb3`` begins the names of the peer's."""
+    """Plots microseconds per batch against the buffer size. Lines of Stable-Baselines3 start with ``sb3``."""
     colours = {"rejeu, hindsight": "#0b6e99", "sb3, hindsight": "#e07b39", "rejeu, priority": "#15b097"}
     labels = {
         "rejeu, hindsight": "rejeu, hindsight",
@@ -138,14 +139,14 @@ def draw_replay(seconds: Mapping[str, Mapping[int, Spread]], path: Path, title: 
 
 
 def logarithmic(axis: Any) -> None:
-    """Labels a logarithmic axis at 1, 2 and 5 of each power of ten."""
+    """Labels a logarithmic axis at 1, 2 and 5 times each power of ten."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(number))
 
 
 def draw_line(axes: Any, by: Mapping[int, Spread], colour: str, label: str) -> None:
-    """Draws medians as a line and spreads as a band."""
+    """Plots medians as a line and ranges as a band."""
     places: Sequence[int] = list(by)
     axes.plot(places, [found.median for found in by.values()], "o-", color=colour, label=label, markersize=4)
     low, high = ([getattr(found, end) for found in by.values()] for end in ("low", "high"))
@@ -153,7 +154,7 @@ def draw_line(axes: Any, by: Mapping[int, Spread], colour: str, label: str) -> N
 
 
 def save(figure: Any, path: Path) -> None:
-    """Writes a picture and lets it go."""
+    """Saves a figure and closes it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     plt.close(figure)

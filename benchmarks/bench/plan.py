@@ -1,4 +1,4 @@
-"""Everything that is measured: which library, with which settings, in which order."""
+"""The list of measurements: libraries, settings and order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ VARIANTS: dict[str, dict[str, str]] = {
         ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NPROC"), "1"
     ),
 }
-"""Environment variables by what the report calls them. ``NPROC`` is what XLA takes the size of its thread pool from."""
+"""Environment variables, by their names in the report. ``NPROC`` sets the size of XLA's thread pool."""
 
 PARKING = {
     "replay_buffer_kwargs": {"n_sampled_goal": 4, "goal_selection_strategy": "future"},
@@ -26,7 +26,7 @@ PARKING = {
     "train_freq": 1,
     "gradient_steps": 1,
 }
-"""What the parking job sets; everything else is each library's default, which is the same."""
+"""Hyperparameters of the parking task. All others are the defaults, which are equal in all libraries."""
 SMALL = {"batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
 MIDDLE = {"batch_size": 128, "policy_kwargs": {"net_arch": [128, 128]}}
 LARGE = {"batch_size": 256, "policy_kwargs": {"net_arch": [256, 256]}}
@@ -45,11 +45,11 @@ STEPS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "TQC": ("TQC", "Pendulum-v1", MIDDLE),
     "CrossQ": ("CrossQ", "Pendulum-v1", MIDDLE),
     "DQN": ("DQN", "MountainCar-v0", VALUES),
-    "QRDQN": ("QRDQN", "MountainCar-v0", {**VALUES, "batch_size": 32}),  # 200 by 200 quantiles a transition
+    "QRDQN": ("QRDQN", "MountainCar-v0", {**VALUES, "batch_size": 32}),  # 200 by 200 quantiles per transition
 }
-"""Algorithm, environment and settings of each case with one environment and one update a step."""
+"""Algorithm, environment and hyperparameters of each case with one environment and one update per step."""
 POOL = "SAC, 8 environments"
-"""The case with eight environments on EnvPool and eight updates a turn; the settings are those of ``SAC``."""
+"""The case with eight EnvPool environments and eight updates per vector step. Hyperparameters as in ``SAC``."""
 LANDER = "LunarLanderContinuous-v3"
 ROLLOUT = 2048
 N_ENVS = (1, 4, 16, 64)
@@ -59,33 +59,33 @@ SIZES = (1_000, 10_000, 100_000, 1_000_000)
 
 @dataclass(frozen=True)
 class Measurement:
-    """One thing to measure, once a round, in a process of its own."""
+    """One measurement, which runs once per round in its own process."""
 
     case: str
     name: str
     library: str
     worker: str
-    """A module of ``benchmarks.bench.work``."""
+    """Name of a module in ``benchmarks.bench.work``."""
     arguments: dict[str, Any] = field(default_factory=dict)
     variants: tuple[str, ...] = ("",)
-    """All are measured in the first round, the fastest of them in the others."""
+    """Settings to compare. The first round measures all of them, later rounds only the fastest one."""
     rounds: int | None = None
-    """None for as many as there are."""
+    """Number of rounds. None means all rounds of the run."""
     keeps_compiled: bool = True
-    """Whether compiled programs are taken from the run's own cache; False compiles everything anew."""
+    """Whether to use the compilation cache of the run. If False, everything is compiled again."""
     counts: bool = False
-    """Whether the first round counts the operations too."""
+    """Whether the first round also counts floating-point operations."""
 
     @property
     def key(self) -> str:
-        """Names the measurement in the file of samples."""
+        """Key of the measurement in the samples file."""
         return f"{self.case}/{self.name}/{self.library}"
 
 
 def everything(quick: bool = False) -> list[Measurement]:
-    """Returns all measurements of a round in their order, libraries next to each other.
+    """Returns all measurements of a round in order, with the libraries of a case next to each other.
 
-    ``quick`` leaves out what runs the same code as others, and makes the rest too short to mean anything.
+    ``quick`` omits cases that run the same code as others and shortens the rest. Its timings are meaningless.
     """
     seconds = 0.1 if quick else 1.2
     found = [
@@ -112,13 +112,13 @@ def everything(quick: bool = False) -> list[Measurement]:
 
 
 def is_first(measurement: Measurement) -> bool:
-    """Returns whether nothing like it is measured before: PPO and A2C with one number of environments are enough."""
+    """Returns whether no similar case is measured before. One number of environments is enough for PPO and A2C."""
     alike = measurement.case == "rollouts" and measurement.arguments["n_envs"] != 4
     return not alike and measurement.name != "SAC, 256-256"
 
 
 def env_name(env: str, n_envs: int, backend: str) -> str:
-    """Returns the name of the measurement of bare steps of environments."""
+    """Returns the key of the measurement of environment steps without an agent."""
     return f"{env}, {n_envs} on {backend}"
 
 
@@ -179,7 +179,7 @@ def steps(seconds: float) -> list[Measurement]:
 
 
 def rollout_settings(algorithm: str, n_envs: int) -> dict[str, Any]:
-    """Returns the hyper-parameters, the same in every library."""
+    """Returns the hyperparameters, which are the same in every library."""
     shared: dict[str, Any] = {"policy_kwargs": {"net_arch": [64, 64]}}
     if algorithm == "A2C":
         return {**shared, "n_steps": 5}
@@ -195,7 +195,7 @@ def rollouts(seconds: float) -> list[Measurement]:
             for backend in BACKENDS:
                 arguments = {"library": "rejeu", "backend": backend, **shared}
                 name = f"{algorithm}, {n} on {backend}"
-                counts = backend == "gymnasium"  # the operations are the same on either
+                counts = backend == "gymnasium"  # the number of operations does not depend on the backend
                 found.append(Measurement("rollouts", name, "rejeu", "rollouts", arguments, counts=counts))
             for library in ("sb3", "sbx") if algorithm == "PPO" else ("sb3",):
                 arguments = {"library": library, **shared}

@@ -1,4 +1,4 @@
-"""The page ``docs/performance.md``, written from the file of results."""
+"""Writes ``docs/performance.md`` from the results file."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ IN_THE_WAY = (
     "**Parking on highway-env is limited by the environment**, which takes 90 % of the training time.",
     "**PPO on Gymnasium is limited by the environments.** The ratio at the limit is below 4 with 16 environments.",
 )
-"""Profiling results on the machine of the page."""
+"""Profiling results on the machine of the report."""
 
 
 def write(results: Mapping[str, Any], page: Path) -> None:
-    """Writes the page, and its pictures into the folder ``images`` beside it."""
+    """Writes the page, and its figures to the folder ``images`` next to it."""
     samples = results["samples"]
     sections = [
         head(results),
@@ -163,7 +163,7 @@ networks and batches of 64 the matrix products are {sac_by_hand() / 1e6:.2f} MFL
 
 
 def sac_by_hand() -> int:
-    """Returns the formula's count for the case ``SAC``."""
+    """Returns the operation count of the case ``SAC`` by the formula."""
     from benchmarks.bench.work import flops
 
     return flops.sac_by_hand(3, 1, (64, 64), 64)

@@ -1,4 +1,4 @@
-"""Runs measurements one after the other, each in a fresh process, and keeps every sample at once."""
+"""Runs the measurements one after the other, each in a new process, and saves every sample immediately."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from benchmarks.bench.summary import cost
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900.0
-"""Seconds after which a measurement counts as failed."""
+"""Timeout of a measurement, in seconds."""
 
 Sample = dict[str, Any]
 
 
 class Samples:
-    """The file of samples: a header, then one line of JSON for each, written as soon as it is there."""
+    """The samples file: a header and one line of JSON per sample. Each line is written as soon as it is available."""
 
     def __init__(self, path: Path, header: Mapping[str, Any], resume: bool) -> None:
-        """Begins a file, or goes on with one.
+        """Creates a file, or opens an existing one to continue it.
 
         Raises:
-            SystemExit: if the file to go on with is of a run with other settings.
+            SystemExit: if the existing file belongs to a run with other settings.
         """
         self.path, self.header = path, dict(header)
         self.samples: list[Sample] = []
@@ -48,18 +48,18 @@ class Samples:
         path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
 
     def add(self, sample: Sample) -> None:
-        """Keeps a sample."""
+        """Appends a sample."""
         self.samples.append(sample)
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(sample) + "\n")
 
     def has(self, key: str, variant: str, turn: int) -> bool:
-        """Returns whether a sample is there."""
+        """Returns whether a sample exists."""
         return any((s["key"], s["variant"], s["round"]) == (key, variant, turn) for s in self.samples)
 
 
 def variants_of(measurement: Measurement, turn: int, samples: Sequence[Sample]) -> tuple[str, ...]:
-    """Returns which variants a round measures: all in the first, then the one that was the fastest in it."""
+    """Returns the variants to measure in a round: all in the first round, then only the fastest one."""
     if turn == 0 or len(measurement.variants) == 1:
         return measurement.variants
     first = [s for s in samples if s["key"] == measurement.key and s["round"] == 0 and "error" not in s]
@@ -67,7 +67,7 @@ def variants_of(measurement: Measurement, turn: int, samples: Sequence[Sample]) 
 
 
 def run_all(plan: Sequence[Measurement], rounds: int, pythons: Mapping[str, str], kept: Samples, cache: Path) -> None:
-    """Takes every sample that is not there yet, all measurements in turn, ``rounds`` times."""
+    """Runs all measurements ``rounds`` times, except those whose samples exist."""
     began = time.perf_counter()
     before = machine.calibrate()
     for turn in range(rounds):
@@ -96,7 +96,7 @@ def run_all(plan: Sequence[Measurement], rounds: int, pythons: Mapping[str, str]
 
 
 def line(sample: Sample, turn: int, rounds: int, elapsed: float) -> str:
-    """Returns what is shown of a sample once it is there."""
+    """Returns a one-line description of a sample."""
     what = f"{sample['key']}{', ' + sample['variant'] if sample['variant'] else ''}"
     told = "FAILED: " + sample["error"].splitlines()[-1][:120] if "error" in sample else f"{cost(sample):.4g} s"
     if sample["case"] in ("steps", "rollouts") and "error" not in sample:
@@ -108,7 +108,7 @@ def line(sample: Sample, turn: int, rounds: int, elapsed: float) -> str:
 
 
 def measure(measurement: Measurement, turn: int, python: str, variant: str, cache: Path) -> Sample:
-    """Runs one measurement in a process of its own and returns its result, or the error it ended with."""
+    """Runs one measurement in its own process and returns its result, or the error that ended it."""
     arguments = dict(measurement.arguments)
     if measurement.counts and turn == 0:
         arguments["count"] = True
@@ -133,9 +133,9 @@ def measure(measurement: Measurement, turn: int, python: str, variant: str, cach
 
 
 def child_environment(measurement: Measurement, variant: str, cache: Path) -> dict[str, str]:
-    """Returns the environment variables of a measurement's process."""
+    """Returns the environment variables for the process of a measurement."""
     environment = {**os.environ, **VARIANTS[variant], "PYTHONWARNINGS": "ignore", "JAX_PLATFORMS": "cpu"}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is compiled, a checkout at its first import
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # pip compiles packages, the first import a checkout
     if measurement.library == "rejeu":
         source = str(ROOT / "src")
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH", ""))))

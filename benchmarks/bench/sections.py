@@ -1,4 +1,4 @@
-"""The sections of the page on what was measured, each empty if its case was not."""
+"""Sections of the page with measured results. A section is empty if its case was not measured."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ environment" is the time of `step` and `reset`. 64-64 networks, batches of 64, o
 
 
 def share_table(cases: Sequence[tuple[str, Sequence[Sample], Mapping[str, float] | None]]) -> str:
-    """Returns rejeu's time by part, and its difference to the limit if there is one."""
+    """Returns rejeu's time by part, and the difference from the limit if there is one."""
     rows = []
     beyond = any(gaps is not None for *_, gaps in cases)
     for name, found, gaps in cases:
@@ -140,7 +140,7 @@ LIMIT_HEADER = ("limit", "environment part", "arithmetic part", "of the limit")
 
 
 def compared(samples: Sequence[Sample], name: str, by: Mapping[str, ByRound], found: Limit | None) -> tuple[str, ...]:
-    """Returns the cells of a row of :func:`per_step`: rejeu's time, then each peer's with its setting and the ratio."""
+    """Returns a row of :func:`per_step`: rejeu's time, then time, setting and ratio of each other library."""
     cells = [with_spread(by["rejeu"], 1e3)]
     for library in ("sb3", "sbx"):
         setting = variant_of(best(samples, "steps", name, library))
@@ -150,7 +150,7 @@ def compared(samples: Sequence[Sample], name: str, by: Mapping[str, ByRound], fo
 
 
 def limit_cells(found: Limit | None, scale: float) -> tuple[str, ...]:
-    """Returns the cells of a limit."""
+    """Returns the cells that describe a limit."""
     if found is None:
         return ("",) * len(LIMIT_HEADER)
     numbers = (number(scale * value) for value in (found.seconds, found.env, found.arithmetic))
@@ -158,12 +158,12 @@ def limit_cells(found: Limit | None, scale: float) -> tuple[str, ...]:
 
 
 def gap_to(samples: Sequence[Sample], case: str, name: str, found: Limit | None) -> dict[str, float] | None:
-    """Returns what a step takes beyond a limit, None where there is no limit."""
+    """Returns the time per step in excess of a limit, or None without a limit."""
     return None if found is None else gap(samples, case, name, found)
 
 
 def env_of(name: str) -> str:
-    """Returns the name of the bare environment of a case of :func:`per_step`."""
+    """Returns the environment of a case of :func:`per_step` as named in the measurements without an agent."""
     if name == plan.POOL:
         return plan.env_name(plan.STEPS["SAC"][1], 8, "envpool")
     return plan.env_name(plan.STEPS[name][1], 1, "gymnasium")
@@ -225,12 +225,12 @@ environments in the process, so their figures are the same in both rows. SBX has
 
 
 def rate_of(seconds: ByRound) -> Spread:
-    """Returns steps per second from seconds of a step."""
+    """Converts seconds per step to steps per second."""
     return spread({turn: 1.0 / value for turn, value in seconds.items()})
 
 
 def rate_text(seconds: ByRound) -> str:
-    """Returns steps per second with their spread."""
+    """Returns steps per second and their range as text."""
     return with_spread({turn: 1.0 / value for turn, value in seconds.items()})
 
 

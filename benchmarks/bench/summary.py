@@ -1,4 +1,4 @@
-"""From samples to numbers: medians, spreads, ratios round by round, limits."""
+"""Statistics of samples: medians, ranges, ratios per round, and limits."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from benchmarks.bench import plan
 
 Sample = Mapping[str, Any]
 ByRound = dict[int, float]
-"""One number for each round."""
+"""One number per round."""
 PARTS = ("env", "replay", "update", "rest")
-"""What rejeu's loops tell apart, and what is left."""
+"""Parts of the training time that rejeu reports, and the rest."""
 
 
 class Spread(NamedTuple):
-    """The median of some numbers, and the least and the greatest."""
+    """Median, minimum and maximum."""
 
     median: float
     low: float
@@ -24,32 +24,32 @@ class Spread(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """What a step would take if nothing but the environment and the arithmetic took time."""
+    """The time that a step would take if only the environment and the arithmetic took time."""
 
     env: float
-    """Seconds of a bare environment step."""
+    """Seconds per environment step without an agent."""
     arithmetic: float
-    """Seconds of the operations of acting and updating, at the rate of the machine's best matrix product."""
+    """Seconds for the operations of acting and updating, at the rate of the machine's fastest matrix product."""
     flops: float
-    """Those operations, for one environment step."""
+    """Number of these operations per environment step."""
     share_reached: float
-    """The limit divided by the measured seconds of a step, the median over the rounds."""
+    """Limit divided by the measured seconds per step, the median over the rounds."""
 
     @property
     def seconds(self) -> float:
-        """Seconds of a step."""
+        """Seconds per step."""
         return self.env + self.arithmetic
 
 
 def cost(sample: Sample) -> float:
-    """Returns what the variants of a measurement are compared by, in seconds: of a step, or of the whole process."""
+    """Returns the seconds by which variants are compared: per step, or of the whole process."""
     if sample["case"] != "parking" and "seconds_per_step" in sample["result"]:
         return sample["result"]["seconds_per_step"]
     return sample["wall_seconds"]
 
 
 def best(samples: Iterable[Sample], case: str, name: str, library: str) -> list[Sample]:
-    """Returns a measurement's samples by round, of the variant that was measured most and, among those, is the fastest."""
+    """Returns a measurement's samples by round, of the variant with the most samples and, among those, the fastest."""
     by_variant: dict[str, list[Sample]] = {}
     for sample in samples:
         if (sample["case"], sample["name"], sample["library"]) == (case, name, library) and "error" not in sample:
@@ -61,12 +61,12 @@ def best(samples: Iterable[Sample], case: str, name: str, library: str) -> list[
 
 
 def by_round(rows: Iterable[Sample], get: Callable[[Sample], float]) -> ByRound:
-    """Returns a number of each sample by its round."""
+    """Returns a number of each sample by round."""
     return {sample["round"]: get(sample) for sample in rows}
 
 
 def spread(numbers: ByRound) -> Spread:
-    """Returns median, least and greatest.
+    """Returns median, minimum and maximum.
 
     >>> spread({0: 3.0, 1: 1.0, 2: 2.5})
     Spread(median=2.5, low=1.0, high=3.0)
@@ -75,7 +75,7 @@ def spread(numbers: ByRound) -> Spread:
 
 
 def ratio(top: ByRound, bottom: ByRound) -> Spread | None:
-    """Returns the ratios of the rounds that both have; None if there is none.
+    """Returns the ratios of the rounds that both have, or None if they share no round.
 
     >>> ratio({0: 4.0, 1: 9.0, 2: 8.0}, {0: 2.0, 1: 3.0})
     Spread(median=2.5, low=2.0, high=3.0)
@@ -85,20 +85,20 @@ def ratio(top: ByRound, bottom: ByRound) -> Spread | None:
 
 
 def step_seconds(samples: Sequence[Sample], case: str, name: str, library: str) -> ByRound:
-    """Returns the seconds of a step by round."""
+    """Returns the seconds per step by round."""
     return by_round(best(samples, case, name, library), cost)
 
 
 def peak(samples: Sequence[Sample], threads: int) -> float | None:
-    """Returns the most operations a second in any round, with one thread (1) or all (0)."""
+    """Returns the highest number of operations per second over the rounds, with one thread (1) or all (0)."""
     rows = best(samples, "limits", f"peak, {plan.ONE if threads == 1 else plan.ALL}", "rejeu")
     return max((row["result"]["flops_per_second"] for row in rows), default=None)
 
 
 def limit(samples: Sequence[Sample], case: str, name: str, env: str, counted_as: str = "") -> Limit | None:
-    """Returns rejeu's limit in a case whose bare environment was measured as ``env``; None if something is missing.
+    """Returns rejeu's limit in a case whose environment was measured as ``env``, or None if a measurement is missing.
 
-    ``counted_as`` names the measurement that counted the operations, where it is not the same.
+    ``counted_as`` names the measurement that counted the operations, if it is another one.
     """
     rows = best(samples, case, name, "rejeu")
     results = (row["result"] for row in best(samples, case, counted_as or name, "rejeu"))
@@ -114,7 +114,7 @@ def limit(samples: Sequence[Sample], case: str, name: str, env: str, counted_as:
 
 
 def shares(rows: Sequence[Sample]) -> dict[str, float] | None:
-    """Returns what share of a step rejeu spent on each part, medians over the rounds; None if there are no rows."""
+    """Returns the fraction of a step spent on each part, medians over the rounds; None if there are no rows."""
     if not rows:
         return None
     found = {}
@@ -125,10 +125,10 @@ def shares(rows: Sequence[Sample]) -> dict[str, float] | None:
 
 
 def gap(samples: Sequence[Sample], case: str, name: str, found: Limit) -> dict[str, float]:
-    """Returns what a step takes beyond its limit, in seconds by part, medians over the rounds.
+    """Returns the time per step in excess of its limit, in seconds by part, medians over the rounds.
 
-    The environment's part is what it takes beyond a bare step, the update's what the loop waits for beyond the arithmetic,
-    which is negative where environment and update run at the same time.
+    The part of the environment is its time in excess of steps without an agent. The part of the update is the waiting
+    time in excess of the arithmetic. It is negative where environment and update run at the same time.
     """
     floor = {"env": found.env, "update": found.arithmetic}
     rows = best(samples, case, name, "rejeu")
@@ -138,7 +138,7 @@ def gap(samples: Sequence[Sample], case: str, name: str, found: Limit) -> dict[s
 
 
 def drift(samples: Sequence[Sample]) -> Spread | None:
-    """Returns the milliseconds of the calibrating product over the run; None without samples."""
+    """Returns the duration of the calibration in milliseconds over the run; None without samples."""
     found = [ms for sample in samples for ms in sample["calibration_ms"]]
     return spread(dict(enumerate(found))) if found else None
 

@@ -1,4 +1,4 @@
-"""Numbers as text, and text as tables."""
+"""Formatting of numbers and tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def table(header: Row, rows: Iterable[Row]) -> str:
 
 
 def with_spread(numbers: ByRound, scale: float = 1.0) -> str:
-    """Returns the median with the least and the greatest, where there is more than one.
+    """Returns the median as text, with minimum and maximum if there are several values.
 
     >>> with_spread({0: 0.002, 1: 0.004, 2: 0.003}, 1e3), with_spread({0: 1.5}), with_spread({})
     ('3 (2 to 4)', '1.5', '')
@@ -39,12 +39,12 @@ def with_spread(numbers: ByRound, scale: float = 1.0) -> str:
 
 
 def times(found: Spread | None) -> str:
-    """Returns how many times faster, empty where that is not known."""
+    """Returns the speedup as text, empty if unknown."""
     return "" if found is None else f"{found.median:.2f}" if found.median < 10 else f"{found.median:.1f}"
 
 
 def times_of_most(peer: ByRound, own: ByRound, limit: Limit | None) -> str:
-    """Returns how many times faster than a peer, of how many times a program at the limit would be.
+    """Returns the speedup over another library, and the speedup that a program at the limit would have.
 
     >>> times_of_most({0: 8.0, 1: 12.0}, {0: 2.0, 1: 3.0}, Limit(env=0.5, arithmetic=0.5, flops=1.0, share_reached=0.4))
     '4.00 of 10.0'
@@ -56,10 +56,10 @@ def times_of_most(peer: ByRound, own: ByRound, limit: Limit | None) -> str:
 
 
 def percent(share: float) -> str:
-    """Returns a share in percent."""
+    """Formats a fraction as a percentage."""
     return f"{100 * share:.0f} %"
 
 
 def variant_of(rows: Sequence[Sample]) -> str:
-    """Returns which of a peer's settings the figures are of."""
+    """Returns the setting with which another library was measured."""
     return rows[0]["variant"] if rows else ""

@@ -1,5 +1,5 @@
-"""What is measured, a module each: ``python -m benchmarks.bench.work.NAME JSON`` prints one JSON object.
+"""The measurements, one module each. ``python -m benchmarks.bench.work.NAME JSON`` prints one JSON object.
 
-Each runs in a fresh process, with the interpreter of the library that it is of, so no module here imports rejeu or a peer
-before it knows which.
+Each measurement runs in a new process, with the Python interpreter of its library. Modules therefore import rejeu or
+another library only after they have read which one to measure.
 """

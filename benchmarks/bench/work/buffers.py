@@ -1,7 +1,7 @@
-"""Replay buffers that are full, of either library, without an agent and without the hours that filling them would take.
+"""Full replay buffers of rejeu and Stable-Baselines3, filled directly instead of by an agent, which would take hours.
 
-They hold episodes of 100 steps, of an environment with the spaces of highway-env's parking-v0, or of Pendulum-v1. Every byte
-is written, so that no page of memory is merely promised.
+They contain episodes of 100 steps with the spaces of highway-env's parking-v0 or of Pendulum-v1. Every byte is written,
+so that the operating system allocates all memory pages.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ACTION = {"parking": 2, "pendulum": 1}
 
 
 def observation_space(kind: str) -> spaces.Space:
-    """Returns the observations of ``"pendulum"``, or ``"parking"``: three vectors of six float64, as highway-env declares."""
+    """Returns observations of ``"pendulum"`` or of ``"parking"`` (three vectors of six float64, as in highway-env)."""
     if kind == "pendulum":
         return spaces.Box(-8.0, 8.0, (3,), np.float32)
     box = spaces.Box(-np.inf, np.inf, (6,), np.float64)
@@ -24,24 +24,24 @@ def observation_space(kind: str) -> spaces.Space:
 
 
 def action_space(kind: str) -> spaces.Box:
-    """Returns the actions of either."""
+    """Returns actions of ``"pendulum"`` or ``"parking"``."""
     return spaces.Box(-1.0, 1.0, (ACTION[kind],), np.float32)
 
 
 def necessary_bytes(kind: str) -> int:
-    """Returns the bytes that a transition must take: its observation once, action, reward and a flag for its end.
+    """Returns the minimum size of a transition in bytes: one observation, the action, the reward and a done flag.
 
-    Numbers are of four bytes, the flag of one: ``4 * (observation + action + 1) + 1``. The next observation is the next
-    transition's own.
+    Numbers have four bytes and the flag has one: ``4 * (observation + action + 1) + 1``. The next observation is stored
+    with the next transition.
     """
     observation = {"parking": 18, "pendulum": 3}[kind]
     return 4 * (observation + ACTION[kind] + 1) + 1
 
 
 def rejeu_ring(kind: str, rows: int) -> Any:
-    """Returns rejeu's ring of so many rows, of which every hundred and first is an episode's last observation, full.
+    """Returns a full replay buffer of rejeu with this many rows. Every 101st row is the last observation of an episode.
 
-    That of parking keeps what hindsight's strategy ``future`` needs.
+    The buffer of parking includes the data for the hindsight strategy ``future``.
     """
     from rejeu import spaces as own
     from rejeu.buffers.hindsight import HindsightConfig, counters
@@ -68,7 +68,7 @@ def rejeu_ring(kind: str, rows: int) -> Any:
 
 
 def fill_sb3(buffer: Any) -> Any:
-    """Fills a replay buffer of Stable-Baselines3, hindsight's included, with whole episodes, and returns it."""
+    """Fills a replay buffer of Stable-Baselines3 (hindsight included) with complete episodes and returns it."""
     rng = np.random.default_rng(0)
     size = buffer.buffer_size
 
@@ -92,7 +92,7 @@ def fill_sb3(buffer: Any) -> Any:
 
 
 def nbytes(thing: Any) -> int:
-    """Returns the bytes of all arrays that an object holds, itself or in dictionaries."""
+    """Returns the size in bytes of all arrays that an object holds directly or in dictionaries."""
     found = 0
     for value in vars(thing).values():
         for array in value.values() if isinstance(value, dict) else [value]:

@@ -1,4 +1,4 @@
-"""What the measurements share: their command line, their clock and how an agent of each library is made."""
+"""Functions shared by the measurements: command line, timing and construction of agents."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 
 
 def main(measure: Callable[..., dict[str, Any]]) -> None:
-    """Calls ``measure`` with the JSON object on the command line and prints what it returns as the last line."""
+    """Calls ``measure`` with the JSON object from the command line and prints the result as the last line."""
     result = measure(**json.loads(sys.argv[1]))
     print(json.dumps(result), flush=True)
 
 
 def timed(function: Callable[..., Any]) -> Any:
-    """Returns ``function`` with an attribute ``seconds``: the wall time spent in it so far."""
+    """Returns ``function`` with an attribute ``seconds``: the total wall time spent in it."""
 
     def call(*args: Any, **kwargs: Any) -> Any:
         began = time.perf_counter()
@@ -36,7 +36,7 @@ def timed(function: Callable[..., Any]) -> Any:
 
 
 def seconds_of(act: Callable[[], Any], seconds: float, warm_up: int = 3, chunks: int = 7) -> float:
-    """Returns the median over ``chunks`` stretches of the seconds that one ``act()`` takes, ``seconds`` in all."""
+    """Returns the median seconds per call of ``act()``, over ``chunks`` intervals that last ``seconds`` in total."""
     for _ in range(warm_up):
         act()
     began = time.perf_counter()
@@ -65,7 +65,7 @@ def algorithm_of(library: str, name: str) -> Any:
 
 
 def threads_used(agent: Any, library: str, n_envs: int) -> dict[str, Any]:
-    """Returns how many threads torch has, and whether rejeu takes one (1) or all (0) for an agent's updates."""
+    """Returns the number of torch threads, and whether rejeu uses one thread (1) or all (0) for an agent's updates."""
     used: dict[str, Any] = {"torch_threads": threads_of(library)}
     if library == "rejeu":
         used["threads"] = 1 if agent.n_threads(n_envs) == 1 else 0
@@ -73,7 +73,7 @@ def threads_used(agent: Any, library: str, n_envs: int) -> dict[str, Any]:
 
 
 def threads_of(library: str) -> int | None:
-    """Returns how many threads torch works with, None where the library has no torch in its updates."""
+    """Returns the number of torch threads, or None if the library does not use torch for its updates."""
     if library != "sb3":
         return None
     import torch
@@ -82,7 +82,7 @@ def threads_of(library: str) -> int | None:
 
 
 def wait(agent: Any, library: str) -> None:
-    """Waits until what was queued on the device is done."""
+    """Blocks until all operations on the device are finished."""
     if library == "rejeu":
         import jax
 
@@ -96,14 +96,14 @@ def wait(agent: Any, library: str) -> None:
 
 
 def time_learning(agent: Any, library: str, warm_up: int, unit: int, seconds: float) -> dict[str, Any]:
-    """Trains and returns the seconds of a step once everything is compiled, and what else there is to know.
+    """Trains an agent and returns the seconds per step after compilation, and other statistics.
 
     Args:
-        agent: with a ``learn`` as Stable-Baselines3 has it.
-        library: of the agent.
-        warm_up: environment steps before the clock starts; everything is compiled in them.
-        unit: steps are taken in multiples of it, a rollout on-policy.
-        seconds: about how long the clock runs.
+        agent: an agent with the ``learn`` method of Stable-Baselines3.
+        library: library of the agent.
+        warm_up: environment steps before timing starts. Everything is compiled during these steps.
+        unit: the number of steps is a multiple of this; for on-policy algorithms it is the size of a rollout.
+        seconds: approximate duration of the timing.
     """
     agent.learn(warm_up)
     wait(agent, library)
@@ -129,9 +129,9 @@ def time_learning(agent: Any, library: str, warm_up: int, unit: int, seconds: fl
 
 
 def resident_bytes() -> int | None:
-    """Returns how much memory this process holds, None where that is not told; freed memory is given back before."""
+    """Returns the memory of this process, or None if the system does not report it. Freed memory is released first."""
     gc.collect()
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # where the C library is not glibc
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # the C library may not be glibc
         ctypes.CDLL(None).malloc_trim(0)
     statm = Path("/proc/self/statm")
     if statm.exists():

@@ -1,4 +1,4 @@
-"""Seconds and bytes of saving and loading a model, and a replay buffer of so many transitions."""
+"""Measures time and file size of saving and loading a model, and a replay buffer with a given number of transitions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REPEATS = 5
 
 
 class Goals(gym.Env):
-    """An environment with parking's spaces that nobody plays; agents must be given one."""
+    """An environment with the spaces of parking. Agents need one, but it is never stepped."""
 
     observation_space = buffers.observation_space("parking")
     action_space = buffers.action_space("parking")
@@ -31,13 +31,13 @@ class Goals(gym.Env):
 
 
 def measure(library: str, n: int) -> dict[str, Any]:
-    """Saves and loads an agent of SAC with its default networks, and a full buffer of ``n`` transitions of parking's kind."""
+    """Saves and loads a SAC agent with the default networks, and a full buffer of ``n`` transitions of parking."""
     settings = {"buffer_size": n, "seed": 0}
     agent_class = common.algorithm_of(library, "SAC")
     if library == "sb3":
         settings["device"] = "cpu"
     agent = agent_class("MultiInputPolicy", Goals(), **settings)
-    agent.learn(110)  # some updates, before which Adam's moments may not exist
+    agent.learn(110)  # some updates, because Adam's moments may not exist before the first
     if library == "sb3":
         buffers.fill_sb3(agent.replay_buffer)
     else:
@@ -55,7 +55,7 @@ def measure(library: str, n: int) -> dict[str, Any]:
 
 
 def repeat(act: Callable[[], Any]) -> float:
-    """Returns the median of the seconds that ``act()`` takes, the first time left out."""
+    """Returns the median duration of ``act()`` in seconds, without the first call."""
     found = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()

@@ -1,8 +1,9 @@
-"""How much floating-point work an update is, by XLA's own count.
+"""Counts the floating-point operations of updates with XLA's cost analysis.
 
-XLA's cost analysis counts the body of a loop once, however often it runs, and of a conditional the costlier branch. So the
-count here is XLA's of the whole program, plus XLA's of each loop's body by itself for every further run of it, minus what
-a conditional's costlier branch has more than the other for the share of times that it is not taken.
+The cost analysis counts the body of a loop once, regardless of the number of iterations, and the more expensive branch
+of a conditional. The count here corrects this. It adds the cost of each loop's body for every further iteration. It
+subtracts the difference between the branches of a conditional for the fraction of calls that do not take the more
+expensive one.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 
 def flops(function: Callable[..., Any], *args: Any, while_runs: int = 1, taken: float = 1.0) -> float:
-    """Returns the floating-point operations of one call of ``function``, elementwise ones included.
+    """Returns the floating-point operations of one call of ``function``, including elementwise operations.
 
     Args:
-        function: what JAX can trace.
-        args: arrays or shapes of arrays.
-        while_runs: how often the body of a ``while_loop`` runs, which no program says.
-        taken: share of the calls in which a conditional takes its costlier branch.
+        function: a function that JAX can trace.
+        args: arrays, or shapes of arrays.
+        while_runs: number of iterations of a ``while_loop``, which the program does not contain.
+        taken: fraction of the calls in which a conditional takes its more expensive branch.
 
     >>> import jax, jax.numpy as jnp
     >>> flops(jnp.matmul, jnp.ones((4, 5), jnp.float32), jnp.ones((5, 6), jnp.float32))
@@ -47,12 +48,12 @@ def _flops(program: ClosedJaxpr, while_runs: int, taken: float) -> float:
 
 
 def _inner(program: ClosedJaxpr, while_runs: int, taken: float) -> float:
-    """Returns what the count of the whole program lacks of what lies inside a loop's body."""
+    """Returns the operations inside loops that the cost analysis of the whole program does not count."""
     return _flops(program, while_runs, taken) - _by_xla(program)
 
 
 def _equations(jaxpr: Any) -> Iterator[Any]:
-    """Yields the equations of a program, those of the functions that it calls included, not those inside of loops."""
+    """Yields the equations of a program and of the functions that it calls, without the bodies of loops."""
     for equation in jaxpr.eqns:
         yield equation
         if equation.primitive.name in ("scan", "while", "cond"):
@@ -69,10 +70,11 @@ def _by_xla(program: ClosedJaxpr) -> float:
 
 
 def sac_by_hand(obs_dim: int, action_dim: int, hidden: tuple[int, int], batch: int) -> int:
-    """Returns the operations of the matrix products alone in one update of SAC with two critics, to check the count by.
+    """Returns the operations of the matrix products in one update of SAC with two critics, as a check of the count.
 
-    A product of a batch with a layer of n by m weights is 2 n m operations a transition; going back through a layer costs
-    as much again for its weights, and again for its inputs where something before it wants a gradient.
+    The product of a batch with a layer of n by m weights takes 2 n m operations per transition. The backward pass takes
+    the same again for the gradient of the weights, and again for the gradient of the inputs if an earlier layer needs
+    it.
     """
     first, last = hidden
     actor = obs_dim * first + first * last + last * 2 * action_dim
@@ -84,7 +86,7 @@ def sac_by_hand(obs_dim: int, action_dim: int, hidden: tuple[int, int], batch: i
 
 
 def off_policy(agent: Any, n_envs: int) -> dict[str, float]:
-    """Returns the operations of one gradient step and of acting for one environment step, for an off-policy agent."""
+    """Returns the operations of one gradient step, and of acting for one environment step, of an off-policy agent."""
     import numpy as np
 
     from rejeu.core import Clock
@@ -97,7 +99,7 @@ def off_policy(agent: Any, n_envs: int) -> dict[str, float]:
 
 
 def on_policy(agent: Any, n_envs: int) -> dict[str, float]:
-    """Returns the operations of one update, of all its epochs, and of acting, each for one environment step."""
+    """Returns the operations of one update with all its epochs, and of acting, per environment step."""
     import numpy as np
 
     from rejeu.core import Clock

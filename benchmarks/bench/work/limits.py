@@ -1,4 +1,4 @@
-"""What the machine allows: bare steps of environments, and the fastest matrix product."""
+"""Measures the limits of the machine: environment steps without an agent, and the fastest matrix product."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def measure(what: str, **arguments: Any) -> dict[str, Any]:
 
 
 def env_steps(env: str, n_envs: int, backend: str, seconds: float) -> dict[str, Any]:
-    """Returns the seconds of one environment step with random actions, resets included, through rejeu's own vectors."""
+    """Returns seconds per environment step with random actions and resets, in rejeu's vector environments."""
     import copy
 
     from gymnasium.vector.utils import batch_space
@@ -44,7 +44,7 @@ def env_steps(env: str, n_envs: int, backend: str, seconds: float) -> dict[str, 
 
 
 def peak(seconds: float) -> dict[str, Any]:
-    """Returns the most operations a second in a product of square float32 matrices, by NumPy and by XLA."""
+    """Returns the highest rate of operations per second in products of square float32 matrices, by NumPy and by XLA."""
     import jax
     import jax.numpy as jnp
 
@@ -65,7 +65,7 @@ def peak(seconds: float) -> dict[str, Any]:
 
 
 def shortest(act: Any, seconds: float) -> float:
-    """Returns the least time that ``act()`` took, of at least three."""
+    """Returns the minimum duration of ``act()`` over at least three calls, in seconds."""
     act()
     found, began = [], time.perf_counter()
     while len(found) < 3 or time.perf_counter() - began < seconds:

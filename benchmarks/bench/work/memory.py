@@ -1,4 +1,4 @@
-"""What a full replay buffer takes: bytes of its arrays, and by how much the process grew."""
+"""Measures the memory of a full replay buffer: the size of its arrays and the growth of the process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from benchmarks.bench.work import buffers, common
 
 
 def measure(library: str, kind: str, n: int, compact: bool = False) -> dict[str, Any]:
-    """Makes and fills a buffer of ``n`` transitions; ``compact`` is Stable-Baselines3's ``optimize_memory_usage``."""
+    """Fills a buffer with ``n`` transitions. ``compact`` is Stable-Baselines3's ``optimize_memory_usage``."""
     make = sb3_buffer if library == "sb3" else rejeu_buffer
     make(kind, 1000, compact)
     before = common.resident_bytes()

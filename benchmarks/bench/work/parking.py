@@ -1,4 +1,4 @@
-"""The parking job, from the first import to the last evaluation: train, save, load, evaluate."""
+"""Measures a complete parking run, from the first import to the last evaluation: train, save, load, evaluate."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from benchmarks.bench.work import common  # noqa: E402
 
 
 def measure(library: str, backend: str, n_envs: int, settings: dict[str, Any], steps: int, episodes: int) -> dict:
-    """Does the job and returns its times.
+    """Runs the task and returns its times.
 
-    Training is timed from ``learning_starts`` and 512 steps on, when everything is compiled, and split into what the
-    environment's ``step`` and ``reset`` took, by the same wrapper around them in either library, and the rest.
+    Timing of the training starts after ``learning_starts`` and 512 further steps, when everything is compiled. The time
+    is split into the environment's ``step`` and ``reset``, measured by the same wrapper in both libraries, and the
+    rest.
     """
     with tempfile.TemporaryDirectory() as folder:
         job = rejeu_job if library == "rejeu" else sb3_job
@@ -24,7 +25,7 @@ def measure(library: str, backend: str, n_envs: int, settings: dict[str, Any], s
 
 
 def training_times(marks: list[tuple[float, ...]]) -> dict[str, float]:
-    """Returns the times of an environment step from two readings of clock, steps, seconds in ``step`` and ``reset``."""
+    """Returns times per environment step from two readings of clock, steps, and time in ``step`` and ``reset``."""
     seconds, steps, in_step, in_reset = (b - a for a, b in zip(marks[0], marks[-1], strict=True))
     return {
         "training_steps_per_second": steps / seconds,

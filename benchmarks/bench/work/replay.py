@@ -1,4 +1,4 @@
-"""Seconds of drawing a batch of 256 from full replay buffers: with hindsight, and by priority with the update of it."""
+"""Measures sampling of batches of 256 from full replay buffers: hindsight, and prioritized replay with its update."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BATCH = 256
 
 
 def measure(library: str, what: str, sizes: list[int], seconds: float) -> dict[str, Any]:
-    """Returns the seconds of a batch by size of the buffer, ``what`` being ``"hindsight"`` or ``"priority"``."""
+    """Returns the seconds per batch by buffer size. ``what`` is ``"hindsight"`` or ``"priority"``."""
     make = sb3_sampler if library == "sb3" else rejeu_sampler
     return {"seconds_per_batch": {str(size): common.seconds_of(make(what, size), seconds, 20) for size in sizes}}
 

@@ -1,4 +1,4 @@
-"""Seconds of an environment step with its share of updates: PPO and A2C."""
+"""Measures seconds per environment step of PPO and A2C, including the updates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def measure(
     backend: str = "gymnasium",
     count: bool = False,
 ) -> dict[str, Any]:
-    """Trains on ``n_envs`` environments with rollouts as ``settings`` say; ``count`` counts the operations too."""
+    """Trains on ``n_envs`` environments with the hyperparameters ``settings``. ``count`` also counts the operations."""
     import gymnasium as gym
 
     if library == "rejeu":

@@ -1,4 +1,4 @@
-"""Seconds of whole processes: one that imports, one that goes on until its first update is done, the command line's help."""
+"""Measures complete processes: an import, training until the first update, and the help of the command line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ agent.predict(agent.{space}.sample())
 
 
 def measure(library: str) -> dict[str, Any]:
-    """Times each process; those that compile with an empty compilation cache and once more with what that left."""
+    """Times each process. Those that compile run twice: with an empty compilation cache, and with the filled one."""
     module = MODULES[library]
     first_update = FIRST_UPDATE.format(
         module=module,
@@ -47,10 +47,10 @@ def measure(library: str) -> dict[str, Any]:
 
 
 def run(code: str, **environment: str) -> float:
-    """Returns the seconds of ``python -c code``.
+    """Returns the duration of ``python -c code`` in seconds.
 
     Raises:
-        RuntimeError: if it fails, with what it said.
+        RuntimeError: if the process fails; the message contains its output.
     """
     began = time.perf_counter()
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Seconds of an environment step with its share of updates: off-policy algorithms."""
+"""Measures seconds per environment step of off-policy algorithms, including the updates."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from benchmarks.bench.work import common
 
 WARM_UP, UNIT = 304, 104
-"""Environment steps before the clock starts, and of which the rest is a multiple; 8 environments divide either."""
+"""Environment steps before timing starts, and the unit of the timed steps. Both are multiples of 8 environments."""
 
 
 def measure(
@@ -20,7 +20,7 @@ def measure(
     backend: str = "gymnasium",
     count: bool = False,
 ) -> dict[str, Any]:
-    """Trains on ``n_envs`` environments, one gradient step an environment step; ``count`` counts its operations too."""
+    """Trains on ``n_envs`` environments, one gradient step per environment step. ``count`` counts operations too."""
     import gymnasium as gym
 
     settings = {**settings, "learning_starts": 100, "buffer_size": 100_000, "train_freq": 1, "gradient_steps": 1}
