@@ -1,9 +1,9 @@
-"""Prioritized replay: steps are drawn in proportion to how wrong the critic was about them.
+"""Prioritized experience replay: steps are sampled in proportion to their TD errors.
 
 Source: Schaul et al. 2015, "Prioritized Experience Replay" (arXiv 1511.05952), the proportional variant. A step with TD
-error ``delta`` has priority ``p = (|delta| + epsilon)^alpha`` and is drawn with probability ``P = p / sum p``; its loss is
-weighted by ``(N P)^-beta``, divided by the largest weight of its batch, with ``beta`` rising to 1 over the run. New steps get
-the largest priority so far.
+error ``delta`` has priority ``p = (|delta| + epsilon)^alpha`` and is sampled with probability ``P = p / sum p``. Its
+loss is weighted by ``(N P)^-beta``, divided by the largest weight of its batch. ``beta`` increases to 1 over the run.
+New steps get the largest priority so far.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from rejeu.schedules import Schedule
 
 @dataclass(frozen=True)
 class PriorityConfig:
-    """Settings of prioritised replay; the defaults are the paper's (table 3, proportional)."""
+    """Hyperparameters of prioritized replay. The defaults are those of the paper (table 3, proportional)."""
 
     alpha: float = 0.6
-    """How strongly priorities differ: 0 is uniform, 1 is in proportion to the TD error."""
+    """Exponent of the priorities: 0 samples uniformly, 1 in proportion to the TD error."""
     beta: float | Schedule = schedules.Linear(0.4, 1.0)
-    """How far importance weights undo the bias; 1 wholly."""
+    """Exponent of the importance weights: 0 does not correct the bias, 1 corrects it fully."""
     epsilon: float = 1e-6
-    """Added to every TD error, so that no step is forgotten; positive."""
+    """Added to the absolute TD error, so that every step can be sampled. Positive."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "beta", schedules.parse("beta", self.beta))
@@ -39,34 +39,34 @@ class PriorityConfig:
 
 
 class Draw(NamedTuple):
-    """Which steps a batch was made of: what their TD errors are given back with."""
+    """The steps of a batch, which identify them when their priorities are updated."""
 
     position: np.ndarray
-    """Their positions in the ring, ``int64 (n,)``."""
+    """Positions in the ring, ``int64 (n,)``."""
     time: np.ndarray
-    """Their absolute times, ``int64 (n,)``, which tell whether they have been overwritten since."""
+    """Their absolute times, ``int64 (n,)``, which show whether they have been overwritten since."""
     version: int
-    """:attr:`Ring.version` when they were drawn; in a ring that was restored since, other steps are there."""
+    """:attr:`Ring.version` at the time of the draw. It differs if the ring has been restored with other steps since."""
 
 
 class SumTree:
-    """Non-negative numbers by position; setting and drawing take time in the logarithm of their count."""
+    """A sum tree of ``n`` non-negative values. Updates and sampling take O(log n)."""
 
     def __init__(self, n: int) -> None:
         self.n_leaves = 1 << max(n - 1, 1).bit_length()
         self.nodes = np.zeros(2 * self.n_leaves, np.float64)
-        """Node 1 is the root and holds the sum; the children of node i are 2 i and 2 i + 1."""
+        """Node 1 is the root and contains the sum. The children of node i are 2 i and 2 i + 1."""
 
     @property
     def total(self) -> float:
-        """The sum of all numbers."""
+        """Sum of all values."""
         return float(self.nodes[1])
 
     def __getitem__(self, index: Any) -> Any:
         return self.nodes[self.n_leaves + index]
 
     def set(self, index: np.ndarray, value: Any) -> None:
-        """Puts ``value`` at the positions ``index``, ``(n,)`` or one; where one is repeated, its last value counts."""
+        """Sets the values at ``index`` to ``value``, ``(n,)`` or a scalar. Of repeated indices, the last one counts."""
         node = index + self.n_leaves
         self.nodes[node] = value
         for _ in range(self.n_leaves.bit_length() - 1):
@@ -74,7 +74,7 @@ class SumTree:
             self.nodes[node] = self.nodes[2 * node] + self.nodes[2 * node + 1]
 
     def fill(self, values: np.ndarray) -> None:
-        """Puts ``values`` ``(n,)`` at the positions from 0 on, and 0 at the others."""
+        """Sets the first ``n`` positions to ``values``, ``(n,)``, and all others to 0."""
         self.nodes[:] = 0.0
         self.nodes[self.n_leaves : self.n_leaves + len(values)] = values
         first = self.n_leaves
@@ -84,7 +84,7 @@ class SumTree:
             first = half
 
     def find(self, mass: np.ndarray) -> np.ndarray:
-        """Returns for each ``mass`` in [0, total) the position where the running sum first exceeds it, ``int64 (n,)``."""
+        """Returns the first positions where the cumulative sum exceeds ``mass``, in [0, total), ``int64 (n,)``."""
         node = np.ones(len(mass), np.int64)
         mass = mass.copy()
         while node[0] < self.n_leaves:
@@ -104,20 +104,21 @@ class Priorities:
         self.config = config
         self.tree = SumTree(ring.rows * ring.n_envs)
         self.largest = 1.0
-        """The largest priority so far, which new steps get."""
+        """Largest priority so far, and the priority of new steps."""
 
     def add(self, index: np.ndarray, following: np.ndarray) -> None:
-        """Notes new steps at ``index``, and that the rows ``following`` are heads, which cannot be drawn."""
+        """Adds new steps at ``index``. The rows ``following`` become heads, which cannot be sampled."""
         self.tree.set(following, 0.0)
         self.tree.set(index, self.largest)
 
     def draw(self, rng: np.random.Generator, n: int, progress: float) -> tuple[Rows, np.ndarray, Draw]:
-        """Returns ``n`` steps, one from each of ``n`` equal parts of the total priority, and weights ``float32 (n,)``.
+        """Returns ``n`` steps, their importance weights ``float32 (n,)``, and their :class:`Draw`.
 
-        Nothing is remembered of it: the third value is what :meth:`update` takes beside the TD errors of these steps.
+        One step is sampled from each of ``n`` equal segments of the total priority. The object does not store the draw.
+        :meth:`update` takes it together with the TD errors of the steps.
 
         Raises:
-            ValueError: if there is none.
+            ValueError: if there are no steps.
         """
         tree, ring = self.tree, self.ring
         if not len(ring):
@@ -133,10 +134,10 @@ class Priorities:
         return rows, weight.astype(np.float32), Draw(index, time, ring.version)
 
     def update(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
-        """Sets the priorities of drawn steps by their absolute TD errors, ``(n,)`` in any shape of that size.
+        """Updates the priorities of sampled steps from their absolute TD errors, in any shape of size ``n``.
 
-        TD errors of steps that were overwritten since are ignored. So are those that are not finite: such a step keeps
-        the priority that it has, because one NaN would make all sums NaN.
+        TD errors of steps that have been overwritten since are ignored. TD errors that are not finite are ignored too,
+        because one NaN would make all sums NaN. Such a step keeps its priority.
         """
         for (index, time, version), td_error in td_errors:
             if version != self.ring.version:
@@ -150,15 +151,15 @@ class Priorities:
             self.largest = max(self.largest, float(priority.max(where=finite, initial=0.0)))
 
     def state(self) -> dict[str, Any]:
-        """Returns everything, for :meth:`restore`."""
+        """Returns the state for :meth:`restore`."""
         n = self.ring.rows * self.ring.n_envs
         return {"values": self.tree[np.arange(n)], "largest": self.largest}
 
     def restore(self, state: Mapping[str, Any] | None = None) -> None:
-        """Puts back what :meth:`state` returned, or gives every step of the ring the largest priority.
+        """Restores a state of :meth:`state`. Without a state, all steps of the ring get the largest priority.
 
         Raises:
-            KeyError, ValueError: if the state is damaged, or of another ring.
+            KeyError, ValueError: if the state is corrupted, or belongs to another ring.
         """
         if state is not None:
             values = state["values"]
@@ -180,10 +181,10 @@ class Priorities:
             self.tree.set(steps, self.largest)
 
     def draw_of(self, index: np.ndarray, time: np.ndarray) -> Draw:
-        """Returns a draw from this ring as it is now, from the positions and times of a file.
+        """Returns a draw from the current content of this ring, given positions and times from a file.
 
         Raises:
-            ValueError: if they are no positions in this ring.
+            ValueError: if they are not positions in this ring.
         """
         good = index.dtype == time.dtype == np.int64 and index.shape == time.shape == (index.size,)
         if not good or not ((index >= 0) & (index < self.ring.rows * self.ring.n_envs)).all():
@@ -191,7 +192,7 @@ class Priorities:
         return Draw(index, time, self.ring.version)
 
     def _step_positions(self) -> np.ndarray:
-        """Returns the positions of the ring that hold steps, environment after environment."""
+        """Returns the positions of the ring that contain steps, ordered by environment."""
         ring = self.ring
         found = []
         for env in range(ring.n_envs):

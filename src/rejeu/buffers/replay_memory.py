@@ -1,4 +1,4 @@
-"""A replay memory for loops of one's own: ``push``, ``sample``, ``len``."""
+"""A replay memory for custom training loops: ``push``, ``sample``, ``len``."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from rejeu.validation import number, whole
 
 
 class ReplayMemory:
-    """Keeps the newest ``capacity`` transitions and draws batches of them, uniformly and with replacement.
+    """Stores the latest ``capacity`` transitions and samples batches uniformly, with replacement.
 
-    Agents have :class:`rejeu.ReplayBuffer` inside, which stores each observation once and knows of episodes. This one takes
-    single transitions, from wherever they come.
+    The agents use :class:`rejeu.ReplayBuffer`, which stores each observation once and keeps track of episodes. This
+    class takes single transitions from any source.
 
     Args:
-        capacity: how many transitions are kept; the oldest give way.
-        observation_space: of what is pushed; any nesting of Dict and Tuple.
+        capacity: maximum number of transitions. The oldest are overwritten.
+        observation_space: the observation space, with any nesting of Dict and Tuple.
         action_space: a Box or Discrete space.
-        gamma: discount per step, in [0, 1].
-        seed: of the draws; None draws one.
+        gamma: discount factor per step, in [0, 1].
+        seed: seed of the sampling. None draws a seed.
 
     Raises:
-        MemoryError: if the machine cannot hold them, with the numbers.
+        MemoryError: if the memory of the machine is too small. The message states the sizes.
 
     >>> space = gym.spaces.Box(-1.0, 1.0, (2,))
     >>> memory = ReplayMemory(1000, space, gym.spaces.Discrete(3), gamma=0.5, seed=0)
@@ -66,22 +66,22 @@ class ReplayMemory:
         self._n_pushed = 0
 
     def __len__(self) -> int:
-        """The number of transitions kept, at most ``capacity``."""
+        """Number of stored transitions, at most ``capacity``."""
         return min(self._n_pushed, self.capacity)
 
     def push(self, obs: Any, action: Any, reward: float, next_obs: Any, terminated: bool) -> None:
-        """Adds one transition, in place of the oldest if the memory is full.
+        """Adds one transition, and overwrites the oldest if the memory is full.
 
         Args:
-            obs: observation.
-            action: what the environment was given, in its own range.
-            reward: what it earned.
-            next_obs: the observation after it, also where the episode ended.
-            terminated: whether the MDP ended there, so that nothing follows: ``terminated`` of Gymnasium's ``step``. Where
-                an episode was only cut off (``truncated``), it is False, and learning bootstraps from ``next_obs``.
+            obs: the observation before the step.
+            action: the action, in the range of the action space.
+            reward: the reward of the step.
+            next_obs: the observation after the step, including the final observation of an episode.
+            terminated: whether a terminal state of the MDP was reached: ``terminated`` of Gymnasium's ``step``. It is
+                False if the episode was only truncated. Algorithms then bootstrap from ``next_obs``.
 
         Raises:
-            ValueError: if an observation or the action does not fit its space, or the reward is not finite.
+            ValueError: if an observation or the action does not match its space, or the reward is not finite.
         """
         before, after = self._parts(obs, "obs"), self._parts(next_obs, "next_obs")
         taken = np.asarray(action)
@@ -103,12 +103,12 @@ class ReplayMemory:
         self._n_pushed += 1
 
     def sample(self, batch_size: int) -> Transition:
-        """Returns a batch of transitions as NumPy arrays, as the losses of :mod:`rejeu.algorithms` take them.
+        """Returns a batch of transitions as NumPy arrays, in the form that the losses of :mod:`rejeu.algorithms` take.
 
-        ``obs`` and ``next_obs`` have leaves ``(batch, ...)``; ``action`` is ``(batch, action_dim)`` in [-1, 1] for a Box and
-        ``int32 (batch,)`` from 0 on for Discrete; ``reward`` is ``(batch,)``; ``discount``, ``(batch,)``, is 0 where the
-        transition terminated and ``gamma`` elsewhere. :func:`rejeu.spaces.scale_action` returns such actions to the
-        environment's range.
+        ``obs`` and ``next_obs`` have leaves ``(batch, ...)``. ``action`` is ``(batch, action_dim)`` in [-1, 1] for Box
+        spaces, and ``int32 (batch,)`` starting at 0 for Discrete spaces. ``reward`` is ``(batch,)``. ``discount``,
+        ``(batch,)``, is 0 for terminated transitions and ``gamma`` for others. :func:`rejeu.spaces.scale_action`
+        converts such actions to the range of the action space.
 
         Raises:
             ValueError: if the memory is empty.
@@ -131,7 +131,7 @@ class ReplayMemory:
         """Returns the arrays of an observation.
 
         Raises:
-            ValueError: if they are not of the space.
+            ValueError: if the observation does not match the space.
         """
         try:
             parts = jax.tree.leaves(spaces.plain(self.observation_space, obs), is_leaf=lambda x: isinstance(x, list))

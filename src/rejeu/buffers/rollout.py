@@ -1,4 +1,4 @@
-"""The rollout buffer: the steps of all environments since the policy last changed, for on-policy learning."""
+"""The rollout buffer of on-policy algorithms, with the steps since the last policy update."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rejeu.spaces import Leaf
 
 
 class RolloutBuffer:
-    """The steps of all environments since the last update. Mutable; ``add`` writes in place."""
+    """The steps of all environments since the last policy update. Mutable: ``add`` writes in place."""
 
     def __init__(
         self,
@@ -25,7 +25,7 @@ class RolloutBuffer:
         action_dtype: Any,
         gamma: float,
     ) -> None:
-        """Reserves ``n_steps`` steps of each environment."""
+        """Allocates memory for ``n_steps`` steps of each environment."""
         self.n_steps, self.n_envs, self.gamma = n_steps, n_envs, gamma
         self.obs_leaves, self.obs_structure = obs_leaves, obs_structure
         shape = (n_steps, n_envs)
@@ -38,38 +38,38 @@ class RolloutBuffer:
         self.valid = np.zeros(shape, bool)
         self.running_return = np.zeros(shape, np.float32)
         self.started = np.zeros(n_envs, bool)
-        """Where an episode began with the first step, ``(n_envs,)``."""
+        """Whether an episode started with the first step, ``bool (n_envs,)``."""
         self.carry: PyTree = ()
-        """What the policy remembered before the first step, leaves ``(n_envs, ...)``."""
+        """Recurrent state of the policy before the first step, with leaves ``(n_envs, ...)``."""
         self.length = 0
-        """Steps of each environment kept so far."""
+        """Number of steps of each environment in the buffer."""
 
     @property
     def nbytes(self) -> int:
-        """Bytes reserved."""
+        """Allocated memory in bytes."""
         return self.n_steps * sum(array[0].nbytes for array in self._stores().values())
 
     @property
     def full(self) -> bool:
-        """Whether no further step fits in."""
+        """Whether the buffer is full."""
         return self.length == self.n_steps
 
     def size(self) -> int:
-        """Returns the number of steps kept, over all environments."""
+        """Returns the number of valid steps, summed over the environments."""
         return int(self.valid[: self.length].sum())
 
     def begin(self, carry: PyTree, started: np.ndarray) -> None:
-        """Begins a rollout, forgetting the one before.
+        """Starts a new rollout, and discards the previous one.
 
         Args:
-            carry: what the policy remembers before its first step.
-            started: where an episode begins with it, ``bool (n_envs,)``.
+            carry: recurrent state of the policy before the first step.
+            started: whether an episode starts with the first step, ``bool (n_envs,)``.
         """
         self.length = 0
         self.carry, self.started = carry, started.copy()
 
     def observe(self, obs: PyTree) -> None:
-        """Notes the observations ``(n_envs, ...)`` that the next step starts from."""
+        """Stores the observations ``(n_envs, ...)`` before the next step."""
         for store, leaf in zip(self.obs, jax.tree.leaves(obs), strict=True):
             store[self.length] = leaf
 
@@ -83,9 +83,9 @@ class RolloutBuffer:
         running_return: np.ndarray | float = 0.0,
         valid: np.ndarray | bool = True,
     ) -> None:
-        """Records one step of every environment, ``(n_envs, ...)``; only those where ``valid`` count.
+        """Adds one step of every environment, ``(n_envs, ...)``. Steps that are not ``valid`` are ignored in training.
 
-        The observations that it started from were given to :meth:`observe`.
+        The observations before the step must have been passed to :meth:`observe`.
         """
         t = self.length
         for store, leaf in zip(self.next_obs, jax.tree.leaves(next_obs), strict=True):
@@ -99,14 +99,14 @@ class RolloutBuffer:
         self.length += 1
 
     def cut(self, envs: np.ndarray | bool = True) -> None:
-        """Ends the episodes of ``envs``, ``bool (n_envs,)``, with the newest step: they cannot be continued.
+        """Truncates the episodes of ``envs``, ``bool (n_envs,)``, at the latest step.
 
-        Nothing is terminal by that: the value of the last observation stands for what would have followed.
+        The last observation does not become terminal: algorithms bootstrap from its value.
         """
         self.ended[self.length - 1] |= envs
 
     def rollout(self) -> Rollout:
-        """Returns what is kept, padded to all that was reserved; views, so use them before adding."""
+        """Returns the rollout, padded to ``n_steps``. The arrays are views: use them before adding steps."""
         self.valid[self.length :] = False
         tree = lambda stores: jax.tree.unflatten(self.obs_structure, stores)  # noqa: E731
         return Rollout(
@@ -123,7 +123,7 @@ class RolloutBuffer:
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Returns everything kept, as named arrays ``(steps, n_envs, ...)``."""
+        """Returns the stored steps as named arrays ``(steps, n_envs, ...)``."""
         return {name: array[: self.length] for name, array in self._stores().items()}
 
     def _stores(self) -> dict[str, np.ndarray]:
@@ -134,11 +134,11 @@ class RolloutBuffer:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Puts back what :meth:`arrays` returned.
+        """Restores the arrays of :meth:`arrays`.
 
         Raises:
-            ValueError: if names, shapes or dtypes are not those of this buffer, or if it would be full, as none is between
-                two steps; nothing is then changed.
+            ValueError: if names, shapes or dtypes do not match this buffer, or if it would be full, which cannot happen
+                between two steps. The buffer is then unchanged.
         """
         own = self._stores()
         if {*own} != {*arrays}:

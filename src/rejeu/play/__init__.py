@@ -31,7 +31,7 @@ from rejeu.validation import number, whole
 __all__ = ["Game", "Player", "play", "watch"]
 
 REST_SECONDS = 1.5
-"""How long the end of a round is shown."""
+"""Seconds for which the end of a round is shown."""
 
 
 def play(
@@ -47,8 +47,8 @@ def play(
     """Opens a window to play an environment by hand, and returns the game when the window is closed.
 
     Args:
-        env: an id, or Car, Mountain or Lunar, or a function that takes ``render_mode`` and makes an environment.
-        keys: actions by keys, in addition to the environment's defaults; see :mod:`rejeu.play.keys`.
+        env: an id, a short name (Car, Mountain, Lunar), or a function of ``render_mode`` that makes an environment.
+        keys: actions by keys, in addition to the environment's defaults. See :mod:`rejeu.play.keys`.
         seed: seed of the first round; each further round adds one. None draws a seed.
         fps: steps per second; None uses the environment's ``render_fps``, or 30.
         episodes: close after this number of episodes; None never closes.
@@ -93,7 +93,7 @@ def watch(
 
     Args:
         agent: anything with ``predict(obs, state, deterministic=True)``.
-        env: an id, or Car, Mountain or Lunar, or a function that takes ``render_mode`` and makes an environment.
+        env: an id, a short name (Car, Mountain, Lunar), or a function of ``render_mode`` that makes an environment.
         seed: seed of the first episode; each further episode adds one. None draws a seed.
         fps: steps per second; None uses the environment's ``render_fps``, or 30.
         episodes: close after this number of episodes; None never closes.

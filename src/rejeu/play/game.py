@@ -1,4 +1,4 @@
-"""The state of a game: players with the same seeds, held keys, pauses, scores. Without a window or a clock."""
+"""The state of a game: players with the same seeds, held keys, pauses, scores. It has no window and no clock."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from rejeu.play.recording import Recording
 from rejeu.reporting.video import rgb_frame
 
 Act = Callable[[Any, frozenset[str], int], Any]
-"""Maps observation, held keys and step of the episode (from 0) to an action, or None to wait."""
+"""Maps the observation, the held keys and the step of the episode (from 0) to an action, or None to wait."""
 
 MAX_DELAY = 0.25
-"""Seconds of delay up to which the following steps are faster, to catch up."""
+"""Maximum delay in seconds that is caught up by faster steps."""
 
 
 @dataclass
@@ -32,7 +32,7 @@ class Player:
     """Made with ``render_mode="rgb_array"``."""
     act: Act
     recording: Recording | None = None
-    """Recorder of the episodes, None for none."""
+    """Recording of the episodes, None if they are not recorded."""
     obs: Any = None
     frame: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
     """The latest frame, ``uint8 (height, width, 3)``."""
@@ -82,8 +82,8 @@ class Player:
 class Game:
     """One or several players whose rounds have the same seeds. Mutable; no method waits.
 
-    Each round uses the next seed, the same for all players. It waits for the first bound key, unless ``bound`` is empty, and
-    is over when the episodes of all players are.
+    Each round uses the next seed, the same for all players. It waits for the first bound key, unless ``bound`` is
+    empty. It is over when the episodes of all players are over.
     """
 
     players: list[Player]
@@ -99,7 +99,7 @@ class Game:
     paused: bool = False
     closed: bool = False
     held: set[str] = field(default_factory=set)
-    """Keys that are held."""
+    """Keys that are currently held."""
     rounds: int = 0
     """Number of completed rounds."""
     tapped: set[str] = field(default_factory=set)

@@ -1,4 +1,4 @@
-"""Default keys of known environments, and short names for some of them."""
+"""Default keys of known environments, and short names of some environments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rejeu.play import keys
 from rejeu.play.keys import KeyMap
 
 SHORT_NAMES = {"car": "CarRacing-v3", "mountain": "MountainCar-v0", "lunar": "LunarLander-v3"}
-"""Short names of ids; their case is ignored."""
+"""Short names of ids, not case-sensitive."""
 
 KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
     "CartPole-v1": {

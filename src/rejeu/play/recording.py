@@ -123,7 +123,7 @@ class Recording:
     def _create(self, buffer: Any) -> Any:
         described = self._env if has_json_spec(self._env) else None
         with minari_path(self.folder), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about the missing author and so on
+            warnings.simplefilter("ignore")  # for example about the missing author
             return self._minari.create_dataset_from_buffers(
                 self.dataset_id,
                 [buffer],

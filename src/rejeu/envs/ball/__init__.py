@@ -1,4 +1,4 @@
-"""``rejeu/Ball-v0``: a ball that is pushed to a place on a strip."""
+"""``rejeu/Ball-v0``: keep a randomly moving ball inside a box."""
 
 from rejeu.envs.ball.ball import Ball
 

@@ -1,4 +1,4 @@
-"""The ball: keep a randomly pushed ball inside a box by pushing back. Registered as ``rejeu/Ball-v0``."""
+"""The environment ``rejeu/Ball-v0``: keep a randomly moving ball inside a box."""
 
 from __future__ import annotations
 
@@ -20,45 +20,49 @@ if TYPE_CHECKING:
 WALL = 10.0
 """The box is [-WALL, WALL] in every dimension."""
 STRONGEST_PUSH = 2.0
-"""Actions are in [-STRONGEST_PUSH, STRONGEST_PUSH], and so are the starting positions."""
+"""Actions and initial positions are in [-STRONGEST_PUSH, STRONGEST_PUSH]."""
 N_STEPS = 500
-"""Steps for which the ball is to be held."""
+"""Time limit of an episode, in steps."""
 HELD_REWARD, LOST_REWARD = 50.0, -10.0
-"""Rewards of the last step of an episode; every other step gives 1."""
+"""Rewards of the last step of an episode. The reward of every other step is 1."""
 
 
 class Ball(gym.Env[np.ndarray, np.ndarray]):
-    """A ball that is pushed about at random, and an agent that pushes it back.
+    """A ball moves randomly, and the agent pushes it to keep it inside a box.
 
     ==================  ==========================================================================================
     observation         the position, ``float32 (dimension,)`` in [-10, 10]
-    action              the push, ``float32 (dimension,)`` in [-2, 2]; what is beyond is clipped
-    start               the position is uniform in [-2, 2]
-    step                ``position + action + sigma N(0, 1)``
-    reward              1; -10 where the ball leaves the box; 50 at step 500 if it is held until then
-    end                 *terminated* where it leaves the box, *truncated* at step 500
-    info                ``is_success`` in the last step of an episode: whether it was held for all 500 steps
+    action              the push, ``float32 (dimension,)`` in [-2, 2]; clipped to this range
+    initial state       the position is uniform in [-2, 2]
+    dynamics            the next position is ``position + action + sigma N(0, 1)``
+    reward              1 per step; -10 if the ball leaves the box; 50 at step 500 if it is still inside
+    episode end         *terminated* if the ball leaves the box, *truncated* at step 500
+    info                ``is_success`` in the last step of an episode: whether it stayed inside for 500 steps
     ==================  ==========================================================================================
 
-    An episode that is held returns 549. In two dimensions the policy ``clip(-x, -2, 2)`` holds all episodes for
-    ``sigma=1``, 89 in 100 for ``sigma=2`` and none for ``sigma=3``.
+    The return of a successful episode is 549. In two dimensions, the policy ``clip(-x, -2, 2)`` succeeds in all
+    episodes for ``sigma=1``, in 89 of 100 for ``sigma=2`` and in none for ``sigma=3``.
 
-    The 500th step is a time limit and no end of the task: nothing in the position tells that it comes, so a value that
-    stopped there could not be learned. Algorithms bootstrap from it, as the course from which the environment is
-    taken (``Bille_Env``) does by ignoring all ends. Mended against the course: the position that is tested for having
-    left is the new one and not that of the step before; leaving therefore costs at once, and the time limit comes after
-    500 steps rather than 501; a ball that leaves in the last step is lost; the episode is not reset behind the agent's
-    back, so that it sees the position that ended it (on the wall where it went through); and an action out of range is
-    clipped, not refused, since noise and rounding produce them.
+    Step 500 is a time limit and not a terminal state. The observation does not contain the time, so a value function
+    that treats this step as terminal cannot be learned. Algorithms therefore bootstrap from the last observation.
+
+    The environment is a corrected version of ``Bille_Env`` from a course, where all episode ends are ignored in the
+    targets. The differences are:
+
+    - The new position is tested for leaving the box, not the previous one. The penalty is therefore immediate, and the
+      time limit is 500 steps, not 501.
+    - A ball that leaves the box in the last step is lost.
+    - The episode is not reset automatically. The agent observes the final position, clipped to the box.
+    - Actions out of range are clipped, because noise and rounding produce them. They do not raise an exception.
 
     Args:
-        dimension: of the box.
-        sigma: standard deviation of the random push in each dimension and step.
-        render_mode: ``"rgb_array"`` or ``"human"``; one dimension is drawn as position against time, two as a plane,
-            more as the plane of the first two beside every coordinate against time (the first ten).
+        dimension: number of dimensions of the box.
+        sigma: standard deviation of the random displacement in each dimension, per step.
+        render_mode: ``"rgb_array"`` or ``"human"``. One dimension is drawn as position against time, two as a plane.
+            More are drawn as the plane of the first two, next to plots of the first ten coordinates against time.
 
     Raises:
-        ValueError: for a dimension below 1, a negative sigma or an unknown render mode.
+        ValueError: for a dimension below 1, a negative or infinite ``sigma``, or an unknown render mode.
 
     >>> import gymnasium as gym, rejeu
     >>> env = gym.make("rejeu/Ball-v0", dimension=2, sigma=1.0)
@@ -83,11 +87,11 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self.observation_space = spaces.Box(-WALL, WALL, (dimension,), np.float32)
         self.action_space = spaces.Box(-STRONGEST_PUSH, STRONGEST_PUSH, (dimension,), np.float32)
         self.position: list[float] = []
-        """Where the ball is; empty before the first reset. Beyond the wall once it has left."""
+        """Position of the ball, not clipped to the box. Empty before the first reset."""
         self.n_steps = 0
-        """Steps taken in this episode."""
+        """Number of steps of this episode."""
         self.needs_reset = True
-        """Whether a reset is due."""
+        """Whether the environment must be reset before the next step."""
         self._trail: deque[tuple[float, ...]] = deque(maxlen=N_STEPS + 1)
         self._push: list[float] = []
         self._drawing: BallDrawing | None = None
@@ -95,7 +99,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; returns the position and an empty info."""
+        """Starts an episode. Returns the position and an empty info."""
         super().reset(seed=seed)
         self.position = self.np_random.uniform(-STRONGEST_PUSH, STRONGEST_PUSH, self.dimension).tolist()
         self.n_steps = 0
@@ -107,11 +111,11 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         return self._observe(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Pushes the ball; see the class.
+        """Pushes the ball, see the class.
 
         Raises:
             gymnasium.error.ResetNeeded: if the episode is over or has not begun.
-            ValueError: if the action has another shape or is not a number.
+            ValueError: if the shape of the action is wrong, or if it contains NaN.
         """
         if self.needs_reset:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
@@ -136,11 +140,11 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
 
     @property
     def trajectory(self) -> np.ndarray:
-        """The positions of the episode so far, ``float64 (n_steps + 1, dimension)``, where it left the box included."""
+        """The positions of the current episode, ``float64 (n_steps + 1, dimension)``, not clipped to the box."""
         return np.array(self._trail, np.float64).reshape(-1, self.dimension)
 
     def plot(self, path: str | Path | None = None) -> Picture:
-        """Returns :attr:`trajectory` as a matplotlib figure, shown by notebooks; see :mod:`rejeu.reporting.plots`.
+        """Plots :attr:`trajectory` as a matplotlib figure, which notebooks display. See :mod:`rejeu.reporting.plots`.
 
         Raises:
             MissingExtra: if matplotlib is not installed.
@@ -151,7 +155,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         return plots.trajectory(self.trajectory, path, low=-WALL, high=WALL)
 
     def get_state(self) -> dict[str, Any]:
-        """Returns everything that the further course depends on, as JSON values; :meth:`set_state` puts it back."""
+        """Returns the state, including the random number generator, as JSON values, for :meth:`set_state`."""
         return {
             "position": list(self.position),
             "n_steps": self.n_steps,
@@ -160,10 +164,10 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continues where :meth:`get_state` was called, exactly; the trajectory begins here.
+        """Restores a state of :meth:`get_state`. The trajectory starts at its position.
 
         Raises:
-            ValueError: if the state is of another dimension, or no episode can stand there.
+            ValueError: if the state has another dimension, or cannot occur in an episode.
         """
         if len(state["position"]) not in (0, self.dimension):
             raise ValueError(f"the state is of {len(state['position'])} dimensions and this ball has {self.dimension}")
@@ -180,10 +184,10 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             self._trail.append(tuple(self.position))
 
     def render(self) -> np.ndarray | None:
-        """Returns the picture, ``uint8 (height, width, 3)``, or None where it is shown on the screen.
+        """Returns an image, ``uint8 (height, width, 3)``, or None if it is shown in a window.
 
         Raises:
-            ValueError: if it was made without a render mode.
+            ValueError: if the environment was made without a render mode.
             MissingExtra: if pygame is not installed.
         """
         if self.render_mode is None:
@@ -193,7 +197,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         return self._drawing.draw(self._trail, self._push, self.n_steps, self.needs_reset)
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window if there is one."""
         if self._drawing is not None:
             self._drawing.close()
             self._drawing = None
@@ -203,7 +207,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             self.render()
 
     def _observe(self) -> np.ndarray:
-        """Returns the position; where the ball has left, the nearest point of the box."""
+        """Returns the position, clipped to the box."""
         if self.needs_reset:
             return np.array([min(max(x, -WALL), WALL) for x in self.position], np.float32)
         return np.array(self.position, np.float32)

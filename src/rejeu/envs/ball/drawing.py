@@ -1,6 +1,6 @@
-"""How the ball is drawn: position against time in one dimension, the plane in two.
+"""Rendering of the ball: position against time in one dimension, a plane in two.
 
-In more, the plane of the first two coordinates with every coordinate against time beside it.
+More dimensions are drawn as the plane of the first two coordinates, next to plots of coordinates against time.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ INK, FAINT, GRID = (52, 58, 70), (140, 146, 156), (232, 234, 238)
 OLD_TRAIL, NEW_TRAIL = (214, 225, 240), (40, 104, 190)
 BALL, HELD, LOST, PUSH = (40, 104, 190), (38, 150, 96), (205, 62, 52), (236, 140, 38)
 FINE = 2
-"""Everything is drawn this many times larger and then reduced, which smooths the edges."""
+"""Supersampling factor: the image is drawn at this multiple of its size and downscaled, for smooth edges."""
 FADING = 80
-"""Steps over which the trail fades."""
+"""Number of steps over which the trail fades."""
 MARGIN = 2.2
-"""What is seen beyond the walls, in units of position."""
+"""Width of the visible area outside the walls, in units of position."""
 LINE_SIZE, PLANE_SIZE, STRIPS_WIDTH = (900, 460), (620, 666), 320
-"""Width and height in pixels of the picture in one dimension and of the plane; even, as videos want them."""
+"""Width and height in pixels of the image in one dimension and of the plane. They are even, as videos require."""
 MOST_STRIPS = 10
-"""Most coordinates that are drawn against time beside the plane."""
+"""Maximum number of coordinates that are plotted against time next to the plane."""
 
 
 class Strip(NamedTuple):
-    """Where one coordinate is drawn against time, in pixels."""
+    """Area of the plot of one coordinate against time, in pixels."""
 
     left: float
     top: float
@@ -40,16 +40,16 @@ class Strip(NamedTuple):
     bottom: float
 
     def place(self, share: float, height: float) -> Point:
-        """Returns the pixel at a share of the time in [0, 1] and a height from -1 (bottom) to 1 (top)."""
+        """Returns the pixel coordinates of a time fraction in [0, 1] and a height from -1 (bottom) to 1 (top)."""
         y = 0.5 * (self.top + self.bottom) - 0.5 * height * (self.bottom - self.top)
         return self.left + share * (self.right - self.left), y
 
 
 class BallDrawing:
-    """One picture or window, drawn anew at every step. Mutable."""
+    """An image or window that is redrawn at every step. Mutable."""
 
     def __init__(self, dimension: int, render_mode: str, fps: float, wall: float, n_steps: int) -> None:
-        """Opens the window if there is to be one.
+        """Prepares the drawing, and opens a window for the render mode ``human``.
 
         Raises:
             MissingExtra: if pygame is not installed.
@@ -87,9 +87,9 @@ class BallDrawing:
         self.field = self.canvas.copy()
 
     def draw(self, trail: Sequence[Sequence[float]], push: Sequence[float], step: int, over: bool) -> np.ndarray | None:
-        """Draws the positions of ``trail``, oldest first, the last ``push`` and the ball after ``step`` steps.
+        """Draws the positions of ``trail``, oldest first, the last ``push``, and the ball after ``step`` steps.
 
-        Returns ``uint8 (height, width, 3)``, or None where there is a window.
+        Returns ``uint8 (height, width, 3)``, or None if there is a window.
         """
         lost = over and bool(trail) and max(map(abs, trail[-1])) > self.wall
         colour = BALL if not over else LOST if lost else HELD
@@ -113,7 +113,7 @@ class BallDrawing:
         return None
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window if there is one."""
         if self.window is not None:
             self.pygame.display.quit()
             self.window = None
@@ -127,7 +127,7 @@ class BallDrawing:
         return self.bottom - (self.bottom - self.top) * (value + reach) / (2 * reach)
 
     def _points(self, trail: Sequence[Sequence[float]], step: int) -> list[Point]:
-        """Returns where the trail's positions are in the picture; what is further out than its edge is on the edge."""
+        """Returns the positions of the trail in the image, clipped to its edges."""
         reach = self.wall + MARGIN
         clipped = [[min(max(x, -reach), reach) for x in position] for position in trail]
         if self.dimension == 1:
@@ -136,7 +136,7 @@ class BallDrawing:
         return [(self._x(position[0]), self._y(position[1])) for position in clipped]
 
     def _draw_field(self) -> None:
-        """Draws what stays as it is: the box, its walls and the scales."""
+        """Draws the static background: the box, its walls and the axis labels."""
         self.canvas.fill(PAPER)
         wall = self.wall
         west, east = (0, self.n_steps) if self.dimension == 1 else (-wall, wall)
@@ -156,7 +156,7 @@ class BallDrawing:
             self._line(corners[start], corners[end], INK, 2.5)
 
     def _draw_trail(self, points: list[Point]) -> None:
-        """Draws the way so far; in the plane its older part in one faint colour, beneath the rest."""
+        """Draws the trail. In the plane, the older part has a single faint color and is below the rest."""
         n_old = len(points) if self.dimension == 1 else max(len(points) - FADING, 0)
         if n_old > 1:
             fine = [(x * FINE, y * FINE) for x, y in points[: n_old + 1]]
@@ -172,7 +172,7 @@ class BallDrawing:
             self._disc(points[0], 2.8, INSIDE)
 
     def _draw_push(self, origin: Point, push: Sequence[float]) -> None:
-        """Draws the push as an arrow from where the ball was."""
+        """Draws the push as an arrow from the previous position of the ball."""
         scale = (self.bottom - self.top) / (2 * (self.wall + MARGIN))
         along = np.array([0.0, -push[0]] if self.dimension == 1 else [push[0], -push[1]]) * scale
         length = float(np.hypot(*along))
@@ -193,7 +193,7 @@ class BallDrawing:
             self._disc((centre[0] - shift, centre[1] - shift), radius * (1 - 0.85 * share), _mix(colour, INSIDE, tint))
 
     def _strips(self) -> list[Strip]:
-        """Returns the places of the coordinates against time, in the height of the plane."""
+        """Returns the areas of the plots against time, which share the height of the plane."""
         n = min(self.dimension, MOST_STRIPS)
         left, right, gap = self.right + 74.0, self.size[0] - 26.0, 12.0
         height = (self.bottom - self.top - gap * (n - 1)) / n
@@ -201,7 +201,7 @@ class BallDrawing:
         return [Strip(left, top, right, top + height) for top in tops]
 
     def _draw_strip(self, coordinate: int, strip: Strip) -> None:
-        """Draws what stays as it is of one coordinate against time: the box, its walls, and which coordinate it is."""
+        """Draws the static background of one plot against time: the box, its walls and the label of the coordinate."""
         wall = self.wall / (self.wall + MARGIN)
         self._rectangle((strip.left, strip.top), (strip.right, strip.bottom), OUTSIDE)
         self._rectangle(strip.place(0, wall), strip.place(1, -wall), INSIDE)
@@ -217,7 +217,7 @@ class BallDrawing:
             self._text(f"{len(self.strips)} of {self.dimension} coordinates", (strip.right, 30), FAINT, "right")
 
     def _draw_course(self, strip: Strip, values: Sequence[float], step: int, colour: Colour) -> None:
-        """Draws one coordinate's values up to ``step``."""
+        """Plots the values of one coordinate up to ``step``."""
         reach, first = self.wall + MARGIN, step - len(values) + 1
         heights = [min(max(value / reach, -1.0), 1.0) for value in values]
         points = [strip.place((first + i) / self.n_steps, height) for i, height in enumerate(heights)]
@@ -227,7 +227,7 @@ class BallDrawing:
             self._disc(points[-1], 4.0, colour)
 
     def _caption(self, trail: Sequence[Sequence[float]], step: int, over: bool, lost: bool) -> str:
-        """Returns what is written above the plane; in more dimensions than it shows, where the ball left."""
+        """Returns the caption. In more than two dimensions, it names the coordinates in which the ball left the box."""
         if not lost:
             return f"held for {step} steps" if over and step else f"step {step}"
         left = [f"x{i + 1}" for i, x in enumerate(trail[-1]) if abs(x) > self.wall]
@@ -246,7 +246,7 @@ class BallDrawing:
         self.pygame.draw.rect(self.canvas, colour, (left, top, width, height))
 
     def _line(self, start: Sequence[float], end: Sequence[float], colour: Colour, width: float) -> None:
-        """Draws a line with round ends; pygame's own wide lines are cut off slanting."""
+        """Draws a line as a polygon, because wide lines of pygame have slanted ends. Thin lines have round ends."""
         along = np.subtract(end, start)
         length = float(np.hypot(*along))
         if length > 0.0:
@@ -265,18 +265,18 @@ class BallDrawing:
         )
 
     def _text(self, text: str, place: Point, colour: Colour, side: str, font: Any = None) -> None:
-        """Writes ``text`` with its middle line at ``place``, which is its ``side``: left, right or centre."""
+        """Writes ``text``, vertically centered. ``place`` is its ``side``: ``"left"``, ``"right"`` or ``"centre"``."""
         drawn = (font or self.font).render(text, True, colour)
         x = place[0] * FINE - {"left": 0.0, "centre": 0.5, "right": 1.0}[side] * drawn.get_width()
         self.canvas.blit(drawn, (round(x), round(place[1] * FINE - 0.5 * drawn.get_height())))
 
 
 def _mix(first: Colour, second: Colour, share: float) -> Colour:
-    """Returns the colour ``share`` of the way from ``first`` to ``second``."""
+    """Interpolates between the colors ``first`` (``share=0``) and ``second`` (``share=1``)."""
     red, green, blue = (round(a + (b - a) * share) for a, b in zip(first, second, strict=True))
     return red, green, blue
 
 
 def _number(value: float) -> str:
-    """Returns a number with a true minus sign."""
+    """Formats a number with a Unicode minus sign."""
     return f"{value:g}".replace("-", "\N{MINUS SIGN}")

@@ -123,8 +123,8 @@ class Workers:
     """A pool of worker processes with one environment each.
 
     Requests are sent to several workers at once, and the answers may arrive in any order. A lost worker is replaced
-    with a warning, up to ``restarts`` times in total. After that, a lost worker raises ``WorkerError`` and terminates the
-    other processes.
+    with a warning, up to ``restarts`` times in total. After that, a lost worker raises ``WorkerError``, and the other
+    processes are terminated.
     """
 
     def __init__(
