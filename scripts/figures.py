@@ -1,10 +1,10 @@
-"""Writes every figure of README and documentation from the measured data.
+"""Writes every figure of the README and the documentation from the measured data.
 
-    python scripts/figures.py            # rewrites src/rejeu/presets/results.json and the marked blocks of the pages
+    python scripts/figures.py            # updates src/rejeu/presets/results.json and the marked blocks of the pages
     python scripts/figures.py --check    # changes nothing; exits with 1 if something is out of date
 
-A marked block stands between ``<!-- figures: NAME ARGUMENTS -->`` and ``<!-- end of figures -->``. The data is in
-``benchmarks/results``.
+A marked block starts with ``<!-- figures: NAME ARGUMENTS -->`` and ends with ``<!-- end of figures -->``. The data is
+in ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def load(name: str) -> Any:
 
 
 def measured() -> list[Result]:
-    """Returns the results of all presets from ``benchmarks/results/learning``, the preset as it is first."""
+    """Returns the results of all presets from ``benchmarks/results/learning``, with the unmodified preset first."""
     found = [
         result_of(json.loads(path.read_text(encoding="utf-8"))) for path in sorted((DATA / "learning").glob("*.json"))
     ]
@@ -47,7 +47,7 @@ def measured() -> list[Result]:
 
 
 def result_of(data: dict[str, Any]) -> Result:
-    """Returns the result that a file of ``benchmarks/learning.py`` or of ``rejeu train`` and ``evaluate`` holds."""
+    """Returns the result in a file of ``benchmarks/learning.py`` or of ``rejeu train`` and ``evaluate``."""
     words = shlex.split(data["command"])
     runs = data["runs"]
     env_id, algorithm = (words[2], words[3]) if words[0] == "python" else (words[2], "SAC")
@@ -90,7 +90,7 @@ def results(*algorithms: str) -> str:
 
 
 def time_of(result: Result) -> str:
-    """Returns the range of the training times of a result's seeds."""
+    """Returns the range of the training times over the seeds of a result."""
     low, high = (round(seconds) for seconds in result.seconds)
     return f"{low} s" if low == high else f"{low} to {high} s"
 
@@ -107,7 +107,7 @@ def ball() -> str:
 
 
 def parking() -> str:
-    """What ``rejeu train parking-v0`` takes and reaches."""
+    """Time and results of ``rejeu train parking-v0``."""
     result = next(result for result in measured() if result.env_id == "parking-v0")
     low, high = (100 * share for share in (result.low, result.high))
     return (
@@ -117,7 +117,7 @@ def parking() -> str:
 
 
 def speed() -> str:
-    """Speed against Stable-Baselines3 and SBX, first on the same environments."""
+    """Speed compared with Stable-Baselines3 and SBX, starting with equal environments."""
     samples = load("bench.json")["samples"]
 
     def row(text: str, case: str, name: str, peer_name: str = "") -> tuple[str, ...]:
@@ -234,7 +234,7 @@ def size() -> str:
         return f"{value:,}"
 
     rows = [(text, count(before[key]), count(after[key])) for key, text in names.items()]
-    # The order of the layers is that of the new layout.
+    # The layers are in the order of the new layout.
     rows = [(text, "" if "layers" in text else b, a) for text, b, a in rows]
     packages = sorted(before["lines_by_package"].keys() | after["lines_by_package"].keys())
     for package in packages:
@@ -257,7 +257,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
 
 
 def render(text: str) -> str:
-    """Returns a page with every marked block written anew."""
+    """Returns a page with every marked block regenerated."""
 
     def block(match: re.Match[str]) -> str:
         name, *arguments = match[2].split()
@@ -267,7 +267,7 @@ def render(text: str) -> str:
 
 
 def rendered() -> Iterator[tuple[Path, str]]:
-    """Yields each file with generated figures, and the text that it should have."""
+    """Yields each file with generated figures, and the expected text."""
     entries = [result.__dict__ for result in measured()]
     yield PRESET_RESULTS, json.dumps(entries, indent=1) + "\n"
     for page in PAGES:

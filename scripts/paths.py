@@ -35,7 +35,7 @@ SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
 
 
 class Listed(NamedTuple):
-    """A path as the page lists it."""
+    """A path as listed on the page."""
 
     files: dict[str, list[str]]
     most_files: int
@@ -44,7 +44,7 @@ class Listed(NamedTuple):
 
 
 class Reached(BaseException):
-    """The function that ends a trace was called."""
+    """Raised when the last function of a trace is called."""
 
 
 class Reach(gym.Env):
@@ -97,7 +97,7 @@ def tracing(called: set[tuple[str, str]], until: Callable[..., Any] | None = Non
 
 
 def trace_loop(agent: Any, loop: Any, n_turns: int) -> set[tuple[str, str]]:
-    """Returns what the turns of a loop call."""
+    """Returns the functions called by some turns of a loop."""
     called: set[tuple[str, str]] = set()
     with tracing(called):
         for _ in loop(agent.run, agent.learner, agent.config, n_turns, lambda step: 0.0):
@@ -106,21 +106,21 @@ def trace_loop(agent: Any, loop: Any, n_turns: int) -> set[tuple[str, str]]:
 
 
 def trace_sac() -> set[tuple[str, str]]:
-    """Returns what turns of SAC call: random and chosen actions, updates, and the end of an episode."""
+    """Returns the functions called by turns of SAC: random and policy actions, updates, and the end of an episode."""
     env = gym.make("Pendulum-v1", max_episode_steps=4)
     agent = rejeu.SAC("MlpPolicy", env, learning_starts=4, batch_size=4, **SMALL)
     return trace_loop(agent, off_policy, 10)
 
 
 def trace_ppo() -> set[tuple[str, str]]:
-    """Returns what two rollouts of PPO call."""
+    """Returns the functions called by two rollouts of PPO."""
     env = gym.make("Pendulum-v1", max_episode_steps=3)
     agent = rejeu.PPO("MlpPolicy", env, n_steps=8, batch_size=4, n_epochs=1, **SMALL)
     return trace_loop(agent, on_policy, 17)
 
 
 def trace_her() -> set[tuple[str, str]]:
-    """Returns what drawing a relabeled batch calls."""
+    """Returns the functions called by sampling a relabeled batch."""
     buffer = {"replay_buffer_class": "HerReplayBuffer", "learning_starts": 10}
     agent = rejeu.SAC("MultiInputPolicy", Reach(), **buffer, **SMALL)
     agent.learn(9)
@@ -132,7 +132,7 @@ def trace_her() -> set[tuple[str, str]]:
 
 
 def trace_train() -> set[tuple[str, str]]:
-    """Returns what ``rejeu train`` calls before the loop begins."""
+    """Returns the functions called by ``rejeu train`` before the loop starts."""
     called: set[tuple[str, str]] = set()
     with tempfile.TemporaryDirectory() as folder:
         words = ["train", "Pendulum-v1", "--algo", "SAC", "--steps", "2", "--out", f"{folder}/run", "--set"]
@@ -145,7 +145,7 @@ TRACES = {"SAC": trace_sac, "PPO": trace_ppo, "HER": trace_her, "rejeu train": t
 
 
 def read_page(text: str) -> tuple[dict[str, Listed], list[tuple[str, str | None]]]:
-    """Returns the paths by name, and the prefixes of leaf helpers with the path that each is for (None: all)."""
+    """Returns the paths by name, and the prefixes of leaf helpers with the path of each (None: all paths)."""
     paths: dict[str, Listed] = {}
     leaves: list[tuple[str, str | None]] = []
     current: Listed | None = None
@@ -179,7 +179,7 @@ def lengths(path: Path) -> dict[str, int]:
 
 
 def check(name: str, listed: Listed, called: set[tuple[str, str]], leaves: list[tuple[str, str | None]]) -> list[str]:
-    """Prints the totals of a path and returns what is wrong with its list."""
+    """Prints the totals of a path and returns the errors of its list."""
     problems, n_lines = [], 0
     for file, names in listed.files.items():
         sizes = lengths(PACKAGE / file) if (PACKAGE / file).exists() else {}
@@ -207,7 +207,7 @@ def check(name: str, listed: Listed, called: set[tuple[str, str]], leaves: list[
 
 
 def main() -> int:
-    """Checks all paths; returns 1 if something is wrong."""
+    """Checks all paths; returns 1 if there are errors."""
     paths, leaves = read_page(DESIGN.read_text(encoding="utf-8"))
     problems = [f"{DESIGN.name} lists no path {name}" for name in TRACES if name not in paths]
     for name, trace in TRACES.items():

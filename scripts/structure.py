@@ -1,4 +1,4 @@
-"""Prints how large the package is and how its modules depend on each other. Standard library and SciPy only.
+"""Prints the size of the package and the dependencies between its modules. Uses only the standard library and SciPy.
 
     python scripts/structure.py [SRC] [--json]
 
@@ -47,7 +47,7 @@ def is_type_checking(node: ast.AST) -> bool:
 
 
 def nodes(module: str, tree: ast.Module) -> Iterator[ast.AST]:
-    """Yields every node of a module; of the package's own ``__init__`` without the types of its lazy public names."""
+    """Yields every node of a module, but in the package's own ``__init__`` not the types of its lazy public names."""
     for statement in tree.body:
         if not (module == PACKAGE and is_type_checking(statement)):
             yield from ast.walk(statement)
@@ -70,7 +70,7 @@ def imports(module: str, path: Path, tree: ast.Module, known: set[str]) -> Itera
 
 
 def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
-    """Returns the groups of modules that import each other, directly or not."""
+    """Returns the groups of modules that import each other, directly or indirectly."""
     names = sorted(edges)
     number = {name: i for i, name in enumerate(names)}
     pairs = [(number[a], number[b]) for a in names for b in edges[a]]
@@ -84,7 +84,7 @@ def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
 
 
 def is_private(name: str) -> bool:
-    """Returns whether a name begins with an underscore and is not a dunder."""
+    """Returns whether a name starts with an underscore and is not a dunder."""
     return name.startswith("_") and not (name.startswith("__") and name.endswith("__"))
 
 
@@ -147,7 +147,7 @@ def code_lines(path: Path, tree: ast.Module) -> list[str]:
 
 
 def repeated_lines(files: list[list[str]]) -> tuple[int, int]:
-    """Returns how many lines occur in three or more of the files, and how many lines there are."""
+    """Returns the number of lines that occur in three or more of the files, and the number of lines."""
     in_files = Counter(line for file in files for line in set(file))
     lines = [line for file in files for line in file]
     return sum(in_files[line] >= 3 for line in lines), len(lines)
@@ -164,7 +164,7 @@ def longest_function(modules: dict[str, tuple[Path, ast.Module]]) -> tuple[int, 
 
 
 def measure(src: Path) -> dict[str, Any]:
-    """Returns every count, and the list behind those that should be 0."""
+    """Returns every count, and the details of those that should be 0."""
     modules = parse(src)
     lines: Counter[str] = Counter()
     found = []
@@ -198,7 +198,7 @@ def measure(src: Path) -> dict[str, Any]:
 
 
 def report(counts: dict[str, Any], verbose: bool) -> None:
-    """Prints the counts for a person."""
+    """Prints the counts as text."""
     print(", ".join(f"{package} {n:,}" for package, n in counts["lines_by_package"].items()))
     print(
         f"{counts['lines']:,} lines in {counts['files']} files; {counts['top_level_modules']} modules at the top level,",

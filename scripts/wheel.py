@@ -1,9 +1,9 @@
-"""Builds the wheel and tries it in a fresh virtual environment, without extras.
+"""Builds the wheel and tests it in a new virtual environment, without extras.
 
     python scripts/wheel.py [FOLDER]
 
-The wheel is left in ``FOLDER``, or thrown away without one. The exit status is 0 if the wheel holds the package and nothing
-else, installs, imports, answers on the command line, and trains.
+The wheel is saved in ``FOLDER``, or deleted if none is given. The exit status is 0 if the wheel contains only the
+package, installs, imports, runs its commands, and trains.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ assert rejeu.load("cartpole").num_timesteps == 512
 
 
 def run(*command: str | Path, cwd: Path = ROOT) -> str:
-    """Runs a command without the variables that could lead Python back to the sources; returns what it printed."""
+    """Runs a command without environment variables that point Python to the sources; returns its output."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     done = subprocess.run(
         command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, check=True
@@ -36,14 +36,14 @@ def run(*command: str | Path, cwd: Path = ROOT) -> str:
 
 
 def build(folder: Path) -> Path:
-    """Returns the path of the wheel, built into ``folder``."""
+    """Builds the wheel in ``folder`` and returns its path."""
     run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT)
     (wheel,) = folder.glob("rejeu-*.whl")
     return wheel
 
 
 def check_contents(wheel: Path) -> None:
-    """Exits unless the wheel holds the package with its type marker, and nothing else."""
+    """Exits unless the wheel contains the package with its type marker, and nothing else."""
     names = zipfile.ZipFile(wheel).namelist()
     strangers = [name for name in names if not name.startswith(("rejeu/", "rejeu-"))]
     if strangers or "rejeu/py.typed" not in names:
@@ -51,7 +51,7 @@ def check_contents(wheel: Path) -> None:
 
 
 def try_out(wheel: Path, folder: Path) -> None:
-    """Installs the wheel into a virtual environment under ``folder`` and uses it there."""
+    """Installs the wheel in a virtual environment under ``folder`` and uses it there."""
     venv.create(folder / "venv", with_pip=True)
     programs = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = programs / "python"
@@ -64,7 +64,7 @@ def try_out(wheel: Path, folder: Path) -> None:
 
 
 def main() -> None:
-    """Builds, checks and tries the wheel."""
+    """Builds, checks and tests the wheel."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         wheels = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else folder / "dist"

@@ -1,7 +1,8 @@
-"""Environments that each do one thing wrong; :data:`EVERY` says what is to be said of it.
+"""Environments with one fault each. :data:`EVERY` lists the expected messages.
 
-``checked`` are words of an error or warning of ``rejeu.check_env``, ``trained`` those of the ``BadEnvironmentError`` that ends
-training, or None where training goes on, because the fault is mended on the way or cannot be seen there.
+``checked`` is part of an error or warning of ``rejeu.check_env``. ``trained`` is part of the ``BadEnvironmentError``
+that ends training. It is None if training continues, because the fault is corrected or cannot be detected during
+training.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from tests.environments import Reach
 
 
 class Good(gym.Env):
-    """Nothing is wrong with it: a walk of ten steps, the observation a number drawn, the time and the place."""
+    """A valid environment: a walk of ten steps. Observations are a random number, the time and the position."""
 
     observation_space: spaces.Space = spaces.Box(-20.0, 20.0, (3,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -36,7 +37,7 @@ class Good(gym.Env):
 
     @property
     def late(self) -> bool:
-        """Whether the fault is to show: not before the third step."""
+        """Whether the fault occurs: from the third step on."""
         return self.time >= 3
 
 
@@ -58,7 +59,7 @@ class AsList(Good):
 
 
 class Scalar(Good):
-    """One number, which NumPy would write into all three places."""
+    """One number, which NumPy would broadcast to all three elements."""
 
     def observe(self):
         return np.float32(1.0) if self.late else super().observe()
@@ -111,7 +112,7 @@ class OutOfBounds(Good):
 
 
 class Answering(Good):
-    """Answers a step with :meth:`answer` from the third on."""
+    """Modifies the result of ``step`` with :meth:`answer` from the third step on."""
 
     def step(self, action):
         answer = super().step(action)
@@ -167,7 +168,7 @@ class TerminatedInfo(Answering):
 
 
 class Zeros(Answering):
-    """Flags as 0 and 1."""
+    """Returns 0 and 1 as flags."""
 
     def answer(self, obs, reward, terminated, truncated, info):
         return obs, reward, int(terminated), np.float32(truncated), info
@@ -179,7 +180,7 @@ class OnlyObservation(Good):
 
 
 class TwoKeysOnly(MissingKey):
-    """Returns a dict of two keys, which can be taken apart as a pair."""
+    """Returns a dict with two keys, which can be unpacked like a pair."""
 
     late = False
 
@@ -198,7 +199,7 @@ class Unrepeatable(Good):
 
 
 class FoldedLimit(Good):
-    """Calls its time limit the end of the task."""
+    """Reports its time limit as a termination."""
 
     _max_episode_steps = 10
 
@@ -222,7 +223,7 @@ class Endless(Good):
 
 
 class SameArray(Good):
-    """Writes every observation into one array."""
+    """Writes every observation into the same array."""
 
     def observe(self):
         self.__dict__.setdefault("array", np.zeros(3, np.float32))[:] = super().observe()
@@ -247,7 +248,7 @@ class NoInfo(Good):
 
 
 class Line(Reach):
-    """A goal environment with nothing wrong."""
+    """A valid goal environment."""
 
     def _observe(self):
         return {key: np.array(value) for key, value in super()._observe().items()}
@@ -269,7 +270,7 @@ class RewardNeedsInfo(Line):
 
 
 class MeanReward(Line):
-    """Of many goals at once it gives to each the mean of all."""
+    """Returns the mean reward for every goal of a batch."""
 
     def compute_reward(self, achieved, desired, info):
         reward = super().compute_reward(achieved, desired, info)
@@ -277,14 +278,14 @@ class MeanReward(Line):
 
 
 class RowReward(Line):
-    """Takes one goal at a time."""
+    """Accepts one goal at a time."""
 
     def compute_reward(self, achieved, desired, info):
         return -float(np.linalg.norm(achieved - desired) >= 0.5)
 
 
 class RewardWithAxis(Line):
-    """Of one goal it gives an array."""
+    """Returns an array for a single goal."""
 
     def compute_reward(self, achieved, desired, info):
         return super().compute_reward(achieved, desired, info)[..., None]
@@ -302,13 +303,13 @@ class OddTerminated(Line):
 
 
 class Fault(NamedTuple):
-    """What is to be said of an environment."""
+    """The expected messages of an environment."""
 
     make: Any
     level: str
     checked: str
     trained: str | None
-    """What ends training; None if it goes on."""
+    """Message of the error that ends training; None if training continues."""
 
 
 EVERY: dict[str, Fault] = {

@@ -1,4 +1,4 @@
-"""Bits to be flipped one at a time until they match a goal (Andrychowicz et al. 2017, arXiv 1707.01495, section 3.1)."""
+"""The bit-flipping environment (Andrychowicz et al. 2017, arXiv 1707.01495, section 3.1)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from gymnasium import spaces
 
 
 class BitFlipping(gym.Env):
-    """A goal environment: state and goal are drawn anew every episode, each action flips one of ``n_bits``.
+    """A goal environment: state and goal are sampled at every reset, and each action flips one of ``n_bits``.
 
-    The reward is 0 where the state equals the goal, which terminates, and -1 elsewhere; episodes are cut after
-    ``max_steps`` (None: as many as bits). Rewards say nothing of how near the goal is.
+    The reward is 0 and the episode terminates if the state equals the goal; otherwise the reward is -1. Episodes are
+    truncated after ``max_steps`` (None: ``n_bits``). The reward does not depend on the distance to the goal.
     """
 
     def __init__(self, n_bits: int = 10, max_steps: int | None = None) -> None:
@@ -38,11 +38,11 @@ class BitFlipping(gym.Env):
         return self._observe(), float(success) - 1.0, success, truncated, {"is_success": success}
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
-        """Returns 0 where the goals are equal and -1 elsewhere, ``(...)`` for goals ``(..., n_bits)``."""
+        """Returns 0 where state and goal are equal and -1 elsewhere, ``(...)`` for goals ``(..., n_bits)``."""
         return self.compute_terminated(achieved_goal, desired_goal, info).astype(np.float32) - 1.0
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
-        """Returns whether the goals are equal."""
+        """Returns where state and goal are equal."""
         return (achieved_goal == desired_goal).all(axis=-1)
 
     def _observe(self) -> dict[str, np.ndarray]:

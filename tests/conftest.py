@@ -1,10 +1,10 @@
 """Settings and fixtures of all tests: JAX does not promote ranks, and compiled functions are cached on disk between runs.
 
-Programs are compiled with little optimization, which takes half as long and is most of what tests do; ``XLA_FLAGS= pytest``
-compiles them as users do.
+Programs are compiled with little optimization, because compilation takes most of the time of the tests. This halves the
+compilation time. ``XLA_FLAGS= pytest`` compiles them as users do.
 
-Mixed dtypes are refused as well, but only around our own functions (``strict_dtypes``): Adam's bias correction in optax
-raises a Python float to an int32 power, which JAX's strict mode forbids.
+Mixed dtypes also raise an error, but only around rejeu's own functions (``strict_dtypes``): Adam's bias correction in
+optax raises a Python float to an int32 power, which JAX's strict mode does not allow.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import pytest
 hypothesis.settings.register_profile("rejeu", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("rejeu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell; those whom tests start inherit it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # set by shells for background jobs; subprocesses inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -39,25 +39,25 @@ QUICK_TO_COMPILE = (
 )
 MAPS = Path("/proc/self/maps")
 STEPS, EPISODES = 64, 25
-"""The longest training of an example. Restoring the best weights takes 20 finished episodes."""
+"""Maximum number of training steps of an example. Restoring the best weights takes 20 finished episodes."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Sets XLA's options before its first use. Slow tests train for minutes, so for them optimized programs are worth it."""
+    """Sets XLA's options before its first use. Slow tests train for minutes, so their programs are optimized."""
     if config.option.markexpr.startswith("not slow"):
         os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 
 
 @pytest.fixture
 def strict_dtypes() -> Iterator[None]:
-    """JAX raises wherever two dtypes meet; for tests of functions that hold no optimizer."""
+    """JAX raises an error if two dtypes are mixed. For tests of functions that contain no optimizer."""
     with jax.numpy_dtype_promotion("strict"):
         yield
 
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cuts short the training and the evaluations of an example."""
+    """Shortens the training and the evaluations of an example."""
     from rejeu.agents import Agent
 
     learn, evaluate = Agent.learn, Agent.evaluate
@@ -86,7 +86,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled_functions_are_dropped() -> Iterator[None]:
-    """Drops compiled functions before they take more than about 3 GB; each is a few memory maps."""
+    """Drops compiled functions before they exceed about 3 GB. Each one uses a few memory maps."""
     yield
     if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 15_000:
         jax.clear_caches()

@@ -1,9 +1,9 @@
-"""What a power cut may leave of files: every state that POSIX allows after some file operations, made from a record of them.
+"""Simulates power failures: generates every state of the files that POSIX allows after a sequence of file operations.
 
-Operations are recorded while a program runs (:class:`Recorder`). A power cut may come between any two of them. Then a file
-holds what was in it at its last ``fsync``, and of what was written since all, a part, zeros or nothing; and a folder has the
-names of its last ``fsync``, with any of the changes since, each made or not. File systems promise more than that; what
-survives here survives everywhere.
+Operations are recorded while a program runs (:class:`Recorder`). A power failure can occur between any two of them. A
+file then has its contents at the last ``fsync``. Of later writes, it has all, a part, zeros or nothing. A folder has
+its names at the last ``fsync`` and any subset of the changes since then. Real file systems give stronger guarantees. A
+program that is correct under these rules is therefore correct on all of them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 MOST_CHANGES = 8
-"""Unsynced changes of names of which every subset is tried; of more, those that came first."""
+"""Maximum number of unsynced name changes of which all subsets are generated. Of more, the first are used."""
 
 
 class Operation(NamedTuple):
@@ -26,30 +26,30 @@ class Operation(NamedTuple):
     """``create``, ``write``, ``sync``, ``sync folder``, ``rename``, ``remove``, ``folder`` or ``done``."""
     path: pathlib.PurePath
     more: Any = None
-    """What is written, or the new path."""
+    """The bytes written, or the new path."""
     note: Any = None
-    """What ``Recorder.note`` was when it was done."""
+    """Value of ``Recorder.note`` at the time of the operation."""
 
 
 class Recorder:
-    """Records what is done through ``pathlib`` and ``os.fsync`` beneath a folder."""
+    """Records operations of ``pathlib`` and ``os.fsync`` in a folder."""
 
     def __init__(self, monkeypatch: Any, root: pathlib.Path) -> None:
         self.root = root
         self.operations: list[Operation] = []
         self.note: Any = None
-        """Goes with every operation from now on."""
+        """Value that is recorded with every following operation."""
         self._folders: dict[int, pathlib.Path] = {}
         self._files: dict[int, _File] = {}
         self._patch(monkeypatch)
 
     def add(self, kind: str, path: pathlib.Path, more: Any = None) -> None:
-        """Records an operation, if it is beneath the folder; writes to one file that follow each other are one."""
+        """Records an operation if it is in the folder. Consecutive writes to the same file are merged."""
         if not path.is_relative_to(self.root):
             return
         path, last = path.relative_to(self.root), self.operations[-1] if self.operations else None
         if kind == "write" and last is not None and (last.kind, last.path) == (kind, path):
-            self.operations[-1] = last._replace(more=last.more + more)  # a part of it is tried in any case
+            self.operations[-1] = last._replace(more=last.more + more)  # partial writes are generated in any case
         else:
             self.operations.append(Operation(kind, path, more, self.note))
 
@@ -132,7 +132,7 @@ class _File(io.FileIO):
 
 
 class Inode:
-    """A file or a folder apart from its name."""
+    """A file or folder, independent of its name."""
 
     def __init__(self, is_folder: bool) -> None:
         self.is_folder = is_folder
@@ -140,26 +140,26 @@ class Inode:
 
 
 class State(NamedTuple):
-    """What a power cut left."""
+    """The files after a power failure."""
 
     files: dict[str, bytes]
     """Contents by path."""
     folders: list[str]
     note: Any
-    """That of the operation before which the power was cut."""
+    """Note of the operation before which the power failed."""
     n_done: int
-    """How many operations of the kind ``done`` had ended before."""
+    """Number of preceding operations of the kind ``done``."""
 
 
 Entries = dict[pathlib.PurePath, Inode]
 
 
 def crash_states(operations: list[Operation], ignored: tuple[str, ...] = ()) -> Iterator[State]:
-    """Yields every state that a power cut may leave, each once, for any number of the operations done.
+    """Yields every possible state after a power failure, each once, for any number of completed operations.
 
     Args:
-        operations: as they were recorded.
-        ignored: kinds that are taken not to have happened, to see what a program without them would lose.
+        operations: the recorded operations.
+        ignored: kinds of operations to omit, which shows what a program without them would lose.
     """
     names: Entries = {}
     synced: Entries = {}
@@ -240,7 +240,7 @@ def _content(inode: Inode, after: str) -> bytes:
 
 
 def make(state: State, root: pathlib.Path) -> None:
-    """Writes the files of a state beneath an empty folder."""
+    """Writes the files of a state to an empty folder."""
     for folder in state.folders:
         (root / folder).mkdir(parents=True, exist_ok=True)
     for name, content in state.files.items():

@@ -1,4 +1,4 @@
-"""Tiny environments that several tests share. Each is as small as the behaviour that it makes visible."""
+"""Minimal environments shared by several tests."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from gymnasium import spaces
 
 
 class Counter(gym.Env):
-    """Says where it stands: the observation is (episode, time within it, a number drawn at reset).
+    """Observes its own state: (episode, time in the episode, a number sampled at reset).
 
-    Episodes last ``lengths[episode % len(lengths)]`` steps and end as ``ends`` says. The reward is 100 times the
-    episode plus the time, and ``actions`` keeps what was received.
+    Episode ``i`` has ``lengths[i % len(lengths)]`` steps, and ``ends`` says how it ends. The reward is 100 times the
+    episode plus the time. ``actions`` contains all actions received.
     """
 
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -52,7 +52,7 @@ class Counter(gym.Env):
 
 
 class Reach(gym.Env):
-    """A goal environment: move a point on a line to a goal; 10 steps, or shorter where ``stops`` and it is reached."""
+    """A goal environment: move a point on a line to a goal. 10 steps, or fewer if ``stops`` and the goal is reached."""
 
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     observation_space = spaces.Dict(
@@ -83,7 +83,7 @@ class Reach(gym.Env):
 
 
 class Sampled(gym.Env):
-    """Observations drawn from any space, rewards of 0, episodes of 5 steps."""
+    """Samples observations from any space. Rewards are 0 and episodes have 5 steps."""
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Space | None = None) -> None:
         self.observation_space = observation_space

@@ -1,4 +1,4 @@
-"""A small agent of every algorithm on every kind of action it takes, sharing compiled functions (see ``sharing``)."""
+"""Small agents of every algorithm and kind of action space. They share compiled functions (see ``sharing``)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Kind(NamedTuple):
     name: str
     discrete: bool
     settings: dict[str, Any]
-    """What it needs to learn the probes."""
+    """Hyperparameters with which it learns the probes."""
     delay: int = 1
-    """Gradient steps until everything has moved once."""
+    """Number of gradient steps after which all parameters have changed."""
 
     @property
     def agent(self) -> type[agents.Agent]:
@@ -38,7 +38,7 @@ class Kind(NamedTuple):
 NOISE = rejeu.NormalActionNoise([0.0], [0.3])
 TEMPERATURE = {"ent_coef": "auto_0.01"}
 CALMING = {"learning_rate": rejeu.Linear(1e-2, 1e-3)}
-"""Without targets to follow slowly, the last steps must be smaller."""
+"""Without target networks, the last steps must be smaller."""
 EPSILON = {"train_freq": 1, "target_update_interval": 1, "exploration_fraction": 0.5}
 
 KINDS = {
@@ -52,20 +52,20 @@ KINDS = {
     "DQN": Kind("DQN", True, EPSILON),
     "QRDQN": Kind("QRDQN", True, {**EPSILON, "n_quantiles": 5}),
 }
-"""Every algorithm with every kind of action space that it takes."""
+"""Every algorithm with every kind of action space that it supports."""
 
 LEARNING = {"learning_rate": 1e-2, "batch_size": 32, "tau": 0.05, "policy_kwargs": {"net_arch": [32]}}
 RUN = {"gamma": 0.5, "buffer_size": 2000, "learning_starts": 64, "seed": 0}
 
 
 def env_of(kind: Kind, probe: Probe | None = None) -> gym.Env:
-    """The probe (None: any) with the kind's actions."""
+    """Returns the probe (None: the default one) with this kind of action space."""
     probe = Probe() if probe is None else probe
     return Discretely(probe) if kind.discrete else probe
 
 
 def small(kind: Kind, env: Any, **settings: Any) -> agents.Agent:
-    """A small agent of this kind."""
+    """Returns a small agent of this kind."""
     settings = {**LEARNING, **RUN, **kind.settings, **settings}
     if not kind.has_targets:
         settings.pop("tau")

@@ -1,4 +1,4 @@
-"""A disk that is full for a while: files can be opened, and half of what is written to them arrives."""
+"""Simulation of a full disk: files can be opened, but only half of the bytes are written."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pathlib
 
 
 class FullDisk:
-    """While ``full``, every write through ``Path.open`` fails after half of its bytes, as it does on a real disk."""
+    """While ``full``, every write through ``Path.open`` fails after half of its bytes, as on a real disk."""
 
     def __init__(self, monkeypatch):
         self.full = False

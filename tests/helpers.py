@@ -1,4 +1,4 @@
-"""Small agents, as quick to build as an agent can be, and ways to look at them."""
+"""Small agents that are fast to create, and functions to inspect them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tests.sharing import shared_learners
 
 
 def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
-    """A SAC with one narrow layer and batches of 4 that learns from step 8 on.
+    """Returns a SAC agent with one small layer and a batch size of 4 that learns from step 8 on.
 
-    Agents of equal settings and spaces share their compiled functions.
+    Agents with equal settings and spaces share their compiled functions.
     """
     given = env.observation_space if isinstance(env, gym.Env) else getattr(env, "observation_space", None)
     nested = isinstance(given, gym.spaces.Dict | gym.spaces.Tuple)
@@ -34,7 +34,7 @@ def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
 
 
 def count_updates(agent: rejeu.SAC) -> list[int]:
-    """Replaces the gradient by nothing; returns a list that will hold the number of batches of each call of it."""
+    """Replaces the update by a function that does nothing; returns a list of the number of batches of each call."""
     calls: list[int] = []
 
     def update(leaves: Any, batches: Any, clock: Any) -> tuple[Any, dict, None]:
@@ -46,7 +46,7 @@ def count_updates(agent: rejeu.SAC) -> list[int]:
 
 
 def assert_same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> None:
-    """Fails unless everything learnt is the same, bit for bit."""
+    """Asserts that all parameters are equal, bit for bit."""
     first, second = one.get_parameters(), two.get_parameters()
     assert list(first) == list(second)
     for name, value in first.items():
@@ -54,13 +54,13 @@ def assert_same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> None:
 
 
 def same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> bool:
-    """Whether everything learnt is the same, bit for bit."""
+    """Returns whether all parameters are equal, bit for bit."""
     first, second = one.get_parameters(), two.get_parameters()
     return all(np.array_equal(value, second[name]) for name, value in first.items())
 
 
 def q_values(agent: rejeu.SAC, obs: Any, action: Any) -> np.ndarray:
-    """The mean of the critics' values of each row, ``(n,)``."""
+    """Returns the mean of the critics' values of each row, ``(n,)``."""
     critics = agent.state.critics
     values = [
         np.asarray(_member(critics, i)(jnp.asarray(obs, jnp.float32), jnp.asarray(action, jnp.float32)))[:, 0]

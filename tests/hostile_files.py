@@ -93,7 +93,7 @@ def changed(content: bytes, change: Callable[[dict, dict], Any]) -> bytes:
 
 
 def variants(content: bytes) -> Iterator[Variant]:
-    """Yields hostile files made from a valid one of any kind, without flips (see :func:`flipped`) and truncations."""
+    """Yields invalid files made from a valid one of any kind, except bit flips (:func:`flipped`) and truncations."""
     yield from foreign()
     yield from bad_tables(content)
     yield from bad_arrays(content)
@@ -466,7 +466,7 @@ def bad_statistics(content: bytes) -> Iterator[Variant]:
 
 
 def bad_buffers(content: bytes) -> Iterator[Variant]:
-    """Yields replay files whose counters lead out of the ring, or that hold numbers that no environment returns."""
+    """Yields replay files with counters outside of the ring, or with values that no environment returns."""
 
     def of(name: str, change: Callable[[dict, dict], Any]) -> Variant:
         return Variant("buffer", name, changed(content, change))
@@ -477,7 +477,7 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
             yield of(f"{kind} {i}", lambda h, a, k=kind, v=value: h.update({k: v}))
         yield of(f"{kind} gone", lambda h, a, k=kind: h.pop(k))
         yield of(f"{kind} of another", lambda h, a, k=kind: h.update({k: {"MultiBinary": {"shape": [7]}}}))
-    # A full ring may begin anywhere: with another newest row the file is valid.
+    # A full ring may start at any row: with another newest row the file is valid.
     is_full = (arrays["head"] >= arrays["kind"].shape[1]).all()
     for name in ("head", "n_steps"):
         for value in (-2, -1, 0, 10**6, 2**62, 2**63 - 1, -(2**63)):
@@ -487,7 +487,7 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
         yield of(f"{name} of more", lambda h, a, n=name: a.update({n: np.repeat(a[n], 2)}))
     for value in (3, 255):
         yield of(f"kind {value}", lambda h, a, v=value: a["kind"].fill(v))
-    # Counters of each row, which only older files hold.
+    # Only older files contain the counters of each row.
     for name in ("since_start", "until_end"):
         for value in (10**6, 2**31 - 1, -1, -(2**31)):
             yield of(f"{name} {value}", lambda h, a, n=name, v=value: a.update({**counters(a), n: counters(a)[n] + v}))
@@ -539,7 +539,7 @@ def bad_runs(content: bytes) -> Iterator[Variant]:
 
 
 class Sparse(NamedTuple):
-    """The beginning of a file whose rest is a hole."""
+    """The beginning of a sparse file."""
 
     name: str
     content: bytes
@@ -548,7 +548,7 @@ class Sparse(NamedTuple):
 
 
 def sparse(content: bytes, size: int = 6 * 2**30) -> Iterator[Sparse]:
-    """Yields files in which one array has about 6 GiB, all in a hole: a few KiB on disk."""
+    """Yields sparse files in which one array has about 6 GiB but which take a few KiB on disk."""
     parts = take_apart(content)
     rows = {name: array for name, array in parts.arrays.items() if array.ndim}
     for name in ("a", min(rows), max(rows), max(rows, key=lambda name: rows[name].nbytes)):

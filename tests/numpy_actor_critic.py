@@ -1,7 +1,8 @@
-"""Policy and value, their losses and whole on-policy updates in float64 NumPy, knowing nothing of JAX.
+"""Reference implementation of policies, values, losses and on-policy updates in float64 NumPy, independent of JAX.
 
-Networks have tanh between their layers and share nothing. All of one is a list of layers (see ``numpy_networks``): the
-policy's, the value's, and where there is one a last layer of the log standard deviation and nothing else.
+Networks have tanh between their layers and share none. A complete network is a list of layers (see ``numpy_networks``):
+those of the policy, those of the value and, if there is one, a last layer that contains only the log standard
+deviation.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from tests.numpy_networks import Adam, Layers, gradient
 
 
 class Network:
-    """The numbers of an ``ActorCritic``, or of its optimizer's moments, copied."""
+    """A copy of the arrays of an ``ActorCritic``, or of its optimizer's moments."""
 
     def __init__(self, network: Any) -> None:
         parts = lambda torso, head: [  # noqa: E731
@@ -28,21 +29,21 @@ class Network:
 
     @property
     def policy(self) -> Layers:
-        """What the policy has, the same arrays."""
+        """The layers of the policy (not copied)."""
         return self.pi + self.log_std
 
     @property
     def everything(self) -> Layers:
-        """All layers, the same arrays."""
+        """All layers (not copied)."""
         return self.pi + self.vf + self.log_std
 
     def value(self, obs: Any) -> np.ndarray:
-        """Values of observations ``(..., obs_dim)``, ``(...)``."""
+        """Returns the values ``(...)`` of observations ``(..., obs_dim)``."""
         return through(self.vf, obs)[..., 0]
 
 
 def through(layers: Layers, x: Any) -> np.ndarray:
-    """What comes out of layers with a tanh between them."""
+    """Returns the output of layers with tanh between them."""
     x = np.float64(x)
     for weight, bias in layers[:-1]:
         x = np.tanh(x @ weight + bias)
@@ -50,10 +51,10 @@ def through(layers: Layers, x: Any) -> np.ndarray:
 
 
 def log_prob_and_entropy(network: Network, obs: Any, action: Any, kind: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Log-probabilities of actions and entropies, ``(batch,)`` each.
+    """Returns log-probabilities of actions and entropies, ``(batch,)`` each.
 
-    ``kind`` is ``"box"``, ``"squashed"``, ``"binary"`` or the sizes of several choices. A squashed normal's entropy is
-    estimated by -log pi.
+    ``kind`` is ``"box"``, ``"squashed"``, ``"binary"`` or the sizes of several choices. The entropy of a squashed
+    normal distribution is estimated by -log pi.
     """
     outputs = through(network.pi, obs)
     if kind in ("box", "squashed"):
@@ -78,7 +79,7 @@ def log_prob_and_entropy(network: Network, obs: Any, action: Any, kind: Any) -> 
 
 
 def lambda_advantages(network: Network, rollout: Any, gae_lambda: float) -> tuple[np.ndarray, np.ndarray]:
-    """Advantages and values ``(steps, n_envs)``, environment by environment from the last valid step back."""
+    """Returns advantages and values ``(steps, n_envs)``, computed per environment backward from the last valid step."""
     value, next_value = network.value(rollout.obs), network.value(rollout.next_obs)
     advantage = np.zeros_like(value)
     for env in range(value.shape[1]):
@@ -92,12 +93,12 @@ def lambda_advantages(network: Network, rollout: Any, gae_lambda: float) -> tupl
 
 
 def standard(values: np.ndarray) -> np.ndarray:
-    """Values with mean 0 and standard deviation 1; one alone, which has no deviation, as it is."""
+    """Returns values standardized to mean 0 and standard deviation 1. A single value is returned unchanged."""
     return values if len(values) == 1 else (values - values.mean()) / (values.std() + 1e-8)
 
 
 class Losses:
-    """What a minibatch comes to, from arrays ``(batch,)`` of the steps that there are."""
+    """The losses of a minibatch, from arrays ``(batch,)`` of its valid steps."""
 
     def __init__(
         self,
@@ -129,18 +130,18 @@ class Losses:
 
 
 def norm(slopes: Layers) -> float:
-    """The length of all slopes as one vector."""
+    """Returns the global norm of the gradients."""
     return float(np.sqrt(sum(np.sum(array**2) for layer in slopes for array in layer)))
 
 
 def cut(slopes: Layers, most: float | None) -> Layers:
-    """Slopes scaled down to the length ``most`` if they are longer."""
+    """Returns gradients scaled down to the norm ``most`` if they exceed it."""
     factor = 1.0 if most is None else min(1.0, most / (norm(slopes) + 1e-6))
     return [[factor * array for array in layer] for layer in slopes]
 
 
 class PPO:
-    """PPO as its docstring has it; ``two_rates`` gives policy and value an Adam each."""
+    """PPO as documented; ``two_rates`` uses one Adam optimizer for the policy and one for the value."""
 
     def __init__(self, network: Any, config: Any, kind: Any, two_rates: bool = False) -> None:
         self.network, self.config, self.kind = Network(network), config, kind
@@ -157,7 +158,7 @@ class PPO:
         clip_vf: float | None = None,
         ent_coef: float = 0.0,
     ) -> dict[str, float]:
-        """One rollout's worth of steps in the given orders of valid steps ``(n_epochs, n)``; returns the mean losses."""
+        """Updates on a rollout with the given orders of valid steps ``(n_epochs, n)``; returns the mean losses."""
         config, network = self.config, self.network
         flat = lambda x: np.reshape(x, (-1, *x.shape[2:]))  # noqa: E731
         advantage, value = map(flat, lambda_advantages(network, rollout, config.gae_lambda))
@@ -195,16 +196,16 @@ class PPO:
 
 
 def minibatches(orders: np.ndarray, size: int) -> Iterator[np.ndarray]:
-    """Every order cut into pieces of ``size``, the last of which holds what is left."""
+    """Yields minibatches of ``size`` from each order. The last one of an order contains the remaining steps."""
     for order in orders:
         for first in range(0, len(order), size):
             yield order[first : first + size]
 
 
 class RMSprop:
-    """RMSprop (Tieleman and Hinton 2012) on ``network`` in place, as TensorFlow has it.
+    """RMSprop (Tieleman and Hinton 2012), which updates ``network`` in place as TensorFlow does.
 
-    The mean of squares begins at 1 and epsilon is added to it under the root: r / sqrt(v + epsilon).
+    The mean of squares starts at 1, and epsilon is added inside the square root: r / sqrt(v + epsilon).
     """
 
     def __init__(self, network: Layers, rate: float, eps: float, decay: float = 0.99) -> None:
@@ -212,7 +213,7 @@ class RMSprop:
         self.second = [[np.ones_like(array) for array in layer] for layer in network]
 
     def step(self, slopes: Layers) -> None:
-        """Moves the network one step against ``slopes``."""
+        """Takes one step against the gradients ``slopes``."""
         for layer, slope, v in zip(self.network, slopes, self.second, strict=True):
             for i, g in enumerate(slope):
                 v[i] = self.decay * v[i] + (1.0 - self.decay) * g**2
@@ -220,14 +221,14 @@ class RMSprop:
 
 
 class A2C:
-    """A2C as its docstring has it; ``optimizers`` makes one or two that have all of a network between them."""
+    """A2C as documented; ``optimizers`` returns one or two optimizers that cover the whole network."""
 
     def __init__(self, network: Any, config: Any, kind: Any, optimizers: Callable[[Network], list[Any]]) -> None:
         self.network, self.config, self.kind = Network(network), config, kind
         self.optimizers = optimizers(self.network)
 
     def update(self, rollout: Any, ent_coef: float) -> dict[str, float]:
-        """One gradient step on the valid steps of a rollout; returns the losses before it."""
+        """Takes one gradient step on the valid steps of a rollout; returns the losses before the step."""
         network, config, keep = self.network, self.config, rollout.valid
         advantage, value = (x[keep] for x in lambda_advantages(network, rollout, config.gae_lambda))
         target = advantage + value

@@ -1,4 +1,4 @@
-"""Networks, gradients and Adam in float64 NumPy, knowing nothing of JAX: what whole updates are checked against."""
+"""Reference implementation of networks, gradients and Adam in float64 NumPy, independent of JAX."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Layers = list[list[np.ndarray]]
 
 
 def layers(network: Any, index: Any = ...) -> Layers:
-    """Copies the weights of a plain network, or of its optimizer's moments; ``index`` picks one of an ensemble."""
+    """Copies the weights of a network, or of its optimizer's moments; ``index`` selects a member of an ensemble."""
     parts = [*network.torso.layers, network.head]
     return [[np.array(np.float64(part.weight)[index]), np.array(np.float64(part.bias)[index])] for part in parts]
 
 
 def forward(network: Layers, x: Any) -> np.ndarray:
-    """What comes out of layers with a relu between them, ``(batch, n_outputs)``."""
+    """Returns the output of layers with ReLU between them, ``(batch, n_outputs)``."""
     x = np.float64(x)
     for weight, bias in network[:-1]:
         x = np.maximum(x @ weight + bias, 0.0)
@@ -26,13 +26,13 @@ def forward(network: Layers, x: Any) -> np.ndarray:
 
 
 def softmax(logits: np.ndarray) -> np.ndarray:
-    """Probabilities, ``(batch, n)``."""
+    """Returns probabilities, ``(batch, n)``."""
     powers = np.exp(logits - logits.max(axis=1, keepdims=True))
     return powers / powers.sum(axis=1, keepdims=True)
 
 
 def gradient(network: Layers, loss: Callable[[], float], width: float = 1e-6) -> Layers:
-    """Central differences of ``loss()``, which reads ``network``, in the direction of every weight."""
+    """Returns the gradient of ``loss()``, a function of ``network``, by central differences."""
     slopes = [[np.zeros_like(array) for array in layer] for layer in network]
     for layer, slope in zip(network, slopes, strict=True):
         for array, along in zip(layer, slope, strict=True):
@@ -47,7 +47,7 @@ def gradient(network: Layers, loss: Callable[[], float], width: float = 1e-6) ->
 
 
 class Adam:
-    """Adam as its authors write it (Kingma and Ba 2015, algorithm 1), on ``network`` in place."""
+    """Adam (Kingma and Ba 2015, algorithm 1), which updates ``network`` in place."""
 
     def __init__(self, network: Layers, rate: float, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8) -> None:
         self.network, self.rate, self.b1, self.b2, self.eps = network, rate, b1, b2, eps
@@ -55,7 +55,7 @@ class Adam:
         self.t = 0
 
     def step(self, slopes: Layers) -> None:
-        """Moves the network one step against ``slopes``."""
+        """Takes one step against the gradients ``slopes``."""
         self.t += 1
         for layer, slope, m, v in zip(self.network, slopes, self.first, self.second, strict=True):
             for i, g in enumerate(slope):
@@ -65,25 +65,25 @@ class Adam:
                 layer[i][...] = layer[i] - self.rate * corrected[0] / (np.sqrt(corrected[1]) + self.eps)
 
     def descend(self, loss: Callable[[], float]) -> None:
-        """Moves the network one step against the gradient of ``loss()``, which reads it."""
+        """Takes one step against the gradient of ``loss()``, a function of the network."""
         self.step(gradient(self.network, loss))
 
 
 def follow(target: Layers, online: Layers, tau: float) -> None:
-    """Moves ``target`` by the share ``tau`` towards ``online``, in place."""
+    """Moves ``target`` toward ``online`` by the fraction ``tau``, in place."""
     for target_layer, online_layer in zip(target, online, strict=True):
         for t, o in zip(target_layer, online_layer, strict=True):
             t[...] = (1.0 - tau) * t + tau * o
 
 
 def assert_equal_layers(given: Layers, expected: Layers, what: str, atol: float = 2e-5, rtol: float = 0.0) -> None:
-    """Fails unless all weights and biases agree."""
+    """Asserts that all weights and biases agree."""
     for i, (one, two) in enumerate(zip(given, expected, strict=True)):
         for kind, a, b in zip(("weight", "bias"), one, two, strict=True):
             np.testing.assert_allclose(a, b, atol=atol, rtol=rtol, err_msg=f"{what}: {kind} {i}")
 
 
 def largest_difference(one: Layers, two: Layers) -> float:
-    """The largest difference between any two corresponding numbers."""
+    """Returns the maximum absolute difference of corresponding values."""
     pairs = zip(one, two, strict=True)
     return max(float(np.abs(a - b).max()) for p, q in pairs for a, b in zip(p, q, strict=True))

@@ -1,4 +1,4 @@
-"""Small on-policy agents on every kind of action that they take, sharing what is compiled (see ``sharing``)."""
+"""Small on-policy agents with every kind of action space that they support. They share compiled functions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Kind(NamedTuple):
 
     name: str
     wrapper: type[gym.ActionWrapper] | None
-    """What gives a probe such actions; None leaves its Box."""
+    """Wrapper that gives a probe such actions; None keeps its Box."""
     settings: dict[str, Any]
 
     @property
@@ -27,22 +27,22 @@ class Kind(NamedTuple):
         return agents.AGENTS[self.name]
 
     def envs(self, probe: type[Probe], n_envs: int = 1) -> InProcess:
-        """So many of the probe with such actions."""
+        """Returns a vector environment of ``n_envs`` probes with such actions."""
         made = [probe() for _ in range(n_envs)]
         return InProcess([one if self.wrapper is None else self.wrapper(one) for one in made])
 
     def small(self, env: Any, **settings: Any) -> agents.Agent:
-        """A small agent of this kind."""
+        """Returns a small agent of this kind."""
         with shared_learners():
             return self.agent("MlpPolicy", env, **{**LEARNING, **self.settings, **settings})
 
     def load(self, path: Any, **settings: Any) -> agents.Agent:
-        """The agent of a file, sharing what is compiled."""
+        """Loads an agent that shares compiled functions."""
         with shared_learners():
             return rejeu.load(path, **settings)
 
     def numbers(self, actions: np.ndarray) -> np.ndarray:
-        """What a batch of actions stands for in the probes, from 0 to 2."""
+        """Converts a batch of actions to the probe's numbers, from 0 to 2."""
         if self.wrapper is None:
             return actions[:, 0]
         made = self.wrapper(Probe())
@@ -56,7 +56,7 @@ ALGORITHMS = {
 }
 ACTIONS = {"Box": None, "Discrete": Discretely, "MultiDiscrete": Doubly, "MultiBinary": Bitwise}
 NARROW = {"policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}}
-"""A Box policy that begins narrower finds its place sooner."""
+"""A Box policy with a smaller initial standard deviation converges sooner."""
 
 KINDS = {
     f"{name}, {actions}": Kind(name, wrapper, settings | (NARROW if wrapper is None else {}))

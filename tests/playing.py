@@ -1,4 +1,4 @@
-"""Environments, an agent and scripted key presses for the tests of playing by hand."""
+"""Environments, an agent and scripted key presses for tests of the interactive player."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pygame = pytest.importorskip("pygame")
 
 
 class Lever(gym.Env):
-    """Episodes of 5 steps, each rewarded with its action; a success is to gain 5. The picture of step t is grey 40 t."""
+    """Episodes of 5 steps. The reward is the action; a return of 5 is a success. The frame of step t is gray 40 t."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
     observation_space = gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
@@ -65,7 +65,7 @@ LEVER = "rejeu-play-test/Lever-v0"
 
 
 def perform(script, run, *arguments, **settings):
-    """Runs something that opens a window, with a script that goes on before each turn; its end closes the window."""
+    """Runs a function that opens a window. A script advances before each turn, and the window closes when it ends."""
     scripts, real = [], play_package.turn
 
     def turn(window, game):
@@ -100,7 +100,7 @@ def lever(game):
 
 
 def hold(names, steps, read, found):
-    """A script: holds some keys for some steps, then notes what ``read`` gives of the environment."""
+    """Returns a script that holds some keys for some steps and then appends ``read(env)`` to ``found``."""
 
     def script(window, game):
         down(*(names or ["p"]))
@@ -112,7 +112,7 @@ def hold(names, steps, read, found):
 
 
 class Pull:
-    """An agent that always takes action 2."""
+    """An agent that always selects action 2."""
 
     def predict(self, obs, state=None, episode_start=None, deterministic=False):
         assert deterministic
@@ -120,7 +120,7 @@ class Pull:
 
 
 def error_of(capsys, *argv):
-    """The line that a command prints when it fails."""
+    """Returns the line that a command prints when it fails."""
     assert main([*argv]) == 2
     text = capsys.readouterr().err
     assert re.fullmatch(r"rejeu: error: [^\n]+\n", text)

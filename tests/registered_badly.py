@@ -1,4 +1,4 @@
-"""Registers an environment when it is imported, as packages of environments do."""
+"""Registers an environment when it is imported, as environment packages do."""
 
 import gymnasium as gym
 

@@ -1,7 +1,7 @@
-"""A brute-force model of replay: every observation ever seen, as a plain list per environment.
+"""A brute-force reference of the replay buffers: a plain list of all observations of each environment.
 
-Each observation names its environment and its place in that list, so that a sampled transition can be looked up and
-checked. The model knows nothing of rings: what is kept is simply the end of the list.
+Each observation identifies its environment and its index in that list, so that a sampled transition can be looked up
+and checked. The reference has no ring buffer: the stored observations are the last ones of the list.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from rejeu.buffers.ring import Ring
 
 @dataclass
 class Frame:
-    """One observation, and the step that was taken from it (None: the last of its episode, or the newest)."""
+    """An observation and the step from it (None for the last one of an episode, or the newest)."""
 
     episode: int
     step: tuple[float, float, bool] | None = None
     """Action, reward, terminated."""
     closed: bool = False
-    """Whether this is the final observation of an episode after which another has begun."""
+    """Whether this is the final observation of an episode after which another one has started."""
 
 
 class Model:
-    """What a ring with room for ``rows`` observations of each environment ought to hold."""
+    """The expected contents of a ring with room for ``rows`` observations of each environment."""
 
     def __init__(self, n_envs: int, rows: int) -> None:
         self.n_envs, self.rows = n_envs, rows
@@ -41,16 +41,16 @@ class Model:
         return range(max(len(self.frames[env]) - self.rows, 0), len(self.frames[env]))
 
     def steps(self) -> list[tuple[int, int]]:
-        """All (environment, place) whose step and successor are kept."""
+        """Returns all (environment, index) whose step and next observation are stored."""
         return [(env, i) for env in range(self.n_envs) for i in self.kept(env) if self.frames[env][i].step is not None]
 
     def episode(self, env: int, place: int) -> list[int]:
-        """The kept places of the episode that (env, place) belongs to, final observation included, in order."""
+        """Returns the stored indices of the episode of (env, place) in order, including the final observation."""
         mine = self.frames[env][place].episode
         return [i for i in self.kept(env) if self.frames[env][i].episode == mine]
 
     def n_step(self, env: int, place: int, n: int, gamma: float) -> tuple[float, int, float]:
-        """Return, place bootstrapped from, and discount, by walking along the episode."""
+        """Returns the return, the index to bootstrap from, and the discount, by iterating over the episode."""
         total, weight = 0.0, 1.0
         for _ in range(n):
             frame = self.frames[env][place]
@@ -81,16 +81,16 @@ class Model:
 
 @dataclass
 class Turn:
-    """One thing that happens to the environments."""
+    """An operation on the environments."""
 
     stepping: list[bool]
     ends: list[str]
     restarting: list[bool]
-    """Environments whose running episode is given up after the step."""
+    """Environments whose running episode is discarded after the step."""
 
 
 def turns(n_envs: int, most: int = 40) -> st.SearchStrategy[list[Turn]]:
-    """Random histories: partial steps, both kinds of ends, abandoned episodes."""
+    """Random histories with partial steps, both kinds of episode ends, and discarded episodes."""
     each = lambda values: st.lists(values, min_size=n_envs, max_size=n_envs)  # noqa: E731
     end = st.sampled_from(["no"] * 6 + ["terminated", "truncated"])
     restart = st.sampled_from([False] * 9 + [True])
@@ -110,14 +110,14 @@ GOAL_OBSERVATION = gym.spaces.Dict(
 
 
 def observe(n_envs: int, places: list[int]) -> Any:
-    """Observations that name environment and place, in every leaf."""
+    """Observations that contain environment and index in every leaf."""
     where = np.array([[env, place] for env, place in enumerate(places)], np.float32)
     coded = np.array([10 * place + env for env, place in enumerate(places)])
     return {"where": where, "more": (coded.astype(np.int32), (coded % 256).astype(np.uint8)[:, None])}
 
 
 def observe_goal(n_envs: int, places: list[int]) -> Any:
-    """The achieved goal names environment and place; the desired one is (-1, -1), which nothing achieves."""
+    """The achieved goal contains environment and index. The desired goal is (-1, -1), which is never achieved."""
     where = np.array([[env, place] for env, place in enumerate(places)], np.float32)
     return {"observation": where, "achieved_goal": where, "desired_goal": np.full((n_envs, 2), -1.0, np.float32)}
 
@@ -130,7 +130,7 @@ def make_ring(
 
 
 def play(replay: Any, model: Model, history: list[Turn], observe_function: Any = observe, seed: int = 0) -> None:
-    """Does to ``replay`` and ``model`` the same things, as the training loop would."""
+    """Applies the same operations to ``replay`` and ``model``, like the training loop."""
     rng = np.random.default_rng(seed)
     n_envs = model.n_envs
 

@@ -1,7 +1,7 @@
-"""Agents that share compiled functions, which take most of the time of a test to build.
+"""Agents that share compiled functions, because compilation takes most of the time of a test.
 
-A :class:`Learner` holds pure functions of an algorithm's configuration and the spaces, and no state. Agents for which these
-are equal can therefore share one.
+A :class:`Learner` contains pure functions of an algorithm's configuration and the spaces, and no state. Agents for
+which these are equal can therefore share one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.loops.learner import Learner
 
 READ_ELSEWHERE = ("learning_starts", "buffer_size", "train_freq", "gradient_steps", "n_steps")
-"""Settings of off-policy algorithms that only the loop and the replay buffer read."""
+"""Settings of off-policy algorithms that only the loop and the replay buffer use."""
 
 _learners: dict[Hashable, Learner] = {}
 _build = Agent.build
@@ -29,9 +29,9 @@ _build = Agent.build
 
 @contextlib.contextmanager
 def shared_learners() -> Iterator[None]:
-    """Agents that are made or loaded within the block share the learner of equal agents, those of other blocks included.
+    """Agents that are created or loaded within the block share the learner of equal agents, also across blocks.
 
-    Not for tests that patch functions of an algorithm: a learner that was compiled earlier does not see them.
+    Not for tests that patch functions of an algorithm: a learner that was compiled earlier does not use the patch.
     """
     with mock.patch.object(Agent, "build", _build_or_share):
         yield
@@ -52,6 +52,6 @@ def _key(agent: Agent, observation_space: gym.Space, action_space: gym.Space) ->
         defaults = type(config)()
         names = [name for name in READ_ELSEWHERE if hasattr(config, name)]
         if config.normalize is None:
-            names.append("gamma")  # which is otherwise in the discounts of a batch only
+            names.append("gamma")  # otherwise gamma occurs only in the discounts of a batch
         config = dataclasses.replace(config, **{name: getattr(defaults, name) for name in names})
     return type(agent), config, json.dumps([spaces.describe(observation_space), spaces.describe(action_space)])

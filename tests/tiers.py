@@ -11,12 +11,12 @@ exhaustive = pytest.mark.exhaustive
 
 
 def only(default: Collection[Any], values: Iterable[Any]) -> list[Any]:
-    """Returns ``values``; those that are not in ``default`` belong to the exhaustive tier."""
+    """Returns ``values``. Those that are not in ``default`` belong to the exhaustive tier."""
     return [value if value in default else pytest.param(value, marks=exhaustive) for value in values]
 
 
 def crossed(first: Sequence[Any], second: Sequence[Any]) -> list[Any]:
-    """Returns all pairs; by default run those of a diagonal, in which every value of either occurs.
+    """Returns all pairs. By default only those of a diagonal run, which contains every value of both.
 
     >>> [getattr(pair, "values", pair) for pair in crossed("ab", [1, 2])]
     [('a', 1), ('a', 2), ('b', 1), ('b', 2)]

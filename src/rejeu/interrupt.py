@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM: as requests to stop training after the step it is in, and as the end of the command ``rejeu``.
+"""Ctrl-C and SIGTERM: requests to stop training after the current step, and the end of the command ``rejeu``.
 
-Nothing here raises an exception out of a signal handler unless a second signal asks for it: Python runs handlers between
-any two instructions of the main thread, also inside callbacks of C libraries (JAX's garbage collection), which print and
-drop an exception. A handler either records the signal, for code that looks at the record, or ends the process.
+A signal handler here only raises an exception if a second signal arrives. Python runs handlers between any two
+instructions of the main thread, also inside callbacks of C libraries (JAX's garbage collection), which print and
+discard exceptions. A handler therefore either records the signal, which other code then checks, or ends the process.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Handler = Callable[[int, FrameType | None], Any]
 
 
 class Stopped(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM, raised where nothing is half done."""
+    """Ctrl-C or SIGTERM, raised where no operation is incomplete."""
 
     def __init__(self, number: int) -> None:
         super().__init__(NAMES[number])
@@ -32,20 +32,20 @@ class Stopped(KeyboardInterrupt):
 
 
 class Interrupt:
-    """While entered, the first Ctrl-C or SIGTERM sets ``requested``; the second acts at once.
+    """Context in which the first Ctrl-C or SIGTERM sets ``requested``. A second signal takes effect immediately.
 
-    One entered within another passes signals on to it, so that both know. Outside the main thread, where Python allows
-    no signal handlers, it does nothing.
+    A nested context passes signals on to the outer one, so both are set. Outside of the main thread, where Python does
+    not allow signal handlers, it does nothing.
     """
 
     def __init__(self) -> None:
         self.signal: int | None = None
-        """Which of the two came first."""
+        """The first signal received."""
         self._previous: dict[int, Any] = {}
 
     @property
     def requested(self) -> bool:
-        """Whether one of them came."""
+        """Whether a signal was received."""
         return self.signal is not None
 
     def __enter__(self) -> Interrupt:
@@ -67,7 +67,7 @@ class Interrupt:
         return isinstance(getattr(self._previous.get(number), "__self__", None), Interrupt)
 
     def check(self) -> None:
-        """Raises :class:`Stopped` if one of them came, unless this is entered within another, which then sees to it."""
+        """Raises :class:`Stopped` if a signal was received. In a nested context the outer one raises it instead."""
         if self.signal is not None and not self._is_within(self.signal):
             raise Stopped(self.signal)
 
@@ -76,21 +76,21 @@ class Interrupt:
 
 
 def install(handler: Handler) -> dict[int, Any]:
-    """Makes a function the handler of both signals and returns those before it; none outside of the main thread."""
+    """Installs a handler for both signals and returns the previous handlers; none outside of the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
     return {number: signal.signal(number, handler) for number in SIGNALS}
 
 
 def restore(previous: dict[int, Any]) -> None:
-    """Puts back what :func:`install` returned."""
+    """Restores the handlers that :func:`install` returned."""
     for number, handler in previous.items():
         signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 @contextmanager
 def leaving(text: str = "interrupted") -> Iterator[None]:
-    """While entered, Ctrl-C and SIGTERM end the process at once, with one line that says ``text``; see :func:`leave`."""
+    """Context in which Ctrl-C and SIGTERM end the process immediately and print ``text``; see :func:`leave`."""
     previous = install(lambda number, frame: leave(number, text))
     try:
         yield
@@ -101,25 +101,25 @@ def leaving(text: str = "interrupted") -> Iterator[None]:
 def leave(number: int, text: str = "interrupted") -> NoReturn:
     """Ends the process with one line on standard error and the exit status that shells use: 130 or 143.
 
-    Nothing is unwound, so that no code on the way can swallow it. Only where nothing is half done that matters: files are
-    written beside their place and renamed, and worker processes end when their pipe closes.
+    The stack is not unwound, so no code can catch the exit. Call it only where no operation is incomplete. Files are
+    written to a temporary path and renamed, and worker processes exit when their pipe closes.
     """
-    show_cursor = b"\x1b[?25h" if os.isatty(2) else b""  # which a progress bar hides
-    with suppress(OSError):  # nobody may be reading any more
+    show_cursor = b"\x1b[?25h" if os.isatty(2) else b""  # progress bars hide it
+    with suppress(OSError):  # the reader may have closed the pipe
         os.write(2, show_cursor + f"rejeu: {text}\n".encode(errors="replace"))
     os._exit(128 + number)
 
 
 def is_command() -> bool:
-    """Returns whether this process is the command ``rejeu``, or ``python -m rejeu``, and no worker process of it."""
+    """Returns whether this process is the command ``rejeu`` or ``python -m rejeu``, and not its worker process."""
     if multiprocessing.parent_process() is not None or not sys.argv:
         return False
-    if sys.argv[0] == "-m":  # Python is still looking for the module, whose name is the word before the arguments
+    if sys.argv[0] == "-m":  # Python has not found the module yet; its name is the word before the arguments
         return sys.orig_argv[-len(sys.argv)].removeprefix("-m") == "rejeu"
     return Path(sys.argv[0]).name.lower() in ("rejeu", "rejeu.exe", "rejeu-script.py")
 
 
 def guard_imports() -> None:
-    """Lets Ctrl-C and SIGTERM end the command ``rejeu`` with one line while it is still importing; else does nothing."""
+    """Lets Ctrl-C and SIGTERM end the command ``rejeu`` with one line while it imports. Otherwise does nothing."""
     if is_command():
         install(lambda number, frame: leave(number))

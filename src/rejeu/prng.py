@@ -17,7 +17,7 @@ from jax.extend.random import define_prng_impl
 
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = 0x1BD11BDA
-"""The hash's constants (table 2 and section 3.3 there)."""
+"""The constants of the hash (table 2 and section 3.3 of the paper)."""
 
 
 def nth(key: Array, n: Any) -> Array:

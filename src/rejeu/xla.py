@@ -150,7 +150,7 @@ def _marked(function: F, marks: dict[str, str], most: float) -> F:
             complete = list(leaves)
             for i, array in zip(where, arrays, strict=True):
                 complete[i] = array
-            with set_xla_metadata(**dict.fromkeys(marks)):  # it is the call that is marked, not what is done there
+            with set_xla_metadata(**dict.fromkeys(marks)):  # marks the call, not the operations inside
                 arguments, keywords = jax.tree.unflatten(structure, complete)
                 return function(*arguments, **keywords)
 

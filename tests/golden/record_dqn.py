@@ -1,12 +1,12 @@
 """Records three gradient steps of Stable-Baselines3's DQN for ``tests/algorithms/test_dqn.py``.
 
-Run with the Python of an environment that has stable-baselines3 (2.9.2 was used)::
+Run it in an environment with stable-baselines3 (2.9.2 was used)::
 
     python tests/golden/record_dqn.py
 
-It writes ``dqn_sb3.npz`` beside itself: parameters before, parameters and Adam moments after the first and the third step,
-batches, losses. Between the second step and the third the target is moved by ``tau``, as Stable-Baselines3 does after a
-step of the environment.
+It writes ``dqn_sb3.npz`` to its own folder: initial parameters, parameters and Adam moments after the first and the
+third step, batches and losses. Between the second and the third step the target is updated with ``tau``, as
+Stable-Baselines3 does after an environment step.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OBS_DIM, N_ACTIONS, BATCH, UPDATES = 3, 4, 8, 3
 
 
 class Empty(gym.Env):
-    """An environment with the spaces, and nothing else."""
+    """An environment with the spaces and no dynamics."""
 
     observation_space = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
     action_space = gym.spaces.Discrete(N_ACTIONS)
@@ -34,7 +34,7 @@ class Empty(gym.Env):
 
 
 def parameters(model: DQN) -> dict[str, np.ndarray]:
-    """Returns weights and Adam's two moments by torch's names."""
+    """Returns weights and both moments of Adam by torch's names."""
     found: dict[str, np.ndarray] = {}
     for part in ("q_net", "q_net_target"):
         for name, value in getattr(model, part).named_parameters():
@@ -62,7 +62,7 @@ def main() -> None:
         device="cpu",
     )
     model.set_logger(Logger(None, []))
-    # Otherwise the target equals the network, and mistakes could hide.
+    # Otherwise the target equals the network, which could hide errors.
     with torch.no_grad():
         for value in model.q_net_target.parameters():
             value += 0.3 * torch.tensor(rng.normal(size=value.shape), dtype=torch.float32)

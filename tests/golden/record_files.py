@@ -1,13 +1,14 @@
-"""Records files of the present schema, and what they hold, for ``tests/io/test_schemas.py``.
+"""Records files of the current schema and their contents for ``tests/io/test_schemas.py``.
 
-Run once for each schema that is released, with the code that writes it::
+Run it once for each released schema, with the code that writes it::
 
     python tests/golden/record_files.py
 
-It writes the folder ``schema<number>`` beside itself: models, a replay buffer and normalisation statistics as rejeu saves
-them, and ``expected.npz``, which holds the same numbers, and what the models predict, without rejeu's format; and the folder
-``replay_without_counters``, a replay buffer as it is saved since files leave out what follows from the rows' kinds, and the
-same beside it. A folder that is there is never written again: its files stand for those that users have.
+It writes the folder ``schema<number>`` to its own folder: models, a replay buffer and normalization statistics as saved
+by rejeu, and ``expected.npz``, which contains the same arrays and the predictions of the models without rejeu's format.
+It also writes the folder ``replay_without_counters``: a replay buffer in the newer format, which omits what follows
+from the kinds of the rows, and the same expected arrays. An existing folder is never overwritten, because its files
+represent those of users.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ DISCRETE = gym.spaces.Dict({"b": gym.spaces.Discrete(3, start=-1), "a": gym.spac
 
 
 def models() -> dict[str, rejeu.Agent]:
-    """Returns a trained agent of several algorithms, which between them use every kind of setting."""
+    """Returns trained agents of several algorithms, which together use every kind of setting."""
     noise = rejeu.NormalActionNoise([0.0], [0.1])
     return {
         "sac": rejeu.SAC("MlpPolicy", Counter((5,)), **OFF_POLICY, learning_rate=rejeu.Linear(1e-2, 1e-3)).learn(20),
@@ -45,27 +46,27 @@ def models() -> dict[str, rejeu.Agent]:
 
 
 def observations(name: str) -> object:
-    """Returns the observations that the model of that name is asked about."""
+    """Returns the observations for the predictions of a model."""
     rng = np.random.default_rng(7)
     box = rng.normal(size=(5, 3)).astype(np.float32)
     return {"a": box[:, :2], "b": np.array([-1, 0, 1, 0, -1])} if name == "dqn" else box
 
 
 def flat(agent: rejeu.Agent) -> np.ndarray:
-    """Returns all that an agent has learnt as one vector, in the order of the names."""
+    """Returns all parameters of an agent as one vector, sorted by name."""
     arrays = agent.get_parameters()
     return np.concatenate([arrays[name].ravel().astype(np.float64) for name in sorted(arrays)])
 
 
 def replay_agent(strategy: str = "future") -> rejeu.SAC:
-    """Returns an agent with an empty buffer of the kind that is recorded."""
+    """Returns an agent with an empty buffer of the recorded kind."""
     kwargs = {"goal_selection_strategy": strategy}
     settings = {**OFF_POLICY, "learning_starts": 10**6, **HINDSIGHT, "replay_buffer_kwargs": kwargs}
     return rejeu.SAC("MultiInputPolicy", Reach(), **settings)
 
 
 def kept_counters(agent: rejeu.SAC) -> dict[str, np.ndarray]:
-    """Returns the counters of the rows kept, oldest first, of a buffer with hindsight's strategy ``episode``."""
+    """Returns the counters of the stored rows, oldest first, of a buffer with hindsight's strategy ``episode``."""
     ring = agent.replay_buffer.ring
     times = np.arange(ring.oldest()[0], ring.head[0] + 1)
     index = times % ring.rows
@@ -98,14 +99,14 @@ def record_schema(folder: Path) -> None:
 
 
 def record_replay(folder: Path) -> None:
-    """Writes a replay buffer that has forgotten its first steps, and the counters that were kept while it was played."""
+    """Writes a replay buffer that has overwritten its first steps, and the counters recorded during the steps."""
     agent = replay_agent("episode").learn(63)
     agent.save_replay_buffer(folder / "replay.safetensors")
     np.savez_compressed(folder / "expected.npz", **agent.replay_buffer.arrays(), **kept_counters(agent))
 
 
 def main() -> None:
-    """Writes the folders that are missing, and says how large their files are."""
+    """Writes the missing folders and prints the sizes of their files."""
     here = Path(__file__)
     for name, record in ((f"schema{checkpoint.SCHEMA}", record_schema), ("replay_without_counters", record_replay)):
         folder = here.with_name(name)

@@ -1,12 +1,12 @@
-"""Records three gradient steps of Stable-Baselines3's SAC, noise included, for ``tests/algorithms/test_sac.py``.
+"""Records three gradient steps of Stable-Baselines3's SAC, including noise, for ``tests/algorithms/test_sac.py``.
 
-Run with the Python of an environment that has stable-baselines3 (2.9.2 was used)::
+Run it in an environment with stable-baselines3 (2.9.2 was used)::
 
     python tests/golden/record_sac.py
 
-It writes ``sac_sb3.npz`` beside itself: parameters before, parameters and Adam moments after the first and the third
-step, batches, and the standard normal noise that the policy drew. Nothing of Stable-Baselines3 is changed but where its
-noise comes from.
+It writes ``sac_sb3.npz`` to its own folder: initial parameters, parameters and Adam moments after the first and the
+third step, batches, and the standard normal noise sampled by the policy. Stable-Baselines3 is unchanged except for the
+source of its noise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OBS_DIM, ACTION_DIM, BATCH, UPDATES = 3, 2, 8, 3
 
 
 class Empty(gym.Env):
-    """An environment with the spaces, and nothing else."""
+    """An environment with the spaces and no dynamics."""
 
     observation_space = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
@@ -35,7 +35,7 @@ class Empty(gym.Env):
 
 
 def parameters(model: SAC) -> dict[str, np.ndarray]:
-    """Returns weights and Adam's two moments by torch's names."""
+    """Returns weights and both moments of Adam by torch's names."""
     found: dict[str, np.ndarray] = {"log_ent_coef": model.log_ent_coef.detach().numpy().copy()}
     optimizers = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
     for part in ("actor", "critic", "critic_target"):
@@ -67,7 +67,7 @@ def main() -> None:
         device="cpu",
     )
     model.set_logger(Logger(None, []))
-    # Otherwise targets and critics are equal, the policy's deviation is 1 everywhere, and mistakes could hide.
+    # Otherwise targets equal critics and the policy's standard deviation is 1 everywhere, which could hide errors.
     with torch.no_grad():
         for value in model.critic_target.parameters():
             value += 0.3 * torch.tensor(rng.normal(size=value.shape), dtype=torch.float32)

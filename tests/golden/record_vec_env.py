@@ -1,10 +1,10 @@
-"""Records what Stable-Baselines3's vector environments and callbacks show, for ``tests/sb3/test_golden.py``.
+"""Records the outputs of Stable-Baselines3's vector environments and callbacks for ``tests/sb3/test_golden.py``.
 
-Run with the Python of an environment that has stable-baselines3 (2.9.2 was used)::
+Run it in an environment with stable-baselines3 (2.9.2 was used)::
 
     python tests/golden/record_vec_env.py
 
-It writes ``vec_env_sb3.npz`` beside itself. The scripts are those of ``vec_env_script.py``, which the test runs too.
+It writes ``vec_env_sb3.npz`` to its own folder. The scripts are in ``vec_env_script.py``, which the test runs too.
 """
 
 from __future__ import annotations

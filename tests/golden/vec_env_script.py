@@ -1,7 +1,7 @@
-"""Scripts as a Stable-Baselines3 user writes them, of which the library's name is the only argument.
+"""Scripts for Stable-Baselines3 that take the name of the library as their only argument.
 
-``record_vec_env.py`` runs them with Stable-Baselines3 and keeps what they see; ``tests/sb3/test_golden.py`` runs the same
-with rejeu's mirror. Nothing here imports either.
+``record_vec_env.py`` runs them with Stable-Baselines3 and saves the outputs. ``tests/sb3/test_golden.py`` runs them
+with ``rejeu.sb3``. This module imports neither.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ STEPS = 11
 
 
 class Walk(gym.Env):
-    """Observes (time, a wave, a number drawn at reset); ends after ``3 + rank`` steps, of itself where rank is even."""
+    """Observes (time, a wave, a number sampled at reset). Has ``3 + rank`` steps; terminates if rank is even."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -42,7 +42,7 @@ class Walk(gym.Env):
 
 
 class Parts(gym.ObservationWrapper):
-    """Shows a Dict: the walk, and a small image of it with its channels first or last."""
+    """Observes a Dict: the walk, and a small image of it with its channels first or last."""
 
     def __init__(self, env, first):
         super().__init__(env)
@@ -57,12 +57,12 @@ class Parts(gym.ObservationWrapper):
 
 
 def module(library, path):
-    """Returns a module of the library."""
+    """Imports a module of the library."""
     return importlib.import_module(f"{library}.{path}")
 
 
 def watch(env, record, name, seed=3):
-    """Steps a vector environment and keeps all that it shows."""
+    """Steps a vector environment and records all outputs."""
     env.seed(seed)
     seen = {"obs": [flat(env.reset())], "reward": [], "done": [], "limit": [], "last": [], "episode": []}
     for _ in range(STEPS):
@@ -85,13 +85,13 @@ def watch(env, record, name, seed=3):
 
 
 def flat(obs, batch_axes=1):
-    """Returns an observation as one row per environment, its parts in the order of their names."""
+    """Returns an observation as one row per environment, with its entries sorted by name."""
     parts = [obs[key] for key in sorted(obs)] if isinstance(obs, dict) else [obs]
     return np.concatenate([np.asarray(p, float).reshape(*p.shape[:batch_axes], -1) for p in parts], axis=-1)
 
 
 def vector_environments(library):
-    """What the vector environments and their wrappers show."""
+    """Records the outputs of vector environments and their wrappers."""
     vec, util = module(library, "common.vec_env"), module(library, "common.env_util")
     monitor = module(library, "common.monitor").Monitor
     record = {}
@@ -137,7 +137,7 @@ def vector_environments(library):
 
 
 def keep_statistics(env, record, name):
-    """Keeps what a VecNormalize has seen."""
+    """Records the statistics of a VecNormalize."""
     for key, moments in (("obs", env.obs_rms), ("returns", env.ret_rms)):
         for part in ("mean", "var", "count"):
             record[f"{name}.{key}.{part}"] = np.array(getattr(moments, part), float)
@@ -145,7 +145,7 @@ def keep_statistics(env, record, name):
 
 
 def callbacks(library, name):
-    """When the hooks are called, what the callbacks write, and where they stop; ``name`` is PPO or DQN."""
+    """Records the order of hooks, the output of callbacks, and when they stop; ``name`` is PPO or DQN."""
     hooks, util = module(library, "common.callbacks"), module(library, "common.env_util")
     results = module(library, "common.results_plotter")
     algorithm = getattr(importlib.import_module(library), name)
@@ -200,7 +200,7 @@ def callbacks(library, name):
         record["evaluation.best"] = np.array([seen.best_mean_reward, seen.last_mean_reward])
         record["checkpoints"] = np.array(sorted(path.stem for path in (Path(folder) / "models").iterdir()))
         table = results.load_results(folder)
-        # the rewards of Walk do not depend on the actions, but the order of rows of one moment is that of the clock
+        # the rewards of Walk do not depend on the actions, but rows with equal times are sorted by the clock
         record["table"] = np.array(sorted(zip(table["r"], table["l"], strict=True)))
         for axis in (results.X_TIMESTEPS, results.X_EPISODES):
             record[f"xy.{axis}"] = np.array(results.ts2xy(table, axis))

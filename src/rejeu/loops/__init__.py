@@ -1,1 +1,1 @@
-"""Loops: what joins an algorithm to environments."""
+"""Training loops, which connect an algorithm to environments."""

@@ -24,7 +24,7 @@ PREFIX = "nonfinite_batch_"
 
 
 class Found(NamedTuple):
-    """What of an update is not finite."""
+    """The parts of an update that are not finite."""
 
     batch: list[str]
     """Parts of the batch that are not finite, each with the first such number, such as ``reward (nan)``."""
@@ -38,7 +38,7 @@ class Found(NamedTuple):
 
 
 def effect(learner: Learner, state: PyTree, batch: Transition | Rollout, clock: Clock) -> tuple[PyTree, Found]:
-    """Returns the state after an update on one batch, and what of it is not finite."""
+    """Returns the state after an update on one batch, and the parts of the update that are not finite."""
     after, metrics = jax.jit(learner.algorithm.update)(state, batch, clock)
     return after, Found(bad_leaves(batch._asdict()), bad_leaves(checked(metrics)), bad_leaves(after))
 
@@ -204,7 +204,7 @@ def _batch_like(agent: Any, file: checkpoint.Contents) -> Transition | Rollout:
 
 
 def examine(agent: Any, path: str | Path) -> Found:
-    """Repeats the update of a saved batch and returns what of it is not finite; the agent is not changed.
+    """Repeats the update of a saved batch and returns the parts that are not finite; the agent is not changed.
 
     The result is false if everything is finite, for example with other weights or hyperparameters.
     """

@@ -122,7 +122,7 @@ class Learner:
     def state(self, packed: PackedState) -> PyTree:
         """Returns a packed state as the algorithm's own class, in buffers of its own; waits for the device.
 
-        This and :meth:`pack` run on the host: they are called seldom, and compiling them would take longer.
+        This and :meth:`pack` run on the host: they are rarely called, and compiling them would take longer.
         """
         return jax.tree.map(jnp.array, self.packing.unpack([np.asarray(array) for array in packed]))
 

@@ -119,7 +119,7 @@ class NonFiniteMonitor:
     def __init__(self, copy: Callable[[PackedState], PackedState], skips: bool) -> None:
         """Takes a function that copies a state, and whether bad updates undo themselves, so that no copy is needed."""
         self.n_skipped = 0
-        """Skipped updates in all."""
+        """Total number of skipped updates."""
         self._copy, self._skips = copy, skips
         self._in_a_row = 0
         self._copied: PackedState | None = None
@@ -130,10 +130,10 @@ class NonFiniteMonitor:
         """The state after these calls."""
         self._n_bytes = 0
         self._unread: deque[int] = deque()
-        """Indices among the calls of the updates whose readings were not looked at."""
+        """Indices of the calls whose readings have not been checked."""
 
     def __len__(self) -> int:
-        """Returns the number of updates whose readings were not looked at."""
+        """Returns the number of updates whose readings have not been checked."""
         return len(self._unread)
 
     def follow(self, state: PackedState) -> None:
@@ -147,7 +147,7 @@ class NonFiniteMonitor:
             self._begin(state)
 
     def record(self, state: PackedState, function: Callable[..., Any], *arguments: Any, readings: Any = None) -> None:
-        """Records a call of ``function`` that led to ``state``; an update also has ``readings``."""
+        """Records a call of ``function`` that returned ``state``; an update also has ``readings``."""
         if readings is not None:
             self._unread.append(len(self._calls))
         self._calls.append(Call(function, arguments, readings))
@@ -155,7 +155,7 @@ class NonFiniteMonitor:
         self._n_bytes += sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[0]))
 
     def read(self, n: int | None = None) -> None:
-        """Looks at the oldest ``n`` updates (None: all); waits for them.
+        """Checks the oldest ``n`` updates (None: all); waits for them.
 
         Raises:
             NonFiniteUpdate: if one of them left NaN or infinity, or if too many in a row were skipped.

@@ -1,18 +1,17 @@
 """The loop of off-policy learning: environments fill a replay buffer, and gradient steps are taken on batches of it.
 
-:func:`off_policy` is a generator that trains; whoever iterates it decides what else happens. One turn is one step of all
-environments::
+:func:`off_policy` is a generator that trains while its caller iterates over it. One turn steps all environments once::
 
     the environments step      while the update of the previous turn still runs in XLA's own threads
     the step is stored         and new episodes begin where some ended
-    actions are requested      from the device, which chooses them as soon as that update is done
+    actions are requested      from the device, which computes them as soon as that update is done
     batches are sampled        meanwhile
     the updates are started    by default one gradient step per environment step, all in one call
-    the actions are read       while they begin
+    the actions are read       while the updates begin
 
-So environments and gradients do not wait for each other, and yet every number depends on the seed alone: the action at a
-step always follows the update of the step before the last. With ``overlap=False`` actions are requested after the updates
-are started, and wait for them.
+So environments and updates do not wait for each other. The results still depend on the seed only, because the action at
+a step always follows the update of the step before the last. With ``overlap=False`` actions are requested after the
+updates are started, and wait for them.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """The loop of on-policy learning: environments fill a rollout under one policy, and the policy learns from all of it.
 
-:func:`on_policy` is a generator: it trains, and whoever iterates it decides what else happens. One turn is one step of all
-environments; where it fills the rollout, the update follows, one call into compiled code for all epochs and minibatches.
-Acting costs one call for all environments, and gives actions only: the values and log-probabilities that learning needs
-are computed with the update, in one pass over the rollout.
+:func:`on_policy` is a generator that trains while its caller iterates over it. One turn is one step of all
+environments. When the rollout is full, the update follows: one call of compiled code for all epochs and minibatches.
+Acting takes one call for all environments and returns actions only. The values and log-probabilities for learning are
+computed with the update, in one pass over the rollout.
 
-The rollout is handed to XLA as it lies in memory, and written to again only after the next actions were read, which the
-update must precede.
+XLA reads the rollout without a copy. The rollout is written to again only after the next actions were read, which
+requires that the update is done.
 """
 
 from __future__ import annotations

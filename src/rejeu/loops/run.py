@@ -27,7 +27,7 @@ class Episode(NamedTuple):
     """One finished episode."""
 
     step: int
-    """Environment steps taken in all when it ended."""
+    """Total number of environment steps when it ended."""
     env: int
     """Which environment it ran in."""
     episode_return: float
@@ -44,7 +44,7 @@ class Progress(NamedTuple):
     """What one turn of the loop did."""
 
     step: int
-    """Environment steps taken in all."""
+    """Total number of environment steps taken."""
     episodes: list[Episode]
     """Those that ended in this turn."""
     metrics: Mapping[str, Array] | None
@@ -66,7 +66,7 @@ class Run:
     env: Any
     """The environments, a :class:`VectorEnv`; None for an agent that only predicts."""
     replay: Any
-    """The replay buffer or the rollout buffer; None likewise."""
+    """The replay buffer or the rollout buffer; None for an agent that only predicts."""
     state: PackedState
     """The algorithm's state, packed (see :class:`Learner`)."""
     key: Array
@@ -125,7 +125,7 @@ def restart(run: Run) -> PyTree:
 
 
 def clock_of(run: Run, progress: float) -> Clock:
-    """Returns where the run is, as arrays, so that no compiled function depends on the values."""
+    """Returns the position in the run as arrays, so that no compiled function depends on the values."""
     return Clock(np.uint32(run.step), np.uint32(run.episode), np.float32(progress))
 
 

@@ -33,7 +33,7 @@ class VecCheckNan(VecEnvWrapper):
         """Actions of the last step, None after a reset."""
 
     def step_async(self, actions: Any) -> None:
-        """Begins a step with one action for each environment."""
+        """Starts a step with one action for each environment."""
         self._check(actions, "the actions")
         self._last_actions = actions
         self.venv.step_async(actions)
