@@ -99,7 +99,7 @@ def test_an_agent_learns_and_loads_with_another_optimizer(tmp_path):
         np.testing.assert_array_equal(loaded.get_parameters()[key], value)
 
 
-OWN = """
+SCRIPT = """
 import sys
 import jax, numpy as np, optax, rejeu
 
@@ -122,5 +122,5 @@ for kind, env, settings in (
 def test_optimizers_that_look_at_all_gradients_work_in_the_programs_that_users_compile(optimizer):
     """The tests compile with other options, under which the kernels of these optimizers are never made."""
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", OWN, optimizer], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", SCRIPT, optimizer], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]

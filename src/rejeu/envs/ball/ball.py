@@ -90,8 +90,8 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         """Position of the ball, not clipped to the box. Empty before the first reset."""
         self.n_steps = 0
         """Number of steps of this episode."""
-        self.needs_reset = True
-        """Whether the environment must be reset before the next step."""
+        self.over = True
+        """Whether the episode has ended, or none has begun."""
         self._trail: deque[tuple[float, ...]] = deque(maxlen=N_STEPS + 1)
         self._push: list[float] = []
         self._drawing: BallDrawing | None = None
@@ -103,7 +103,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         self.position = self.np_random.uniform(-STRONGEST_PUSH, STRONGEST_PUSH, self.dimension).tolist()
         self.n_steps = 0
-        self.needs_reset = False
+        self.over = False
         self._trail.clear()
         self._trail.append(tuple(self.position))
         self._push = []
@@ -117,7 +117,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: if the episode is over or has not begun.
             ValueError: if the shape of the action is wrong, or if it contains NaN.
         """
-        if self.needs_reset:
+        if self.over:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
         push = np.asarray(action, np.float64)
         if push.shape != (self.dimension,):
@@ -131,12 +131,12 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self.position = position
         self.n_steps += 1
         held = not lost and self.n_steps >= N_STEPS
-        self.needs_reset = lost or held
+        self.over = lost or held
         self._trail.append(tuple(position))
         self._push = pushes
         self._show()
         reward = LOST_REWARD if lost else HELD_REWARD if held else 1.0
-        return self._observe(), reward, lost, held, {"is_success": held} if self.needs_reset else {}
+        return self._observe(), reward, lost, held, {"is_success": held} if self.over else {}
 
     @property
     def trajectory(self) -> np.ndarray:
@@ -154,12 +154,17 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
 
         return plots.trajectory(self.trajectory, path, low=-WALL, high=WALL)
 
+    @property
+    def needs_reset(self) -> bool:
+        """Whether the environment must be reset before the next step."""
+        return self.over
+
     def get_state(self) -> dict[str, Any]:
         """Returns the state, including the random number generator, as JSON values, for :meth:`set_state`."""
         return {
             "position": list(self.position),
             "n_steps": self.n_steps,
-            "over": self.needs_reset,
+            "over": self.over,
             "rng": self.np_random.bit_generator.state,
         }
 
@@ -177,7 +182,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         if not (over or inside) or not all(map(math.isfinite, position)):
             raise ValueError(f"no ball is under way at {position} after {n_steps} steps")
         self.np_random.bit_generator.state = state["rng"]
-        self.position, self.n_steps, self.needs_reset = position, n_steps, over
+        self.position, self.n_steps, self.over = position, n_steps, over
         self._trail.clear()
         self._push = []
         if self.position:
@@ -194,7 +199,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError("nothing is drawn without a render mode: gymnasium.make(..., render_mode='rgb_array')")
         if self._drawing is None:
             self._drawing = BallDrawing(self.dimension, self.render_mode, self.metadata["render_fps"], WALL, N_STEPS)
-        return self._drawing.draw(self._trail, self._push, self.n_steps, self.needs_reset)
+        return self._drawing.draw(self._trail, self._push, self.n_steps, self.over)
 
     def close(self) -> None:
         """Closes the window if there is one."""
@@ -208,6 +213,6 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
 
     def _observe(self) -> np.ndarray:
         """Returns the position, clipped to the box."""
-        if self.needs_reset:
+        if self.over:
             return np.array([min(max(x, -WALL), WALL) for x in self.position], np.float32)
         return np.array(self.position, np.float32)
