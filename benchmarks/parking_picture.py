@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import rejeu
-from rejeu.envs.masks import shown_to
+from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env
 from rejeu.reporting.video import rgb_frame
 
@@ -27,7 +27,7 @@ def episode(agent: rejeu.agents.Agent, env_id: str, seed: int) -> list[np.ndarra
     Raises:
         RuntimeError: if the episode is not a success.
     """
-    env = shown_to(agent, make_env(env_id, render_mode="rgb_array"))
+    env = for_agent(agent, make_env(env_id, render_mode="rgb_array"))
     obs, _ = env.reset(seed=seed)
     frames, done, info = [rgb_frame(env)], False, {}
     while not done:
