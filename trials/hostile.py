@@ -37,10 +37,10 @@ import rejeu
 from rejeu.io import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
-from tests.agents.test_resume import compiled_once
 from tests.environments import Counter
 from tests.golden import record_files
 from tests.io.test_hostile_runs import files_of, make_run, replaced, resumed_from
+from tests.sharing import shared_learners
 
 ROOT = Path(__file__).parents[1]
 KINDS = {"agent": "sac", "replay": "replay", "vec_normalize": "vec_normalize"}
@@ -161,7 +161,7 @@ def runs(folder: Path) -> dict[str, Any]:
     """Returns the outcomes of checkpoints with one file replaced by each file of the corpus, by the replaced file."""
     found: dict[str, Any] = {}
     for name in ("replay", "rollout"):
-        with compiled_once():
+        with shared_learners():
             run = make_run(name, folder / name)
             for whole in files_of(run[1]):
                 content, kind = whole.read_bytes(), whole.name.split("_")[0]

@@ -55,13 +55,13 @@ WITHOUT = {"": (), "without fsync of files": ("sync",), "without fsync of folder
 def on_paper(root: Path) -> dict[str, Any]:
     """Checks every state of every run; returns totals."""
     import rejeu
-    from tests.agents.test_resume import compiled_once
     from tests.crash_states import crash_states
     from tests.io.test_power_loss import EVERY, is_loss, outcome, recorded
+    from tests.sharing import shared_learners
 
     found: dict[str, Any] = {"interval": EVERY}
     for name, (kind, keep, settings) in RUNS.items():
-        with compiled_once():
+        with shared_learners():
             agent = rejeu.AGENTS[kind]("MlpPolicy", "rejeu/Ball-v0", **settings)
             operations = recorded(root / "recorded" / name, agent, keep, steps=65)
             one = found[name] = {"operations": len(operations)}
