@@ -179,6 +179,7 @@ def test_an_update_uses_the_mathematics_above_in_the_documented_order():
         "critic_loss": 0.5 * ((values - target) ** 2).mean(axis=1).sum(),
         "actor_loss": np.mean(0.3 * log_prob - value),
         "ent_coef": 0.3,
+        "ent_coef_loss": -(np.log(0.3) * (log_prob - ACTION_DIM)).mean(),
         "entropy": -log_prob.mean(),
         "q_value": values.mean(),
     }

@@ -174,7 +174,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
         state = dataclasses.replace(state, critics=critics, critics_optimizer=critics_optimizer, n_updates=n_updates)
         state = jax.lax.cond(n_updates % config.policy_delay == 0, delayed, lambda s: s, state)
-        return state, metrics_of(critic_loss, state.actor_loss, alpha, state.entropy, values, target)
+        return state, metrics_of(
+            critic_loss, state.actor_loss, alpha, state.entropy, values, target, target_entropy, config
+        )
 
     def values(state: State, obs: PyTree, action: Array) -> Array:
         return jax.vmap(lambda critic: critic(obs, action)[:, 0])(state.critics)

@@ -101,7 +101,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, target_entropy, config, rate
         )
         values, expected = jnp.mean(quantiles, axis=-1), jnp.mean(target, axis=-1)
-        return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, expected)
+        return state, metrics_of(
+            critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, expected, target_entropy, config
+        )
 
     values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)

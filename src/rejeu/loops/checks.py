@@ -8,7 +8,7 @@ import warnings
 import jax
 import numpy as np
 
-from rejeu.core import PyTree
+from rejeu.core import Masked, PyTree
 from rejeu.envs import validation
 from rejeu.envs.base import Step
 from rejeu.errors import BadEnvironmentError, NonFiniteError
@@ -86,7 +86,7 @@ def check_bounds(run: Run, obs: PyTree) -> None:
     The interval between two checks doubles each time, because a check takes longer than a step of some environments.
     """
     run.next_look = 2 * run.step + 1
-    fault = validation.far_outside(run.env.observation_space, obs)
+    fault = validation.far_outside(run.env.observation_space, obs.obs if isinstance(obs, Masked) else obs)
     if fault is not None:
         run.next_look = math.inf
         warnings.warn(

@@ -87,7 +87,8 @@ class Learner:
                 "prioritized replay needs the absolute TD error of each transition: return it from update among the metrics, "
                 f"as TD_ERROR of shape (batch,); it returned {'none' if td_error is None else td_error.shape}"
             )
-        return state, nonfinite.readings(state, metrics), td_error if is_weighted else None
+        vectors = state[: len(self.packing.groups)]  # large arrays are checked by the monitor
+        return state, nonfinite.readings(vectors, metrics), td_error if is_weighted else None
 
     def _init(self, key: Array) -> PackedState:
         """Returns the state before learning."""
@@ -132,14 +133,16 @@ class Learner:
 
     def bad_leaves(self, state: PackedState) -> list[str]:
         """Returns the names of the leaves of a packed state that are not finite; waits for the device."""
-        arrays = [np.asarray(array) for array in state]
-        if all(array.dtype.kind != "f" or np.isfinite(array).all() for array in arrays):
-            return []
-        return nonfinite.bad_leaves(self.packing.unpack(arrays))
+        return [] if is_finite(state) else nonfinite.bad_leaves(self.packing.unpack([np.asarray(a) for a in state]))
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""
         return self.explorer.init(self.algorithm.actor(self.shapes), n_envs)
+
+
+def is_finite(state: PackedState) -> bool:
+    """Returns whether all numbers of a packed state are finite; waits for the device."""
+    return all(np.isfinite(array).all() for array in map(np.asarray, state) if array.dtype.kind == "f")
 
 
 def check_state(state: PyTree, expected: PyTree, function: str) -> None:

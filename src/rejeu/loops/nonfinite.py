@@ -2,8 +2,9 @@
 
 Every compiled update reports, with its metrics, whether what it left is finite. :class:`NonFiniteMonitor` reads this one
 turn later, when the loop waits for the device anyway. It keeps a copy of a state and the updates since, from which it
-recomputes the state before the first bad update. With ``nonfinite="skip"`` a bad update is undone on the device at once
-(:func:`undo`), and the monitor only counts.
+recomputes the state before the first bad update. Large arrays are checked only when the state is copied, on the host: until
+then NaN in one of them shows in the loss of the next update. With ``nonfinite="skip"`` a bad update is undone on the device
+at once (:func:`undo`), and the monitor only counts.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rejeu.io.checkpoint import names
 from rejeu.loops.packing import PackedState, Readings
 
 MAX_CALLS = 64
-"""Number of calls after which the state is copied again."""
+"""Largest number of calls after which the state is copied again."""
 MAX_BYTES = 32 * 2**20
 """Number of bytes of batches after which the state is copied again."""
 MAX_SKIPPED = 100
@@ -73,8 +74,11 @@ def undo(before: PyTree, after: PyTree, metrics: Metrics) -> tuple[PyTree, Metri
     return jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before), metrics | {FINITE: finite}
 
 
-def readings(state: PackedState, metrics: Metrics) -> Readings:
-    """Returns the means of metrics over gradient steps, and how many of these were bad; used inside compiled code."""
+def readings(state: Iterable[Array], metrics: Metrics) -> Readings:
+    """Returns the means of metrics over gradient steps, and how many of these were bad; used inside compiled code.
+
+    ``state`` are the arrays to be checked.
+    """
     if FINITE not in metrics:  # one bad step spoils all that follow
         return Readings.of({name: jnp.mean(value) for name, value in metrics.items()}, ~check(state, metrics))
     finite = metrics.pop(FINITE)
@@ -116,11 +120,13 @@ class Call(NamedTuple):
 class NonFiniteMonitor:
     """Observes the updates of a run. Mutable."""
 
-    def __init__(self, copy: Callable[[PackedState], PackedState], skips: bool) -> None:
-        """Takes a function that copies a state, and whether bad updates undo themselves, so that no copy is needed."""
+    def __init__(
+        self, copy: Callable[[PackedState], PackedState], is_finite: Callable[[PackedState], bool], skips: bool
+    ) -> None:
+        """Takes functions that copy and check a state, and whether bad updates undo themselves, so that neither is needed."""
         self.n_skipped = 0
         """Total number of skipped updates."""
-        self._copy, self._skips = copy, skips
+        self._copy, self._is_finite, self._skips = copy, is_finite, skips
         self._in_a_row = 0
         self._copied: PackedState | None = None
         """A copy of a state whose updates were all checked."""
@@ -128,7 +134,8 @@ class NonFiniteMonitor:
         """What has changed the state since the copy."""
         self._newest: PackedState | None = None
         """The state after these calls."""
-        self._n_bytes = 0
+        self._most = MAX_CALLS
+        """Number of calls after which the state is copied again."""
         self._unread: deque[int] = deque()
         """Indices of the calls whose readings have not been checked."""
 
@@ -149,10 +156,12 @@ class NonFiniteMonitor:
     def record(self, state: PackedState, function: Callable[..., Any], *arguments: Any, readings: Any = None) -> None:
         """Records a call of ``function`` that returned ``state``; an update also has ``readings``."""
         if readings is not None:
+            if len(self._calls) < 2:
+                n_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[0]))
+                self._most = min(max(MAX_BYTES // max(n_bytes, 1), 1), MAX_CALLS)
             self._unread.append(len(self._calls))
         self._calls.append(Call(function, arguments, readings))
         self._newest = state
-        self._n_bytes += sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[0]))
 
     def read(self, n: int | None = None) -> None:
         """Checks the oldest ``n`` updates (None: all); waits for them.
@@ -161,7 +170,8 @@ class NonFiniteMonitor:
             NonFiniteUpdate: if one of them left NaN or infinity, or if too many in a row were skipped.
         """
         is_full = self._is_full()
-        for _ in range(len(self._unread) if n is None or is_full else n):
+        n = None if is_full else n
+        for _ in range(len(self._unread) if n is None else n):
             place = self._unread.popleft()
             readings = self._calls[place].readings
             assert readings is not None
@@ -170,6 +180,9 @@ class NonFiniteMonitor:
             self.n_skipped += n_bad if self._skips else 0
             if n_bad and (not self._skips or self._in_a_row >= MAX_SKIPPED):
                 raise self._error(place)
+        updates = [i for i, call in enumerate(self._calls) if call.readings is not None] if n is None else []
+        if updates and self._newest is not None and not self._skips and not self._is_finite(self._newest):
+            raise self._error(updates[-1])
         if is_full:
             self._begin(self._newest)
 
@@ -178,21 +191,27 @@ class NonFiniteMonitor:
         if not self._calls:
             return False
         is_rollout = isinstance(self._calls[-1].arguments[0], Rollout)
-        return is_rollout or len(self._calls) >= MAX_CALLS or self._n_bytes >= MAX_BYTES
+        return is_rollout or len(self._calls) >= self._most
 
     def _begin(self, state: PackedState | None) -> None:
         """Forgets all calls and copies the state that they led to."""
-        self._calls, self._n_bytes, self._newest = [], 0, state
+        self._calls, self._newest = [], state
         self._unread.clear()
         self._copied = None if state is None or self._skips else self._copy(state)
 
     def _error(self, place: int) -> NonFiniteUpdate:
-        """Returns the error of the update at ``place`` among the calls, and forgets all calls."""
-        batches, clock = self._calls[place].arguments
+        """Returns the error of the first bad update, which is the one at ``place`` or before; forgets all calls."""
         state = self._copied
-        for call in [] if state is None else self._calls[:place]:
+        for i, call in enumerate(self._calls[:place]):
+            if state is None:
+                break
+            before = self._copy(state)
             after = call.function(state, *call.arguments)
             state = after[0] if isinstance(after, tuple) else after
+            if call.readings is not None and not self._is_finite(state):
+                state, place = before, i
+                break
+        batches, clock = self._calls[place].arguments
         in_a_row, self._in_a_row = self._in_a_row, 0
         self._begin(None)
         return NonFiniteUpdate(state, batches, clock, in_a_row)

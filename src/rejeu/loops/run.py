@@ -17,7 +17,7 @@ from jax import Array
 from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree
 from rejeu.envs.base import Step, VectorEnv
-from rejeu.loops.learner import Learner
+from rejeu.loops.learner import Learner, is_finite
 from rejeu.loops.nonfinite import NonFiniteMonitor
 from rejeu.loops.packing import PackedState
 from rejeu.loops.timing import no_time
@@ -176,7 +176,7 @@ def initial_run(
         key=explore_key,
         rng=np.random.default_rng(seed),
         carry=learner.initial_carry(1 if env is None else env.n_envs),
-        monitor=NonFiniteMonitor(learner.copy, learner.skips),
+        monitor=NonFiniteMonitor(learner.copy, is_finite, learner.skips),
         learn_from=learn_from,
         seed=seed,
     )

@@ -118,7 +118,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = temperature_and_targets(
             state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, target_entropy, config, rate
         )
-        return state, metrics_of(critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target)
+        return state, metrics_of(
+            critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target, target_entropy, config
+        )
 
     values = lambda state, obs, action: action_values(state.critics, obs, action)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)

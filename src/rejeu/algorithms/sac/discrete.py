@@ -58,7 +58,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         state = temperature_and_targets(
             state, (actor, actor_optimizer), (critics, critics_optimizer), -entropy, target_entropy, config, rate
         )
-        return state, metrics_of(critic_loss, policy_loss, alpha, jnp.mean(entropy), values, target)
+        return state, metrics_of(
+            critic_loss, policy_loss, alpha, jnp.mean(entropy), values, target, target_entropy, config
+        )
 
     values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)

@@ -97,10 +97,18 @@ def temperature_step(
 
 
 def metrics_of(
-    critic_loss: Array, actor_loss: Array, alpha: Array, entropy: Array, values: Array, target: Array
+    critic_loss: Array,
+    actor_loss: Array,
+    alpha: Array,
+    entropy: Array,
+    values: Array,
+    target: Array,
+    target_entropy: float,
+    config: EntropyConfig,
 ) -> Metrics:
     """Returns the metrics of an update, from the values ``(n_critics, batch)`` and their targets ``(batch,)``."""
-    return {
+    loss = {"ent_coef_loss": jnp.log(alpha) * (entropy - target_entropy)} if config.learns_temperature else {}
+    return loss | {
         "critic_loss": critic_loss,
         "actor_loss": actor_loss,
         "ent_coef": alpha,
