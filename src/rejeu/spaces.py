@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import jax
 import msgspec
 import numpy as np
 from gymnasium import spaces
@@ -88,6 +87,8 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
 
 def structure(space: spaces.Space) -> Any:
     """Returns the tree structure of one observation of ``space``."""
+    import jax  # here, so that worker processes start without it
+
     return jax.tree.structure(_skeleton(space))
 
 
@@ -96,6 +97,8 @@ def flat_keys(tree_structure: Any) -> list[str] | None:
 
     None for any other structure. Reading such a dict by its keys is several times faster than flattening it as a tree.
     """
+    import jax
+
     skeleton = jax.tree.unflatten(tree_structure, range(tree_structure.num_leaves))
     is_flat = isinstance(skeleton, dict) and all(isinstance(part, int) for part in skeleton.values())
     return list(skeleton) if is_flat else None
@@ -106,6 +109,20 @@ def narrow(dtype: Any) -> str:
     return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(
         np.dtype(dtype).name, np.dtype(dtype).name
     )
+
+
+def parts(space: spaces.Space, observation: Any) -> list[Any]:
+    """Returns the parts of an observation, one for each of :func:`leaves`, in their order.
+
+    Raises:
+        KeyError: if a key of the space is missing.
+        ValueError: if a tuple has another length than in the space.
+    """
+    if isinstance(space, spaces.Dict):
+        return [one for key in sorted(space.spaces) for one in parts(space.spaces[key], observation[key])]
+    if isinstance(space, spaces.Tuple):
+        return [one for part, obs in zip(space.spaces, observation, strict=True) for one in parts(part, obs)]
+    return [observation]
 
 
 def plain(space: spaces.Space, observation: Any) -> Any:
@@ -126,6 +143,8 @@ def plain(space: spaces.Space, observation: Any) -> Any:
 
 def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
     """Returns a batch of observations as plain dicts and tuples of arrays of the stored dtypes; copies only if needed."""
+    import jax
+
     arrays, tree = jax.tree.flatten(plain(space, observation))
     return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
 
@@ -477,10 +496,8 @@ def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
 def _bounds(bounds: np.ndarray) -> Any:
     """Returns one number if all bounds are equal, else a nested list; infinities as the strings ``inf`` and ``-inf``."""
     values = bounds.astype(np.float64)
-    all_equal = values.size and (values == values.flat[0]).all()
-    return jax.tree.map(
-        lambda v: v if np.isfinite(v) else str(v), values.flat[0].item() if all_equal else values.tolist()
-    )
+    named = np.array([v if np.isfinite(v) else str(v) for v in values.ravel().tolist()], object).reshape(values.shape)
+    return named.flat[0] if values.size and (values == values.flat[0]).all() else named.tolist()
 
 
 def _skeleton(space: spaces.Space) -> Any:

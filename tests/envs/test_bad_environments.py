@@ -13,6 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 import rejeu
 from rejeu import presets
 from rejeu.cli import main
+from rejeu.envs import checker
 from rejeu.envs.checker import findings
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
@@ -32,7 +33,8 @@ SEEN = r"(environment 0, (step 3|the first reset)|in environment 0 after [24] st
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_each_fault_is_found_before_training(name):
+def test_each_fault_is_found_before_training(name, monkeypatch):
+    monkeypatch.setattr(checker, "MOST_SECONDS", 60.0)  # not fewer steps on a slow machine
     fault = EVERY[name]
     found = findings(fault.make())
     assert any(one.level == fault.level and re.search(fault.checked, one.text) for one in found), found

@@ -484,3 +484,10 @@ def test_a_vector_that_seeds_its_environments_itself_takes_one_number():
     venv = VecMonitor(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
     with pytest.raises(ValueError, match="VecMonitor takes a single seed and seeds its environments itself"):
         make_vector(venv, seed=[1, 2])
+
+
+def test_a_dict_in_a_dict_that_holds_one_array_is_read():
+    space = gym.spaces.Dict({"arm": gym.spaces.Dict({"angles": gym.spaces.Box(-1.0, 1.0, (2,))})})
+    vector = InProcess([Sampled(space) for _ in range(2)], seed=0)
+    assert vector.reset()["arm"]["angles"].shape == (2, 2)
+    assert vector.step(np.zeros((2, 1), np.float32)).obs["arm"]["angles"].shape == (2, 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 
 import gymnasium as gym
 import jax
@@ -20,90 +19,10 @@ from rejeu.envs.masks import make_masked
 from rejeu.errors import BadEnvironmentError, WorkerError
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
+from tests.tiers import crossed
+from tests.worker_environments import ACTIONS, Leaving, Rules, Silent, sizes
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
-ACTIONS = {
-    "discrete": spaces.Discrete(5),
-    "shifted": spaces.Discrete(4, start=-2),
-    "multi": spaces.MultiDiscrete([2, 3, 4]),
-    "binary": spaces.MultiBinary(4),
-}
-
-
-def sizes(space):
-    if isinstance(space, spaces.Discrete):
-        return [int(space.n)]
-    return [int(n) for n in space.nvec] if isinstance(space, spaces.MultiDiscrete) else [1] * space.n
-
-
-class Rules(gym.Env):
-    """Allows something else at every step, and refuses to take what it forbade; episodes of 1 to 6 steps.
-
-    The observation is noise, so nothing but the mask says what is allowed. The mask is given by ``info`` or by method.
-    """
-
-    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-
-    def __init__(self, kind="discrete", by="info", all_at_end=True):
-        self.action_space = ACTIONS[kind]
-        self.by, self.all_at_end = by, all_at_end
-        self.taken, self.masks, self.seeds = 0, [], []
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.seeds.append(seed)
-        self.time, self.length = 0, int(self.np_random.integers(1, 7))
-        return self.see(), self.info()
-
-    def step(self, action):
-        assert self.allows(action), f"{action} is forbidden by {self.mask}"
-        self.taken += 1
-        self.time += 1
-        over = self.time >= self.length
-        reward = float(np.sum(action))
-        obs = self.see()
-        if over and not self.all_at_end:
-            self.mask = np.zeros_like(self.mask)
-        return obs, reward, over and self.taken % 2 == 0, over and self.taken % 2 == 1, self.info()
-
-    def see(self):
-        parts = []
-        for n in sizes(self.action_space):
-            part = self.np_random.random(n) < 0.4
-            if not isinstance(self.action_space, spaces.MultiBinary):
-                part[self.np_random.integers(n)] = True
-            parts.append(part)
-        self.mask = np.concatenate(parts)
-        self.masks.append(self.mask)
-        return self.np_random.normal(size=2).astype(np.float32)
-
-    def info(self):
-        return {"action_mask": self.mask.astype(np.int8)} if self.by == "info" else {}
-
-    def action_masks(self):
-        if self.by == "info":
-            raise AssertionError("the info says it already")
-        return self.mask
-
-    def allows(self, action):
-        space = self.action_space
-        assert space.contains(action) or space.contains(np.asarray(action, space.dtype)), action
-        if isinstance(space, spaces.MultiBinary):
-            return bool(np.all(self.mask | (np.asarray(action) == 0)))
-        chosen = np.atleast_1d(action) - (space.start if isinstance(space, spaces.Discrete) else 0)
-        ends = np.cumsum([0, *sizes(space)])[:-1]
-        return bool(self.mask[ends + chosen].all())
-
-
-class Silent(Rules):
-    """Says nowhere what is allowed."""
-
-    def __init__(self):
-        super().__init__(by="nowhere")
-
-    action_masks = property(lambda self: self.no_such_attribute)  # as where there is no method
-
-
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "n_steps": 64, "batch_size": 64, "n_epochs": 1, "seed": 0}
 
 
@@ -118,9 +37,9 @@ def vector(kind, by="info", n_envs=3):
 # What is forbidden is not done: the environment itself checks every action.
 
 
-@pytest.mark.parametrize("kind", list(ACTIONS))
-@pytest.mark.parametrize(("by", "n_envs"), [("info", 3), ("method", 1)])
-def test_what_is_forbidden_is_never_done(kind, by, n_envs):
+@pytest.mark.parametrize(("kind", "given"), crossed(list(ACTIONS), [("info", 3), ("method", 1)]))
+def test_what_is_forbidden_is_never_done(kind, given):
+    by, n_envs = given
     env = vector(kind, by, n_envs)
     agent = small(env, learning_rate=0.05).learn(1000)
     assert sum(one.taken for one in env.envs) == -(-1000 // n_envs) * n_envs
@@ -147,26 +66,11 @@ def test_masks_come_out_of_worker_processes():
         env.close()
 
 
-class Leaving(gym.Env):
-    """Allows both of two actions, at the second of which its process ends."""
-
-    observation_space = spaces.Box(0.0, 9.0, (1,), np.float32)
-    action_space = spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(1, np.float32), {"action_mask": [1, 1]}
-
-    def step(self, action):
-        if action == 1:
-            os._exit(3)
-        return np.ones(1, np.float32), 0.0, False, False, {"action_mask": [1, 1]}
-
-
 def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
     env = make_masked(Leaving, 2, "gymnasium-async", seed=0, worker_timeout=60.0, restart_workers=1)
     try:
         env.reset()
-        with pytest.warns(RuntimeWarning, match=r"started anew \(1 of at most 1 times\)"):
+        with pytest.warns(RuntimeWarning, match=r"restarted \(1 of at most 1 times\)"):
             step = env.step(np.array([0, 1]))
         assert step.truncated.tolist() == [False, True]
         assert env.reset_done(step.truncated).mask.tolist() == [[True, True]] * 2

@@ -206,7 +206,7 @@ def test_a_worker_that_is_lost_before_a_snapshot_ends_its_episode_at_the_next_st
         env.step(np.zeros(2, int))
         env.workers.workers[1].process.kill()
         env.workers.workers[1].process.join()
-        with pytest.warns(RuntimeWarning, match="started anew"):
+        with pytest.warns(RuntimeWarning, match="restarted"):
             assert env.snapshot() is None
         step = env.step(np.zeros(2, int))
         assert step.truncated.tolist() == [False, True]

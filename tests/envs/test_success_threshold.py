@@ -14,6 +14,7 @@ import rejeu
 from rejeu.cli import main
 from rejeu.envs.make import InProcess, make_vector
 from tests.environments import Counter, Reach
+from tests.tiers import exhaustive
 
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "n_steps": 6, "seed": 0}
 
@@ -105,6 +106,7 @@ def test_a_bad_threshold_is_refused(value):
         rejeu.A2C("MlpPolicy", counter(), success_threshold=value, **SMALL)
 
 
+@exhaustive
 def test_the_command_line_takes_thresholds(tmp_path, capsys):
     out = tmp_path / "run"
     argv = ["train", "Pendulum-v1", "--algo", "A2C", "--steps", "400", "--evaluate-every", "400"]

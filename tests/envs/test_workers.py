@@ -26,36 +26,8 @@ from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
 from tests.helpers import small_sac
-
-
-class UnsendableError(Exception):
-    """An exception that pickle can neither write nor read again."""
-
-    def __init__(self, code, text):
-        super().__init__(text)
-        self.lock = threading.Lock()
-
-
-class Faulty(Counter):
-    """Fails in worker processes, in the way that ``fault`` says."""
-
-    def __init__(self, fault):
-        super().__init__((3,))
-        self.fault = fault
-        if fault == "make" and multiprocessing.parent_process() is not None:
-            raise UnsendableError(1, "no such device")
-
-    def reset(self, **kwargs):
-        if self.fault == "reset":
-            raise UnsendableError(1, "cannot begin")
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        if action[0] > 0.5:
-            if self.fault == "exit":
-                os._exit(3)
-            raise UnsendableError(1, "the wheel came off")
-        return super().step(action)
+from tests.tiers import exhaustive
+from tests.worker_environments import Faulty, Losable, Rare
 
 
 def make(fault, n_envs=2):
@@ -110,7 +82,7 @@ def test_environments_registered_in_this_process_reach_the_workers(monkeypatch):
     ("fault", "words"), [("make", "no such device"), ("reset", "cannot begin"), ("step", "the wheel came off")]
 )
 def test_the_traceback_of_a_worker_reaches_the_user(fault, words):
-    with pytest.raises(WorkerError, match=rf"(?s)Traceback .*test_workers.py.*UnsendableError: {words}"):
+    with pytest.raises(WorkerError, match=rf"(?s)Traceback .*worker_environments.py.*UnsendableError: {words}"):
         make_and_step(fault)
 
 
@@ -139,28 +111,6 @@ def test_a_worker_that_is_gone_is_reported():
     vector.close()
 
 
-class Losable(Counter):
-    """Crashes or hangs at the actions 1 and 2; at resets, while the file ``at_reset`` is there, which it removes."""
-
-    def __init__(self, at_reset=None):
-        super().__init__((9,))
-        self.action_space = gym.spaces.Box(-2.0, 2.0, (1,))
-        self.at_reset = at_reset
-
-    def reset(self, **kwargs):
-        if self.at_reset is not None and self.at_reset.exists():
-            self.at_reset.unlink()
-            os._exit(5)
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        if action[0] == 1:
-            os.kill(os.getpid(), signal.SIGKILL) if hasattr(signal, "SIGKILL") else os._exit(9)
-        if action[0] == 2:
-            time.sleep(600)
-        return super().step(action)
-
-
 def children():
     return multiprocessing.active_children()
 
@@ -183,7 +133,7 @@ def test_a_worker_that_crashes_or_hangs_is_named_and_all_are_ended(act):
         vector.step(actions(0, act, 0))
     assert time.monotonic() - began < 60
     assert not children()
-    with pytest.raises(WorkerError, match="make the environments anew"):
+    with pytest.raises(WorkerError, match="create the environments again"):
         vector.reset()
     vector.close()
 
@@ -193,9 +143,7 @@ def test_a_lost_worker_is_started_anew_and_its_episode_truncated(act):
     vector = make_vector(Losable, 2, "gymnasium-async", seed=0, worker_timeout=1.0, restart_workers=1)
     vector.reset()
     before = np.array(vector.step(actions(0, 0)).obs)
-    with pytest.warns(
-        RuntimeWarning, match=r"environment 1 .*'step'.*started anew \(1 of at most 1 times\).*truncated"
-    ):
+    with pytest.warns(RuntimeWarning, match=r"environment 1 .*'step'.*restarted \(1 of at most 1 times\).*truncated"):
         step = vector.step(actions(0, act))
     assert step.truncated.tolist() == [False, True]
     assert not step.terminated.any()
@@ -217,19 +165,15 @@ def test_a_worker_lost_at_a_reset_is_started_anew(tmp_path):
     vector = make_vector(lambda: Losable(crash), 1, "gymnasium-async", seed=0, restart_workers=2)
     vector.reset()
     crash.touch()
-    with pytest.warns(RuntimeWarning, match=r"ended by itself at 'reset' \(exit code 5\); it is started anew"):
+    with pytest.warns(RuntimeWarning, match=r"ended by itself at 'reset' \(exit code 5\); it is restarted"):
         np.testing.assert_array_equal(vector.reset()[0, :2], [0, 0])
     vector.close()
 
 
 def test_training_goes_on_where_workers_are_started_anew():
-    class Rare(Losable):
-        def step(self, action):
-            return super().step(np.ones(1) if self.np_random.uniform() < 0.1 else np.zeros(1))
-
     vector = make_vector(Rare, 2, "gymnasium-async", seed=0, restart_workers=99)
     agent = small_sac(vector, learning_starts=99)
-    with pytest.warns(RuntimeWarning, match="started anew"):
+    with pytest.warns(RuntimeWarning, match="restarted"):
         agent.learn(60)
     assert agent.num_timesteps == 60
     assert 0 < vector.workers.restarts_left < 99
@@ -239,7 +183,7 @@ def test_training_goes_on_where_workers_are_started_anew():
 
 
 def test_a_subproc_vector_replaces_lost_processes_too():
-    env = SubprocVecEnv([Losable] * 2, worker_timeout=1.0, restart_workers=1)
+    env = SubprocVecEnv([Losable] * 2, worker_timeout=3.0, restart_workers=1)
     try:
         env.reset()
         before = env.step(actions(0, 0))[0]
@@ -352,6 +296,7 @@ def test_a_self_resetting_vector_without_shared_memory_is_refused():
 # The main script, which every worker imports.
 
 
+@exhaustive
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C reaches a process by another way")
 def test_nothing_is_left_after_ctrl_c(tmp_path):
     script = tmp_path / "script.py"
@@ -447,3 +392,9 @@ def test_where_a_script_stands_is_told_from_its_text(tmp_path):
     assert ran.stdout.split() == ["True", "False", "None"]
     asked = "from rejeu.envs.workers.pool import main_runs_again as ask; print(ask())"
     assert subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def test_worker_processes_do_not_import_jax():
+    """It would take a second and 100 MB in each of them."""
+    code = "import sys, rejeu.envs.workers.calls, tests.worker_environments; print('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"

@@ -121,7 +121,7 @@ def test_a_logger_of_one_s_own_takes_the_rows(tmp_path, capsys):
         assert [row["mine/n"] for row in csv.DictReader(file)] == ["1", "2"]
     assert agent.logger.get_dir() == str(tmp_path)
     agent.logger.close()
-    with pytest.raises(ValueError, match="'stdout', 'csv' or 'tensorboard'"):
+    with pytest.raises(ValueError, match="format_strings contains 'log', expected any of 'stdout', 'csv', 'json'"):
         configure(tmp_path, ["log"])
     with pytest.raises(TypeError, match=r"record\('mine/text'\) expected a number, got str"):
         Logger().record("mine/text", "words")

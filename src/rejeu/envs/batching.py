@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
-import jax
 import numpy as np
 from gymnasium import spaces
 
@@ -25,7 +24,7 @@ from rejeu.envs.validation import (
     to_array,
 )
 from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import Leaf, cast, flat_keys, leaves, plain, structure
+from rejeu.spaces import Leaf, cast, leaves, parts
 
 
 def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, Any], None]:
@@ -49,9 +48,10 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
             store[i] = obs
 
         return put_array
-    keys = flat_keys(structure(space))
-    if keys is not None:
-        keyed = [(key, *slot) for key, slot in zip(keys, slots, strict=True)]
+    if isinstance(space, spaces.Dict) and not any(
+        isinstance(part, spaces.Dict | spaces.Tuple) for part in space.spaces.values()
+    ):
+        keyed = [(key, *slot) for key, slot in zip(sorted(space.spaces), slots, strict=True)]
 
         def put_dict(i: int, obs: Any) -> None:
             for key, store, shape, size, dtype, array in keyed:
@@ -62,15 +62,11 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
 
         return put_dict
 
-    def put_tree(i: int, obs: Any) -> None:
-        for (store, shape, *_), part in zip(slots, jax.tree.leaves(plain(space, obs), is_leaf=_is_list), strict=True):
+    def put_parts(i: int, obs: Any) -> None:
+        for (store, shape, *_), part in zip(slots, parts(space, obs), strict=True):
             store[i] = to_array(part, shape, store.dtype)
 
-    return put_tree
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, list)
+    return put_parts
 
 
 def reset_env(
@@ -120,7 +116,7 @@ def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, o
         raise BadEnvironmentError(
             f"observations as {describe_value(obs)}, expected a batch of {space}: {error}"
         ) from error
-    for leaf, array in zip(space_leaves, jax.tree.leaves(arrays), strict=True):
+    for leaf, array in zip(space_leaves, parts(space, arrays), strict=True):
         if array.shape != (n_envs, *leaf.shape):
             raise BadEnvironmentError(
                 f"{leaf_name(leaf.path)} of all environments of shape {array.shape}, expected {(n_envs, *leaf.shape)}; one "

@@ -64,7 +64,7 @@ def make_vector(
             number, and keeps a sequence. None draws one.
         worker_timeout: seconds that worker processes have for a step or a reset before they count as hung; None: for
             ever. Of no meaning on other backends.
-        restart_workers: how many worker processes that crashed or hung are started anew, with a warning, and their
+        restart_workers: how many worker processes that crashed or hung are restarted, with a warning, and their
             episode counted as truncated there; after that, and by default, :class:`rejeu.errors.WorkerError` is raised.
             Only for ``backend="gymnasium-async"``.
         env_kwargs: handed to ``gymnasium.make``.

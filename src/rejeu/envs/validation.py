@@ -15,11 +15,10 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import gymnasium as gym
-import jax
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.spaces import Leaf, leaves
+from rejeu.spaces import Leaf, leaves, parts
 
 FLAGS = frozenset((bool, np.bool_))
 """Types of ``terminated`` and ``truncated``."""
@@ -287,9 +286,7 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
 
     Far is ``FAR`` times the distance of the two bounds. Images cannot lie outside, and what is unbounded is not looked at.
     """
-    for leaf, part, array in zip(
-        leaves(space), leaf_spaces(space), jax.tree.leaves(obs), strict=False
-    ):  # a mask may follow
+    for leaf, part, array in zip(leaves(space), leaf_spaces(space), parts(space, obs), strict=True):
         if leaf.kind != "continuous":
             continue
         assert isinstance(part, spaces.Box)

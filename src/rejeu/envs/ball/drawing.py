@@ -12,7 +12,7 @@ import numpy as np
 
 from rejeu.errors import MissingExtra
 
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 Point = tuple[float, float]
 
 PAPER, INSIDE, OUTSIDE = (246, 246, 243), (255, 255, 255), (244, 235, 232)
@@ -92,17 +92,17 @@ class BallDrawing:
         Returns ``uint8 (height, width, 3)``, or None if there is a window.
         """
         lost = over and bool(trail) and max(map(abs, trail[-1])) > self.wall
-        colour = BALL if not over else LOST if lost else HELD
+        color = BALL if not over else LOST if lost else HELD
         self.canvas.blit(self.field, (0, 0))
         points = self._points(trail, step)
         self._draw_trail(points)
         if points:
             if len(push) and len(points) > 1:
                 self._draw_push(points[-2], push)
-            self._draw_ball(points[-1], colour)
+            self._draw_ball(points[-1], color)
         for i, strip in enumerate(self.strips):
-            self._draw_course(strip, [position[i] for position in trail], step, colour)
-        self._draw_caption(self._caption(trail, step, over, lost), step, colour if over else INK, colour)
+            self._draw_course(strip, [position[i] for position in trail], step, color)
+        self._draw_caption(self._caption(trail, step, over, lost), step, color if over else INK, color)
         picture = self.pygame.transform.smoothscale(self.canvas, self.size)
         if self.window is None:
             return np.ascontiguousarray(self.pygame.surfarray.array3d(picture).swapaxes(0, 1))
@@ -149,7 +149,7 @@ class BallDrawing:
         for tick in range(0, self.n_steps + 1, self.n_steps // 5) if self.dimension == 1 else ticks:
             if self.dimension > 1 or tick > 0:
                 self._line((self._x(tick), self._y(-wall)), (self._x(tick), self._y(wall)), GRID, 1.2)
-            self._text(_number(tick), (self._x(tick), self.bottom + 15), FAINT, "centre")
+            self._text(_number(tick), (self._x(tick), self.bottom + 15), FAINT, "center")
         corners = [(self._x(x), self._y(y)) for x, y in ((west, wall), (east, wall), (east, -wall), (west, -wall))]
         sides = ((0, 1), (2, 3)) if self.dimension == 1 else ((0, 1), (1, 2), (2, 3), (3, 0))
         for start, end in sides:
@@ -160,13 +160,13 @@ class BallDrawing:
         n_old = len(points) if self.dimension == 1 else max(len(points) - FADING, 0)
         if n_old > 1:
             fine = [(x * FINE, y * FINE) for x, y in points[: n_old + 1]]
-            colour, width = (NEW_TRAIL, 1.6) if self.dimension == 1 else (OLD_TRAIL, 1.0)
-            self.pygame.draw.lines(self.canvas, colour, False, fine, round(width * FINE))
+            color, width = (NEW_TRAIL, 1.6) if self.dimension == 1 else (OLD_TRAIL, 1.0)
+            self.pygame.draw.lines(self.canvas, color, False, fine, round(width * FINE))
         for i in range(max(n_old, 1), len(points)):
             freshness = 1.0 - (len(points) - 1 - i) / FADING
-            colour = _mix(OLD_TRAIL, NEW_TRAIL, freshness**2)
-            self._line(points[i - 1], points[i], colour, 1.6)
-            self._disc(points[i], 1.2 + 1.2 * freshness, colour)
+            color = _mix(OLD_TRAIL, NEW_TRAIL, freshness**2)
+            self._line(points[i - 1], points[i], color, 1.6)
+            self._disc(points[i], 1.2 + 1.2 * freshness, color)
         if points:
             self._disc(points[0], 4.5, FAINT)
             self._disc(points[0], 2.8, INSIDE)
@@ -184,13 +184,13 @@ class BallDrawing:
         self._line(tuple(base), tuple(neck), PUSH, 3.0)
         self._polygon([base + along, neck + across * head * 0.5, neck - across * head * 0.5], PUSH)
 
-    def _draw_ball(self, centre: Point, colour: Colour) -> None:
+    def _draw_ball(self, center: Point, color: Color) -> None:
         radius = 9.0
-        self._disc((centre[0], centre[1] + 1.5), radius + 1.5, _mix(INSIDE, INK, 0.25))
+        self._disc((center[0], center[1] + 1.5), radius + 1.5, _mix(INSIDE, INK, 0.25))
         for i in range(8):
             share = i / 7
             shift, tint = 0.33 * radius * share, 0.75 * share**2
-            self._disc((centre[0] - shift, centre[1] - shift), radius * (1 - 0.85 * share), _mix(colour, INSIDE, tint))
+            self._disc((center[0] - shift, center[1] - shift), radius * (1 - 0.85 * share), _mix(color, INSIDE, tint))
 
     def _strips(self) -> list[Strip]:
         """Returns the areas of the plots against time, which share the height of the plane."""
@@ -212,11 +212,11 @@ class BallDrawing:
         if coordinate == len(self.strips) - 1:
             for share in (0.0, 0.5, 1.0):
                 place = strip.place(share, 0)[0], self.bottom + 15
-                self._text(_number(share * self.n_steps), place, FAINT, "centre")
+                self._text(_number(share * self.n_steps), place, FAINT, "center")
         if coordinate == 0 and self.dimension > len(self.strips):
             self._text(f"{len(self.strips)} of {self.dimension} coordinates", (strip.right, 30), FAINT, "right")
 
-    def _draw_course(self, strip: Strip, values: Sequence[float], step: int, colour: Colour) -> None:
+    def _draw_course(self, strip: Strip, values: Sequence[float], step: int, color: Color) -> None:
         """Plots the values of one coordinate up to ``step``."""
         reach, first = self.wall + MARGIN, step - len(values) + 1
         heights = [min(max(value / reach, -1.0), 1.0) for value in values]
@@ -224,7 +224,7 @@ class BallDrawing:
         if len(points) > 1:
             self.pygame.draw.lines(self.canvas, NEW_TRAIL, False, [(x * FINE, y * FINE) for x, y in points], FINE)
         if points:
-            self._disc(points[-1], 4.0, colour)
+            self._disc(points[-1], 4.0, color)
 
     def _caption(self, trail: Sequence[Sequence[float]], step: int, over: bool, lost: bool) -> str:
         """Returns the caption. In more than two dimensions, it names the coordinates in which the ball left the box."""
@@ -233,45 +233,45 @@ class BallDrawing:
         left = [f"x{i + 1}" for i, x in enumerate(trail[-1]) if abs(x) > self.wall]
         return f"lost in step {step}" + (f" by {', '.join(left)}" if self.dimension > 2 else "")
 
-    def _draw_caption(self, said: str, step: int, ink: Colour, colour: Colour) -> None:
+    def _draw_caption(self, said: str, step: int, ink: Color, color: Color) -> None:
         self._text(said, (self.left, 30), ink, "left", self.large_font)
         self._text(f"of {self.n_steps}", (self.right, 30), FAINT, "right")
         self._rectangle((self.left, 50), (self.right, 55), GRID)
         filled = self.left + (self.right - self.left) * min(step / self.n_steps, 1.0)
-        self._rectangle((self.left, 50), (filled, 55), colour)
+        self._rectangle((self.left, 50), (filled, 55), color)
 
-    def _rectangle(self, corner: Point, opposite: Point, colour: Colour) -> None:
+    def _rectangle(self, corner: Point, opposite: Point, color: Color) -> None:
         left, top = round(corner[0] * FINE), round(corner[1] * FINE)
         width, height = round(opposite[0] * FINE) - left, round(opposite[1] * FINE) - top
-        self.pygame.draw.rect(self.canvas, colour, (left, top, width, height))
+        self.pygame.draw.rect(self.canvas, color, (left, top, width, height))
 
-    def _line(self, start: Sequence[float], end: Sequence[float], colour: Colour, width: float) -> None:
+    def _line(self, start: Sequence[float], end: Sequence[float], color: Color, width: float) -> None:
         """Draws a line as a polygon, because wide lines of pygame have slanted ends. Thin lines have round ends."""
         along = np.subtract(end, start)
         length = float(np.hypot(*along))
         if length > 0.0:
             across = np.array([-along[1], along[0]]) * (0.5 * width / length)
-            self._polygon([start + across, end + across, end - across, start - across], colour)
+            self._polygon([start + across, end + across, end - across, start - across], color)
         if width < 2.0:
-            self._disc(start, 0.5 * width, colour)
-            self._disc(end, 0.5 * width, colour)
+            self._disc(start, 0.5 * width, color)
+            self._disc(end, 0.5 * width, color)
 
-    def _polygon(self, points: Sequence[Any], colour: Colour) -> None:
-        self.pygame.draw.polygon(self.canvas, colour, [(float(x) * FINE, float(y) * FINE) for x, y in points])
+    def _polygon(self, points: Sequence[Any], color: Color) -> None:
+        self.pygame.draw.polygon(self.canvas, color, [(float(x) * FINE, float(y) * FINE) for x, y in points])
 
-    def _disc(self, centre: Sequence[float], radius: float, colour: Colour) -> None:
+    def _disc(self, center: Sequence[float], radius: float, color: Color) -> None:
         self.pygame.draw.circle(
-            self.canvas, colour, (float(centre[0]) * FINE, float(centre[1]) * FINE), max(radius * FINE, 1.0)
+            self.canvas, color, (float(center[0]) * FINE, float(center[1]) * FINE), max(radius * FINE, 1.0)
         )
 
-    def _text(self, text: str, place: Point, colour: Colour, side: str, font: Any = None) -> None:
-        """Writes ``text``, vertically centered. ``place`` is its ``side``: ``"left"``, ``"right"`` or ``"centre"``."""
-        drawn = (font or self.font).render(text, True, colour)
-        x = place[0] * FINE - {"left": 0.0, "centre": 0.5, "right": 1.0}[side] * drawn.get_width()
+    def _text(self, text: str, place: Point, color: Color, side: str, font: Any = None) -> None:
+        """Writes ``text``, vertically centered. ``place`` is its ``side``: ``"left"``, ``"right"`` or ``"center"``."""
+        drawn = (font or self.font).render(text, True, color)
+        x = place[0] * FINE - {"left": 0.0, "center": 0.5, "right": 1.0}[side] * drawn.get_width()
         self.canvas.blit(drawn, (round(x), round(place[1] * FINE - 0.5 * drawn.get_height())))
 
 
-def _mix(first: Colour, second: Colour, share: float) -> Colour:
+def _mix(first: Color, second: Color, share: float) -> Color:
     """Interpolates between the colors ``first`` (``share=0``) and ``second`` (``share=1``)."""
     red, green, blue = (round(a + (b - a) * share) for a, b in zip(first, second, strict=True))
     return red, green, blue

@@ -210,7 +210,7 @@ class Workers:
         Answers to earlier requests that were not fetched, for example after Ctrl-C, are discarded.
         """
         if self.closed:
-            raise WorkerError("the worker processes were ended; make the environments anew")
+            raise WorkerError("the worker processes were ended; create the environments again")
         late = [number for number in requests if self.workers[number].asked is not None]
         if late:
             self.answers(late)
@@ -248,12 +248,11 @@ class Workers:
         if self.restarts_left == 0:
             self.end()
             spent = f", and {self._restarts} restarts are spent" if self._restarts else ""
-            raise WorkerError(f"{why}{spent}; {advice}, and restart_workers=10 would start it anew and go on")
+            raise WorkerError(f"{why}{spent}; {advice}, and restart_workers=10 would restart it")
         self.restarts_left -= 1
         done = self._restarts - self.restarts_left
         warnings.warn(
-            f"{why}; it is started anew ({done} of at most {self._restarts} times), and its episode "
-            "counts as truncated",
+            f"{why}; it is restarted ({done} of at most {self._restarts} times), and its episode counts as truncated",
             RuntimeWarning,
             stacklevel=2,
         )

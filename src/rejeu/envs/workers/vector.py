@@ -58,7 +58,7 @@ class InWorkers(VectorEnv):
         """Number of steps of the vector."""
         self._lost: dict[int, Restarted] = {}
         """Environments whose process was replaced between two steps. The next step reports it."""
-        self._anew: set[int] = set()
+        self._restarted: set[int] = set()
         """Environments in new processes that have not been reset yet."""
         self._make_one = make_one
         self._seed = seed
@@ -106,9 +106,9 @@ class InWorkers(VectorEnv):
 
     def _next_seed(self, i: int) -> int | None:
         """Returns a seed derived from the last one for an environment in a new process, None for others."""
-        if i not in self._anew:
+        if i not in self._restarted:
             return None
-        self._anew.discard(i)
+        self._restarted.discard(i)
         before = self._seeds[i]
         if before is None:
             return None
@@ -147,7 +147,7 @@ class InWorkers(VectorEnv):
 
     def _heard(self, said: dict[int, Any], what: str) -> dict[int, Any]:
         """Returns the answers. Raises if one of them is a failure."""
-        self._anew.update(i for i, answer in said.items() if isinstance(answer, Restarted))
+        self._restarted.update(i for i, answer in said.items() if isinstance(answer, Restarted))
         failed = {i: answer for i, answer in said.items() if isinstance(answer, Failure)}
         if not failed:
             return said

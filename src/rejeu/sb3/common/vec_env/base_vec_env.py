@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import gymnasium as gym
 import numpy as np
 
+from rejeu.envs.workers.calls import TERMINAL_OBSERVATION, TIME_LIMIT_TRUNCATED
 from rejeu.errors import MissingExtra
 from rejeu.reporting.text import counted
 
@@ -30,10 +31,6 @@ __all__ = [
     "unwrap_wrapper",
 ]
 
-TERMINAL_OBSERVATION = "terminal_observation"
-"""Key of the info that holds the last observation of an episode."""
-TIME_LIMIT_TRUNCATED = "TimeLimit.truncated"
-"""Key of the info that says whether only a time limit ended the episode."""
 Indices = int | Iterable[int] | None
 """Which environments: one, several, or None for all."""
 StepResult = tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]

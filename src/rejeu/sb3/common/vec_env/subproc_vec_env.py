@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from rejeu.envs import batching
 from rejeu.envs.validation import with_location
+from rejeu.envs.workers import calls
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
-from rejeu.envs.workers.process import Failure, checked_step
+from rejeu.envs.workers.process import Failure
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.reporting.video import rgb_frame
 from rejeu.sb3.common.vec_env.base_vec_env import (
@@ -88,7 +88,7 @@ class SubprocVecEnv(VecEnv):
         """Resets some environments, again where the process had to be replaced; returns observations and infos."""
         done: dict[int, tuple[Any, dict[str, Any]]] = {}
         while len(done) < len(numbers):
-            waiting = {i: ("call", _reset, self._seeds[i], self._options[i]) for i in numbers if i not in done}
+            waiting = {i: ("call", calls.reset, self._seeds[i], self._options[i]) for i in numbers if i not in done}
             self.workers.send(waiting)
             replies = self._receive(waiting)
             done |= {i: reply for i, reply in replies.items() if not isinstance(reply, Restarted)}
@@ -99,7 +99,7 @@ class SubprocVecEnv(VecEnv):
         if len(actions) != self.num_envs:
             raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
         self._n_steps += 1
-        self.workers.send({i: ("call", _step_and_reset, action) for i, action in enumerate(actions)})
+        self.workers.send({i: ("call", calls.step_and_reset, action) for i, action in enumerate(actions)})
         self.waiting = True
 
     def step_wait(self) -> StepResult:
@@ -126,17 +126,17 @@ class SubprocVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """Returns an attribute of each environment, looked up through its wrappers."""
-        return self._call(self._get_indices(indices), _get_attr, attr_name)
+        return self._call(self._get_indices(indices), calls.get_attr, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Sets an attribute of each environment where it exists, also inside wrappers."""
-        self._call(self._get_indices(indices), _set_attr, attr_name, value)
+        self._call(self._get_indices(indices), calls.set_attr, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Calls a method of each environment, looked up through its wrappers, and returns the results."""
-        return self._call(self._get_indices(indices), _call_method, method_name, method_args, method_kwargs)
+        return self._call(self._get_indices(indices), calls.call_method, method_name, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
         """Returns for each environment whether it is wrapped in that class."""
@@ -174,39 +174,5 @@ class SubprocVecEnv(VecEnv):
         return concatenate(self.observation_space, parts, empty)
 
 
-def _reset(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
-    """Resets an environment; returns a copy of the observation and the info."""
-    obs, info = batching.reset_env(env, seed, options)
-    return batching.copy_observation(env.observation_space, obs), info
-
-
-def _step_and_reset(env: gym.Env, action: Any) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
-    """Steps an environment, and resets it if the episode has ended.
-
-    Returns:
-        The observation to act on, the reward, whether the episode has ended, the info, and the info of the reset.
-    """
-    obs, reward, terminated, truncated, info = checked_step(env, action)
-    obs = batching.copy_observation(env.observation_space, obs)
-    info = {**info, TIME_LIMIT_TRUNCATED: truncated and not terminated}
-    reset_info: dict[str, Any] = {}
-    if terminated or truncated:
-        info[TERMINAL_OBSERVATION] = obs
-        obs, reset_info = _reset(env, None, None)
-    return obs, reward, terminated or truncated, info, reset_info
-
-
 def _render(env: gym.Env) -> Any:
     return env.render() if env.render_mode == "human" else rgb_frame(env)
-
-
-def _get_attr(env: gym.Env, name: str) -> Any:
-    return env.get_wrapper_attr(name)
-
-
-def _set_attr(env: gym.Env, name: str, value: Any) -> None:
-    env.set_wrapper_attr(name, value)
-
-
-def _call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
-    return env.get_wrapper_attr(name)(*arguments, **keywords)
