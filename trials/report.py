@@ -48,11 +48,13 @@ def read(name: str) -> Any:
 def origins(name: str) -> list[tuple[str, str, str]]:
     """Returns the commit, date and command of results; several if parts were recorded separately."""
     found = read(name)
-    parts = [found] if "command" in found or "date" in found else [p for p in found.values() if isinstance(p, dict)]
+    nested = [part for part in found.values() if isinstance(part, dict)]
+    is_one = "command" in found or "date" in found
+    parts = [found, *(part for part in nested if "recorded" in part)] if is_one else nested
     recorded, day = git("log", "-1", "--format=%h %as", "--", f"trials/results/{name}.json").split() or ("", "")
     dates: dict[tuple[str, str], list[str]] = {}
     for part in parts:
-        commit = f"`{part['commit']}`" if "commit" in part else f"recorded in `{recorded}`"
+        commit = f"`{part['commit']}`" if "commit" in part else f"recorded in `{part.get('recorded', recorded)}`"
         command = re.sub(r" --only .*", "", part.get("command", COMMANDS.get(name, ""))).replace("SB3_PYTHON", "PATH")
         dates.setdefault((commit, f"`{command}`"), []).append(part.get("date", day))
     return [(commit, " and ".join(sorted({*days})), command) for (commit, command), days in dates.items()]
