@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rejeu.loops.run import Episode
-from rejeu.reporting.history import COLUMNS, History
+from rejeu.reporting.history import COLUMNS, EpisodeTable, History
 
 NAN = float("nan")
 
@@ -135,3 +135,15 @@ def test_a_summary_shows_itself_as_a_table():
     assert "success" not in repr(returning(1.0).summary())
     with pytest.raises(ValueError, match="window=0 must be a whole number of at least 1"):
         History().summary(0)
+
+
+def test_episode_table_grows_during_training(tmp_path):
+    history = History([Episode(10, 0, 1.0, 10, math.nan, 0.1)])
+    table = EpisodeTable(lambda: history, tmp_path / "episodes.csv")
+    for step in (20, 30):
+        history.append(Episode(step, 0, 2.0, 10, 1.0, 0.2))
+        table.write(step, {})
+    table.write(30, {})
+    grown = (tmp_path / "episodes.csv").read_bytes()
+    history.write_csv(tmp_path / "whole.csv")
+    assert grown == (tmp_path / "whole.csv").read_bytes()

@@ -142,3 +142,15 @@ def test_vector_environments_show_what_they_step():
     inside = DummyVecEnv([lambda: gym.make("CartPole-v1")] * 2)
     assert repr(inside).startswith("<DummyVecEnv: 2 environments, observations Box(")
     assert repr(VecNormalize(inside)).endswith("actions Discrete(2)>")
+
+
+def test_agents_and_histories_are_tables():
+    agent = rejeu.PPO("MlpPolicy", "CartPole-v1", seed=4)
+    assert "<th>PPO</th><th>CartPole-v1</th>" in formatted(agent)["text/html"]
+    assert "episodes" not in formatted(agent)["text/html"]
+    agent.history.append(Episode(10, 0, 9.0, 10, NAN, 0.5))
+    assert "mean of the last 1: return 9.00" in formatted(agent)["text/html"]
+    text = formatted(agent.history)["text/html"]
+    assert "1 episode in 10 steps" in text
+    assert "<th>return</th><td>9.00 \N{PLUS-MINUS SIGN} 0.00</td>" in text
+    assert "<table" not in formatted(History())["text/html"]

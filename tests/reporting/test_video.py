@@ -22,6 +22,7 @@ import rejeu
 from rejeu.errors import MissingExtra
 from rejeu.reporting import video
 from rejeu.reporting.video import VideoFile, record_video, show_videos
+from tests.tiers import exhaustive
 
 
 class Lamp(gym.Env):
@@ -326,6 +327,7 @@ def test_missing_ffmpeg_names_the_extra(lamp, tmp_path, monkeypatch):
         record_video(Still(), tmp_path / "v.mp4", lamp)
 
 
+@exhaustive
 def test_training_episodes_are_filmed_by_gymnasiums_wrapper(tmp_path):
     pytest.importorskip("moviepy")
     env = gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=10)

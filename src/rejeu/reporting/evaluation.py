@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rejeu.envs.base import VectorEnv
-from rejeu.reporting.text import counted
+from rejeu.reporting.text import counted, html_table
 from rejeu.spaces import scale_action
 
 if TYPE_CHECKING:
@@ -72,6 +72,18 @@ class Evaluation:
         bounds = stats.binomtest(int(self.successes.sum()), len(self.successes)).proportion_ci(method="wilson")
         return float(bounds.low), float(bounds.high)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the statistics by name, as ``rejeu evaluate --json`` prints them."""
+        return {
+            "episodes": len(self.returns),
+            "mean_return": self.mean_return,
+            "std_return": self.std_return,
+            "return_interval": self.return_interval,
+            "mean_length": self.mean_length,
+            "success_rate": self.success_rate,
+            "success_interval": self.success_interval,
+        }
+
     def plot(self, path: str | Path | None = None) -> Picture:
         """Returns a matplotlib figure of the returns and their mean, which notebooks display.
 
@@ -109,10 +121,9 @@ class Evaluation:
             ("return", f"{self.mean_return:,.2f}", f"{low:,.2f} to {high:,.2f}", f"{self.std_return:,.2f}"),
             ("length", f"{self.mean_length:,.1f}", "", f"{np.std(self.lengths):,.1f}"),
         ]
-        head = (counted(len(self.returns), "episode"), "mean", "95 % CI of the mean", "standard deviation")
-        lines = ["".join(f"<th>{cell}</th>" for cell in head)]
-        lines += [f"<th>{row[0]}</th>" + "".join(f"<td>{cell}</td>" for cell in row[1:]) for row in rows]
-        return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+        return html_table(
+            [(counted(len(self.returns), "episode"), "mean", "95 % CI of the mean", "standard deviation"), *rows]
+        )
 
 
 def evaluate(

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from rejeu.io import atomic
 from rejeu.loops.run import Episode
-from rejeu.reporting.text import counted
+from rejeu.reporting.text import counted, html_table
 from rejeu.validation import whole
 
 if TYPE_CHECKING:
@@ -61,6 +61,10 @@ class History:
             text += f", success {means['success']:.0%}"
         steps = int(self["step"][-1])
         return f"<History: {counted(len(self), 'episode')} in {counted(steps, 'step')}; mean of the last {n}: {text}>"
+
+    def _repr_html_(self) -> str:
+        """Returns a table for notebooks."""
+        return self.summary().to_html()
 
     @property
     def episodes(self) -> list[Episode]:
@@ -137,12 +141,8 @@ class History:
 
     def write_csv(self, path: str | Path) -> None:
         """Writes the table with a header line, atomically."""
-        text = io.StringIO()
-        writer = csv.writer(text)
-        writer.writerow(COLUMNS)
-        writer.writerows(self.episodes)
         with atomic.replacing(Path(path)) as file:
-            file.write(text.getvalue().encode())
+            file.write(csv_lines([COLUMNS, *self.episodes]))
 
     def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
         """Returns a matplotlib figure of returns and, if known, success; notebooks display it.
@@ -162,6 +162,51 @@ class History:
     def to_dict(self) -> dict[str, Any]:
         """Returns the columns as arrays, ready for ``pandas.DataFrame``."""
         return {column: self[column] for column in COLUMNS}
+
+
+def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
+    """Returns rows as lines of a CSV file."""
+    text = io.StringIO()
+    csv.writer(text).writerows(rows)
+    return text.getvalue().encode()
+
+
+class EpisodeTable:
+    """Appends new episodes to a CSV file whenever metrics are written, so that the file can be read during training. A sink.
+
+    Args:
+        history: returns the history.
+        path: path of the file; the episodes so far are written at once.
+    """
+
+    def __init__(self, history: Callable[[], History], path: Path) -> None:
+        self._history, self._path = history, path
+        self._n_written = 0
+        self._rewrite()
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Appends the episodes since the last call; the metrics are not used.
+
+        Raises:
+            OSError: if writing fails; the file is not changed.
+        """
+        history = self._history()
+        if len(history) < self._n_written:
+            self._rewrite()
+        elif new := history.last(len(history) - self._n_written):
+            atomic.append(self._path, csv_lines(new))
+            self._n_written += len(new)
+
+    def close(self) -> None:
+        """Does nothing, because rows are not buffered."""
+
+    def _rewrite(self) -> None:
+        history = self._history()
+        history.write_csv(self._path)
+        self._n_written = len(history)
 
 
 @dataclass(frozen=True)
@@ -227,10 +272,11 @@ class Summary:
             best=records[-1] if records else None,
         )
 
-    def __repr__(self) -> str:
-        head = f"{counted(self.all.n, 'episode')} in {counted(self.steps, 'step')}, {self.seconds:,.1f} s"
-        if self.best is None:
-            return head
+    def _head(self) -> str:
+        return f"{counted(self.all.n, 'episode')} in {counted(self.steps, 'step')}, {self.seconds:,.1f} s"
+
+    def _rows(self) -> list[list[str]]:
+        """Returns the table, with a row of headings."""
         parts = (self.all, self.last)
         spread = "{:,.2f} \N{PLUS-MINUS SIGN} {:,.2f}".format
         rows = [
@@ -241,9 +287,27 @@ class Summary:
         if not math.isnan(self.all.success_rate):
             rates = ("-" if math.isnan(part.success_rate) else f"{part.success_rate:.1%}" for part in parts)
             rows.append(["success", *rates])
+        return rows
+
+    def _best(self) -> str:
+        if self.best is None:
+            return ""
+        return f"best return {self.best.episode_return:,.2f} at step {self.best.step:,} ({counted(self.records, 'record')})"
+
+    def __repr__(self) -> str:
+        if self.best is None:
+            return self._head()
+        rows = self._rows()
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         table = [
             "   ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
         ]
-        best = f"best return {self.best.episode_return:,.2f} at step {self.best.step:,} ({counted(self.records, 'record')})"
-        return "\n".join([head, *table, best])
+        return "\n".join([self._head(), *table, self._best()])
+
+    def _repr_html_(self) -> str:
+        return self.to_html()
+
+    def to_html(self) -> str:
+        """Returns the table as HTML, as notebooks show it."""
+        table = "" if self.best is None else html_table(self._rows()) + f"<p>{self._best()}</p>"
+        return f"<p>{self._head()}</p>{table}"

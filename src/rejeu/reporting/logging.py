@@ -1,15 +1,17 @@
-"""Logging of metrics to console, CSV and TensorBoard."""
+"""Logging of metrics: to console, CSV, JSON lines and TensorBoard, and to the trackers of :mod:`rejeu.reporting.trackers`."""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import os
 import secrets
 import socket
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,7 +20,12 @@ import numpy as np
 from rejeu.errors import MissingExtra
 from rejeu.io import atomic
 from rejeu.io.failed_writes import FailedWrites
+from rejeu.reporting import trackers
 from rejeu.reporting.notebook import Display
+from rejeu.reporting.trackers import Background, MLflow, Tracker, Trackio, WandB
+
+LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
+"""What the argument ``log`` takes."""
 
 
 class Sink(Protocol):
@@ -152,24 +159,63 @@ class CsvFile:
             file.write(content)
 
 
+class JsonLines:
+    """Appends rows to a file of JSON lines: one object for each row, with ``step`` first. NaN and infinities are null.
+
+    Args:
+        path: path of the file.
+        up_to: step up to which the rows of an existing file are kept; None starts an empty file.
+    """
+
+    def __init__(self, path: str | Path, up_to: int | None = None) -> None:
+        self.path = Path(path)
+        kept: list[bytes] = []
+        if up_to is not None and self.path.exists():
+            kept = [line for line in self.path.read_bytes().splitlines(keepends=True) if _has_step(line, up_to)]
+        content = b"".join(kept)
+        if not self.path.exists() or self.path.read_bytes() != content:
+            with atomic.replacing(self.path) as file:
+                file.write(content)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Adds a row.
+
+        Raises:
+            OSError: if writing fails; the file is not changed.
+        """
+        row = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        atomic.append(self.path, (json.dumps({"step": step, **row}, allow_nan=False) + "\n").encode())
+
+    def close(self) -> None:
+        """Does nothing, because rows are not buffered."""
+
+
+def _has_step(line: bytes, up_to: int) -> bool:
+    """Returns whether a line of JSON is complete and of a step up to ``up_to``."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    step = row.get("step") if isinstance(row, dict) else None
+    return line.endswith(b"\n") and isinstance(step, int) and step <= up_to
+
+
 class TensorBoard:
-    """Writes scalars for TensorBoard into a folder.
+    """Writes scalars for TensorBoard into a folder, and the configuration as text.
 
     Rows are not buffered. TensorBoard's own writer uses a thread, which ends when a write fails and loses the buffered rows.
     """
 
     def __init__(self, folder: str | Path) -> None:
-        try:
-            from tensorboard.compat.proto.event_pb2 import Event
-            from tensorboard.summary.writer.record_writer import RecordWriter
-        except ImportError:
-            raise MissingExtra("tensorboard_log", "tensorboard", "tensorboard") from None
-        self._event, self._record_writer = Event, RecordWriter
+        self._event, self._record_writer = import_tensorboard()
         name = f"events.out.tfevents.{time.time_ns() // 10**9:010d}.{socket.gethostname()}.{os.getpid()}"
         self.path = Path(folder) / f"{name}.{secrets.token_hex(4)}"
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.touch(exist_ok=False)
-        self._append(Event(wall_time=time.time(), file_version="brain.Event:2"))
+        self._append(self._event(wall_time=time.time(), file_version="brain.Event:2"))
 
     def __str__(self) -> str:
         return str(self.path)
@@ -185,6 +231,20 @@ class TensorBoard:
             event.summary.value.add(tag=name, simple_value=value)
         self._append(event)
 
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Writes the configuration as a table, in TensorBoard's tab "Text"."""
+        cells = [(name, str(value).replace("|", "\\|")) for name, value in trackers.flat(config).items()]
+        table = "\n".join(["| name | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in cells)])
+        event = self._event(wall_time=time.time(), step=0)
+        value = event.summary.value.add(tag="config/text_summary")
+        value.metadata.plugin_data.plugin_name = "text"
+        value.tensor.dtype = 7  # DT_STRING
+        value.tensor.string_val.append(table.encode())
+        self._append(event)
+
+    def write_video(self, step: int, path: Path) -> None:
+        """Does nothing, because TensorBoard shows no videos."""
+
     def close(self) -> None:
         """Does nothing, because rows are not buffered."""
 
@@ -192,6 +252,20 @@ class TensorBoard:
         record = io.BytesIO()
         self._record_writer(record).write(event.SerializeToString())
         atomic.append(self.path, record.getvalue())
+
+
+def import_tensorboard() -> tuple[Any, Any]:
+    """Returns TensorBoard's classes of events and of the writer of records.
+
+    Raises:
+        MissingExtra: if it is not installed.
+    """
+    try:
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
+    except ImportError:
+        raise MissingExtra("logging to TensorBoard", "tensorboard", "tensorboard") from None
+    return Event, RecordWriter
 
 
 class Logger:
@@ -243,9 +317,19 @@ class Logger:
 
     def dump(self, step: int = 0) -> None:
         """Writes the recorded metrics as a row, and clears them."""
-        row = self.take()
-        for output in self.outputs if row else ():
-            output.write(step, row)
+        if row := self.take():
+            self.write(step, row)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Writes a row to every output, without what is recorded."""
+        for output in self.outputs:
+            output.write(step, metrics)
+
+    def write_video(self, step: int, path: str | Path) -> None:
+        """Adds a video to the outputs that take videos."""
+        for output in self.outputs:
+            if isinstance(output, Tracker):
+                output.write_video(step, Path(path))
 
     def get_dir(self) -> str | None:
         """Returns the folder of its files."""
@@ -262,23 +346,78 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
 
     Args:
         folder: folder of the files, None for the current folder.
-        format_strings: any of ``"stdout"``, ``"csv"`` (``progress.csv``) and ``"tensorboard"``; None for ``"stdout"``.
+        format_strings: any of ``"stdout"``, ``"csv"`` (``progress.csv``), ``"json"`` (``progress.json``, JSON lines),
+            ``"tensorboard"``, ``"wandb"``, ``"mlflow"`` and ``"trackio"``; None for ``"stdout"``.
 
     Raises:
         ValueError: for another format.
+        MissingExtra: if its package is not installed.
     """
     folder = Path("." if folder is None else folder)
-    outputs: list[Sink] = []
-    for kind in ["stdout"] if format_strings is None else format_strings:
-        if kind == "stdout":
-            outputs.append(Console())
-        elif kind == "csv":
-            outputs.append(CsvFile(folder / "progress.csv"))
-        elif kind == "tensorboard":
-            outputs.append(TensorBoard(folder))
-        else:
-            raise ValueError(f"format_strings contains {kind!r}, expected 'stdout', 'csv' or 'tensorboard'")
-    return Logger(folder, outputs)
+    kinds = ["stdout"] if format_strings is None else check_logs("format_strings", format_strings, ("stdout", *LOGS))
+    return Logger(folder, [Console() if kind == "stdout" else open_log(kind, folder) for kind in kinds])
+
+
+def check_logs(name: str, value: str | Iterable[str], among: Sequence[str] = LOGS) -> tuple[str, ...]:
+    """Returns the names of logs that an argument gives, each once.
+
+    Raises:
+        ValueError: for an unknown one.
+    """
+    kinds = tuple(dict.fromkeys([value] if isinstance(value, str) else value))
+    for kind in kinds:
+        if kind not in among:
+            raise ValueError(f"{name} contains {kind!r}, expected any of {', '.join(map(repr, among))}")
+    return kinds
+
+
+def require(kinds: Iterable[str]) -> None:
+    """Imports what the logs need.
+
+    Raises:
+        MissingExtra: if a package is not installed, with the command that installs it.
+    """
+    imports = {
+        "tensorboard": import_tensorboard,
+        "wandb": trackers.import_wandb,
+        "mlflow": trackers.import_mlflow,
+        "trackio": trackers.import_trackio,
+    }
+    for kind in kinds:
+        if kind in imports:
+            imports[kind]()
+
+
+def open_log(
+    kind: str,
+    folder: Path,
+    name: str | None = None,
+    run_id: str | None = None,
+    stem: str = "progress",
+    up_to: int | None = None,
+) -> Sink:
+    """Returns the output of a name in ``LOGS``.
+
+    Args:
+        kind: the name.
+        folder: folder of its files.
+        name: name of the run in a tracker.
+        run_id: identifies the run in a tracker.
+        stem: name of its file without the suffix.
+        up_to: step up to which the rows of an existing file are kept; None starts an empty file.
+
+    Raises:
+        MissingExtra: if its package is not installed.
+    """
+    if kind == "csv":
+        return CsvFile(folder / f"{stem}.csv", up_to)
+    if kind == "json":
+        return JsonLines(folder / f"{stem}.json", up_to)
+    if kind == "tensorboard":
+        return TensorBoard(folder)
+    if kind == "wandb":
+        return WandB(name, run_id, folder)
+    return MLflow(name, run_id) if kind == "mlflow" else Trackio(name)
 
 
 def _number(key: str, value: Any) -> float:
@@ -309,6 +448,31 @@ class RetryingSink:
         """Writes the metrics of environment step ``step``."""
         self._failed.put(self._what, self.sink.write, step, dict(metrics))
 
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Writes the configuration, if the sink takes one."""
+        if isinstance(self.sink, Tracker):
+            self._failed.attempt(f"configuration in {self.sink}", partial(self.sink.write_config, config))
+
+    def write_video(self, step: int, path: Path) -> None:
+        """Adds a video, if the sink takes any."""
+        if isinstance(self.sink, Tracker):
+            self._failed.attempt(f"videos in {self.sink}", partial(self.sink.write_video, step, path))
+
     def close(self) -> None:
         """Closes the sink."""
         self._failed.attempt(self._what, self.sink.close, retry=False)
+
+
+def guarded(sink: Sink, failed: FailedWrites, closes: bool = False) -> RetryingSink | Background:
+    """Returns a sink whose failures are reported and retried instead of raised.
+
+    Args:
+        sink: the sink.
+        failed: where its failures are reported.
+        closes: of a tracker, whether to close it too; else the thread that writes to it ends, and the run stays open.
+    """
+    if isinstance(sink, RetryingSink | Background):
+        return sink
+    if isinstance(sink, WandB | MLflow | Trackio):
+        return Background(sink, failed, closes)
+    return RetryingSink(sink, failed)

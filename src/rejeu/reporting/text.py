@@ -1,6 +1,9 @@
-"""Formatting of counts."""
+"""Formatting of counts and of tables in notebooks."""
 
 from __future__ import annotations
+
+import html
+from collections.abc import Iterable
 
 
 def counted(n: int, noun: str) -> str:
@@ -10,3 +13,16 @@ def counted(n: int, noun: str) -> str:
     ('1 episode', '1,200 episodes')
     """
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def html_table(rows: Iterable[Iterable[str]]) -> str:
+    """Returns a table whose first row and first column are headings; the text is escaped.
+
+    >>> html_table([["", "mean"], ["<x>", "1"]])
+    '<table><tr><th></th><th>mean</th></tr><tr><th>&lt;x&gt;</th><td>1</td></tr></table>'
+    """
+    lines = []
+    for i, row in enumerate(rows):
+        cells = [(html.escape(cell), "td" if i and j else "th") for j, cell in enumerate(row)]
+        lines.append("".join(f"<{tag}>{cell}</{tag}>" for cell, tag in cells))
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"

@@ -1,0 +1,546 @@
+"""Comparison of runs: groups of several seeds, with curves, final scores and their intervals."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from rejeu.io import atomic
+from rejeu.io.records import shown
+from rejeu.reporting import statistics
+from rejeu.reporting.run_list import read_all
+from rejeu.reporting.runs import Run, flat, text
+from rejeu.reporting.tabular import (
+    cell,
+    csv_text,
+    curve_parts,
+    improvement_row,
+    interval_text,
+    markdown_table,
+    number,
+    without_nan,
+)
+
+if TYPE_CHECKING:
+    from rejeu.reporting.figures import Picture
+
+By = Literal["algorithm", "setting", "env"]
+Axis = Literal["steps", "time"]
+Score = Literal["training", "evaluation"]
+N_POINTS = 101
+"""Points of a curve."""
+N_LEVELS = 101
+"""Levels of a performance profile."""
+CURVE_SAMPLES = 1000
+"""Most bootstrap samples of a curve, whose interval is only drawn."""
+SMOOTHING = 0.05
+"""Width of the moving mean of a curve, as a share of what is compared."""
+FINAL = 0.1
+"""Share of training, at its end, whose episodes make the final score."""
+FORMATS = ("md", "csv", "json", "png", "html")
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """The runs that are averaged."""
+
+    label: str
+    env_id: str
+    """The environment; several where scores are normalized."""
+    runs: tuple[Run, ...]
+    scores: tuple[np.ndarray, ...]
+    """Final scores of the runs, one array for each environment."""
+    run_scores: tuple[float, ...]
+    """The same, in the order of ``runs``."""
+    score: tuple[float, float, float]
+    """Interquartile mean of the final scores, and the bounds of its interval."""
+    mean: float
+    median: float
+    curve: np.ndarray
+    """``(3, N_POINTS)``: the statistic at each point, and the bounds of its interval; NaN before the first episodes."""
+    x: np.ndarray
+    """``(N_POINTS,)``: steps or seconds; the share of training where environments are mixed."""
+    profile: np.ndarray
+    """``(3, N_LEVELS)``: share of runs whose final score is above each level, and the bounds of its interval."""
+    levels: np.ndarray
+    reached: tuple[int, float, float]
+    """Number of runs that reached the threshold, the median of the steps (or seconds) that this took, infinite where half of
+    the runs did not, and the threshold."""
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The probability that a run of one group scores higher than a run of another."""
+
+    label: str
+    other: str
+    env_id: str
+    probability: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison:
+    """What :func:`compare` returns. ``print`` and notebooks show it as a table."""
+
+    groups: tuple[Group, ...]
+    improvements: tuple[Improvement, ...]
+    by: By
+    axis: Axis
+    score: Score
+    statistic: str
+    notes: tuple[str, ...]
+    """What was left out, cut or not comparable, one line each."""
+
+    @property
+    def definition(self) -> str:
+        """What the final score is."""
+        if self.score == "evaluation":
+            return "final score: mean return of the last evaluation"
+        return f"final score: mean return of the training episodes in the last {FINAL:.0%} of what is compared"
+
+    def table(self) -> list[dict[str, Any]]:
+        """Returns one row for each group, ready for ``pandas.DataFrame``."""
+        return [
+            {
+                "group": group.label,
+                "env": group.env_id,
+                "runs": len(group.runs),
+                "iqm": group.score[0],
+                "iqm_low": group.score[1],
+                "iqm_high": group.score[2],
+                "mean": group.mean,
+                "median": group.median,
+                "threshold": group.reached[2],
+                "reached": group.reached[0],
+                f"{self.axis}_to_threshold": group.reached[1],
+            }
+            for group in self.groups
+        ]
+
+    def to_markdown(self) -> str:
+        """Returns the tables and the notes as Markdown."""
+        head = ["group", "environment", "runs", "IQM (95 % interval)", "mean", "median", f"{self.axis} to threshold"]
+        rows = [
+            [
+                group.label,
+                group.env_id,
+                str(len(group.runs)),
+                f"{number(group.score[0])} ({number(group.score[1])} to {number(group.score[2])})",
+                number(group.mean),
+                number(group.median),
+                f"{number(group.reached[1])} to {number(group.reached[2])} ({group.reached[0]} of {len(group.runs)})",
+            ]
+            for group in self.groups
+        ]
+        parts = [markdown_table(head, rows), self.definition]
+        if self.improvements:
+            names = ["group", "better than", "environment", "probability of improvement (95 % interval)"]
+            parts.append(markdown_table(names, [improvement_row(one) for one in self.improvements]))
+        return (
+            "\n\n".join([*parts, *([] if not self.notes else ["\n".join(f"- {cell(one)}" for one in self.notes)])])
+            + "\n"
+        )
+
+    def to_csv(self) -> str:
+        """Returns :meth:`table` as CSV."""
+        return csv_text(self.table())
+
+    def curves_csv(self) -> str:
+        """Returns the curves as CSV, one row for each point of each group."""
+        names = ("value", "low", "high")
+        return csv_text(
+            {"group": group.label, "env": group.env_id, self.axis: x, **dict(zip(names, point, strict=True))}
+            for group in self.groups
+            for x, point in zip(group.x.tolist(), group.curve.T.tolist(), strict=True)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns everything as JSON values, except that unknown numbers are NaN."""
+        return {
+            "by": self.by,
+            "axis": self.axis,
+            "score": self.definition,
+            "curves": self.statistic,
+            "groups": [
+                {
+                    **row,
+                    "paths": [str(run.path) for run in group.runs],
+                    "seeds": [run.seed for run in group.runs],
+                    "scores": [one.tolist() for one in group.scores],
+                    "curve": {"x": group.x.tolist(), **curve_parts(group.curve)},
+                    "profile": {"levels": group.levels.tolist(), **curve_parts(group.profile)},
+                }
+                for row, group in zip(self.table(), self.groups, strict=True)
+            ],
+            "improvements": [vars(one) for one in self.improvements],
+            "notes": list(self.notes),
+        }
+
+    def to_json(self) -> str:
+        """Returns everything as JSON; unknown numbers are null."""
+        return json.dumps(without_nan(self.to_dict()), indent=1, allow_nan=False) + "\n"
+
+    def plot(self, path: str | Path | None = None) -> Picture:
+        """Returns a matplotlib figure of the curves; ``path`` is a file to write it to.
+
+        Raises:
+            MissingExtra: if matplotlib is not installed.
+        """
+        from rejeu.reporting.plots import comparison
+
+        return comparison.plot(self, path)
+
+    def to_html(self) -> str:
+        """Returns a page with interactive curves, which needs no network.
+
+        Raises:
+            MissingExtra: if plotly or jinja2 is not installed.
+        """
+        from rejeu.reporting import comparison_page
+
+        return comparison_page.render(self)
+
+    def save(self, path: str | Path) -> list[Path]:
+        """Writes a file in the format of its suffix, or all formats into a folder; returns the paths.
+
+        Raises:
+            ValueError: for another suffix.
+            MissingExtra: if a package for the format is not installed.
+        """
+        path = Path(path)
+        suffix = path.suffix.lower().removeprefix(".")
+        if suffix in FORMATS and not path.is_dir():
+            self._write(path, suffix)
+            return [path]
+        if suffix and not path.is_dir():
+            raise ValueError(f"{path.name!r} must end in {', '.join(FORMATS)}, or be a folder")
+        paths = [path / f"compare.{suffix}" for suffix in FORMATS]
+        for one, suffix in zip(paths, FORMATS, strict=True):
+            self._write(one, suffix)
+        curves = path / "curves.csv"
+        write_text(curves, self.curves_csv())
+        return [*paths, curves]
+
+    def _write(self, path: Path, suffix: str) -> None:
+        if suffix == "png":
+            self.plot(path)
+            return
+        texts = {"md": self.to_markdown, "csv": self.to_csv, "json": self.to_json, "html": self.to_html}
+        write_text(path, texts[suffix]())
+
+    def __repr__(self) -> str:
+        lines = [
+            f"{group.label} on {group.env_id or 'an unknown environment'}: {interval_text(group)}"
+            for group in self.groups
+        ]
+        return "\n".join([*lines, self.definition, *(f"note: {one}" for one in self.notes)])
+
+    def _repr_html_(self) -> str:
+        from rejeu.reporting.comparison_page import table_html
+
+        return table_html(self)
+
+
+def compare(
+    runs: str | Path | Run | Iterable[str | Path | Run],
+    by: By | None = None,
+    *,
+    x: Axis = "steps",
+    score: Score = "training",
+    statistic: Literal["iqm", "mean", "median"] = "iqm",
+    normalize: Literal["range"] | Mapping[str, tuple[float, float]] | None = None,
+    threshold: float | None = None,
+    samples: int = 2000,
+    seed: int = 0,
+) -> Comparison:
+    """Compares groups of runs; several seeds of the same experiment are one group.
+
+    Curves are moving means of the training returns. They and the final scores have 95 % intervals from a bootstrap that is
+    stratified by environment. All runs of an environment are cut to the shortest of them.
+
+    Args:
+        runs: run folders, folders of run folders, or what other programs wrote; see :func:`rejeu.reporting.run_list.read_all`.
+        by: what makes a group: ``"algorithm"``, ``"setting"`` (the hyperparameters in which the runs differ) or ``"env"``. By
+            default the first of these in which the runs differ.
+        x: ``"steps"`` or ``"time"``, the training time in seconds.
+        score: what the final score of a run is: ``"training"``, the mean return of the episodes in the last tenth, or
+            ``"evaluation"``, the mean return of the last evaluation.
+        statistic: statistic of the curves over the runs.
+        normalize: puts scores of several environments on one scale, so that they can be averaged: ``"range"`` from the lowest
+            to the highest final score of each environment, or two reference returns by environment, which become 0 and 1.
+        threshold: return that counts as learned; by default the mean final score of the weakest group.
+        samples: number of bootstrap samples.
+        seed: seed of the bootstrap.
+
+    Raises:
+        ValueError: if there is nothing to compare, or an argument is invalid.
+        FileNotFoundError: if a path holds no run.
+    """
+    if by not in (None, "algorithm", "setting", "env") or x not in ("steps", "time"):
+        raise ValueError(f"by={by!r} must be 'algorithm', 'setting' or 'env', and x={x!r} 'steps' or 'time'")
+    if score not in ("training", "evaluation") or statistic not in statistics.STATISTICS:
+        raise ValueError(
+            f"score={score!r} must be 'training' or 'evaluation', and statistic={statistic!r} 'iqm', 'mean' or 'median'"
+        )
+    found, notes = read_all(runs)
+    curves = [Curve.of(run, x, score) for run in found]
+    notes += [one.problem for one in curves if one.problem]
+    curves = [one for one in curves if not one.problem]
+    if not curves:
+        raise ValueError(f"there is nothing to compare; {'; '.join(notes)[:500] or 'no run was given'}")
+    cut_to_shortest(curves, x, notes)
+    kind, labels = group_labels([one.run for one in curves], by)
+    for one, label in zip(curves, labels, strict=True):
+        one.label = label
+    envs = sorted({one.env for one in curves})
+    if normalize is not None:
+        scale(curves, normalize)
+    elif len(envs) > 1 and kind != "env":
+        notes.append(
+            f"the runs are of {len(envs)} environments; each has rows of its own, because their returns cannot be averaged; "
+            "normalize them (--normalize range, or --reference ENV=LOW,HIGH) to average"
+        )
+    return summarize(curves, kind, x, score, statistic, normalize is not None, threshold, samples, seed, notes)
+
+
+class Curve:
+    """The returns of one run over steps or time. Mutable while a comparison is made."""
+
+    def __init__(self, run: Run, x: np.ndarray, y: np.ndarray, problem: str = "") -> None:
+        self.run, self.x, self.y, self.problem = run, x, y, problem
+        self.env = env_label(run)
+        self.label = ""
+        self.end = float(x[-1]) if len(x) else 0.0
+        self.evaluation: tuple[np.ndarray, np.ndarray] | None = None
+
+    @classmethod
+    def of(cls, run: Run, axis: Axis, score: Score) -> Curve:
+        """Returns the curve of a run, or one with a ``problem``."""
+        name = run.name
+        if len(run.episodes):
+            x, y = (run.episodes.step if axis == "steps" else run.episodes.seconds), run.episodes.returns
+        else:  # of a run that is in progress or crashed only the means are known
+            x = run.metrics.column("step" if axis == "steps" else "time/time_elapsed")
+            y = run.metrics.column("rollout/ep_rew_mean")
+        known = np.isfinite(x) & np.isfinite(y)
+        x, y = x[known], y[known]
+        if not len(x) or x[-1] <= 0:
+            return cls(run, x[:0], y[:0], f"{name} has no episode yet and is left out")
+        curve = cls(run, x, y)
+        if score == "evaluation":
+            table = run.evaluations
+            when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
+            good = np.isfinite(when) & np.isfinite(value)
+            if not good.any():
+                return cls(run, x[:0], y[:0], f"{name} has no evaluation and is left out")
+            curve.evaluation = when[good], value[good]
+        return curve
+
+    def mean_between(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Returns the mean return of the episodes that ended in each interval ``(low, high]``.
+
+        Where there is none, the return of the last one before it; NaN before the first.
+        """
+        sums = np.concatenate([[0.0], np.cumsum(self.y)])
+        first, last = (np.searchsorted(self.x, bound, "right") for bound in (low, high))
+        first = np.where(first == last, np.maximum(last - 1, 0), first)
+        with np.errstate(invalid="ignore"):
+            return (sums[last] - sums[first]) / np.where(last > first, last - first, np.nan)
+
+    def points(self) -> np.ndarray:
+        """Returns the smoothed curve, ``(N_POINTS,)``."""
+        grid = np.linspace(0, self.end, N_POINTS)
+        return self.mean_between(grid - SMOOTHING * self.end, grid)
+
+    def final(self) -> float:
+        """Returns the final score."""
+        if self.evaluation is not None:
+            when, value = self.evaluation
+            return float(value[max(int(np.searchsorted(when, self.end, "right")) - 1, 0)])
+        return float(self.mean_between(np.array([(1 - FINAL) * self.end]), np.array([self.end]))[0])
+
+
+def cut_to_shortest(curves: list[Curve], axis: Axis, notes: list[str]) -> None:
+    """Cuts the curves of each environment to the shortest of them, and notes it if they differ by more than a tenth."""
+    for env, group in itertools.groupby(sorted(curves, key=lambda one: one.env), key=lambda one: one.env):
+        members = list(group)
+        shortest = min(members, key=lambda one: one.end)
+        longest = max(one.end for one in members)
+        if shortest.end < (1 - FINAL) * longest:
+            unit = axis if axis == "steps" else "seconds"
+            notes.append(
+                f"the runs on {env or 'the environment'} have between {shortest.end:,.0f} and {longest:,.0f} {unit}; all are "
+                f"compared up to those of {shortest.run.name} ({shortest.run.state})"
+            )
+        for one in members:
+            one.end = shortest.end
+
+
+def group_labels(runs: Sequence[Run], by: By | None) -> tuple[By, list[str]]:
+    """Returns what makes a group, and the label of the group of each run."""
+    labels: dict[By, list[str]] = {
+        "algorithm": [run.algorithm or run.path.parent.name for run in runs],
+        "setting": settings(runs),
+        "env": [env_label(run) for run in runs],
+    }
+    differing = (kind for kind in labels if len({*labels[kind]}) > 1)
+    chosen: By = by if by is not None else next(differing, "algorithm")
+    return chosen, labels[chosen]
+
+
+def settings(runs: Sequence[Run]) -> list[str]:
+    """Returns for each run the algorithm and the settings in which the runs differ."""
+    values = [dict(flat(run.hyperparameters)) | {"n_envs": run.n_envs} for run in runs]
+    written = [{name: text(value) for name, value in one.items()} for one in values]
+    names = sorted({name for one in written for name in one})
+    differing = [name for name in names if len({one.get(name, "") for one in written}) > 1]
+    labels = []
+    for run, one in zip(runs, written, strict=True):
+        parts = [run.algorithm or run.path.parent.name, *(f"{name}={one[name]}" for name in differing if name in one)]
+        labels.append(shown(", ".join(parts), 200))
+    return labels
+
+
+def env_label(run: Run) -> str:
+    """Returns the environment of a run with its keyword arguments."""
+    kwargs = ", ".join(f"{name}={text(value)}" for name, value in sorted(run.env_kwargs.items()))
+    return shown(f"{run.env_id}({kwargs})" if kwargs else run.env_id, 200)
+
+
+def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, float]]) -> None:
+    """Scales the returns of each environment.
+
+    Raises:
+        ValueError: if an environment has no reference returns, or they are equal.
+    """
+    finals: dict[str, list[float]] = {}
+    for one in curves:
+        finals.setdefault(one.env, []).append(one.final())
+    for one in curves:
+        if isinstance(normalize, Mapping):
+            if one.env not in normalize:
+                raise ValueError(
+                    f"normalize has no reference returns for {one.env!r}; add {{{one.env!r}: (low, high)}}"
+                )
+            low, high = normalize[one.env]
+        elif normalize == "range":
+            low, high = min(finals[one.env]), max(finals[one.env])
+        else:
+            raise ValueError(f"normalize={normalize!r} must be 'range' or a mapping of environments to (low, high)")
+        if isinstance(normalize, Mapping) and not high > low:
+            raise ValueError(f"normalize[{one.env!r}]={(low, high)} must be two returns, the lower first")
+        span = (high - low) or 1.0
+        one.y = (one.y - low) / span
+        if one.evaluation is not None:
+            one.evaluation = one.evaluation[0], (one.evaluation[1] - low) / span
+
+
+def summarize(
+    curves: Sequence[Curve],
+    by: By,
+    axis: Axis,
+    score: Score,
+    statistic: str,
+    mixes: bool,
+    threshold: float | None,
+    samples: int,
+    seed: int,
+    notes: list[str],
+) -> Comparison:
+    """Returns the comparison of prepared curves; ``mixes`` averages over environments."""
+    keyed: dict[tuple[str, str], list[Curve]] = {}
+    for one in curves:
+        keyed.setdefault(("" if mixes and by != "env" else one.env, one.label), []).append(one)
+    rng = np.random.default_rng(seed)
+    groups = []
+    finals = {key: strata([(one.env, one.final()) for one in members]) for key, members in keyed.items()}
+    draws = {key: statistics.draw(scores, samples, rng) for key, scores in finals.items()}
+    for key in sorted(keyed):
+        peers = [finals[other] for other in keyed if other[0] == key[0]]
+        level = min(float(statistics.mean(one)) for one in peers) if threshold is None else threshold
+        everything = np.concatenate([one for scores in peers for one in scores])
+        levels = np.linspace(everything.min(), everything.max(), N_LEVELS)
+        groups.append(
+            make_group(key, keyed[key], finals[key], draws[key], levels, level, statistic, mixes and by != "env")
+        )
+    pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
+    improvements = [compared(*pair, finals, draws) for pair in pairs if len({len(finals[one]) for one in pair}) == 1]
+    single = [group.label for group in groups if len(group.runs) == 1]
+    if single:
+        notes.append(
+            f"{len(single)} of {len(groups)} groups have one run, so that their intervals say nothing about luck"
+        )
+    return Comparison(tuple(groups), tuple(improvements), by, axis, score, statistic, tuple(notes))
+
+
+def strata(pairs: Iterable[tuple[str, Any]]) -> tuple[np.ndarray, ...]:
+    """Returns values by environment, one array for each."""
+    found: dict[str, list[Any]] = {}
+    for env, value in pairs:
+        found.setdefault(env, []).append(value)
+    return tuple(np.array(found[env]) for env in sorted(found))
+
+
+def make_group(
+    key: tuple[str, str],
+    members: Sequence[Curve],
+    scores: tuple[np.ndarray, ...],
+    draws: list[np.ndarray],
+    levels: np.ndarray,
+    threshold: float,
+    statistic: str,
+    mixed: bool,
+) -> Group:
+    """Returns a group with its statistics."""
+    function = statistics.STATISTICS[statistic]
+    samples = statistics.resampled(scores, draws)
+    points = [one.points() for one in members]
+    curves = strata(list(zip([one.env for one in members], points, strict=True)))
+    grid = np.linspace(0, 1 if mixed else members[0].end, N_POINTS)
+    times = []
+    for one, values in zip(members, points, strict=True):
+        over = np.flatnonzero(values >= threshold)
+        times.append(over[0] / (N_POINTS - 1) * one.end if len(over) else np.inf)
+    low, high = statistics.interval(statistics.iqm(samples))
+    with np.errstate(invalid="ignore"):  # points before the first episode
+        band = statistics.interval(function(statistics.resampled(curves, [rows[:CURVE_SAMPLES] for rows in draws])))
+        middle = function(curves)
+    return Group(
+        label=key[1],
+        env_id=key[0] or ", ".join(sorted({one.env for one in members})),
+        runs=tuple(one.run for one in members),
+        scores=scores,
+        run_scores=tuple(one.final() for one in members),
+        score=(float(statistics.iqm(scores)), float(low), float(high)),
+        mean=float(statistics.mean(scores)),
+        median=float(statistics.median(scores)),
+        curve=np.stack([middle, *band]),
+        x=grid,
+        profile=np.stack([statistics.above(scores, levels), *statistics.interval(statistics.above(samples, levels).T)]),
+        levels=levels,
+        reached=(int(np.isfinite(times).sum()), float(np.sort(times)[len(times) // 2]), threshold),
+    )
+
+
+def compared(one: tuple[str, str], other: tuple[str, str], finals: Any, draws: Any) -> Improvement:
+    """Returns the probability of improvement of the better of two groups over the other, with its interval."""
+    probability = float(statistics.improvement(finals[one], finals[other]))
+    if probability < 0.5:
+        one, other, probability = other, one, 1 - probability
+    samples = [statistics.resampled(finals[key], draws[key]) for key in (one, other)]
+    low, high = statistics.interval(statistics.improvement(*samples))
+    return Improvement(one[1], other[1], one[0], probability, float(low), float(high))
+
+
+def write_text(path: Path, content: str) -> None:
+    """Writes a text file atomically."""
+    with atomic.replacing(path) as file:
+        file.write(content.encode())

@@ -1,0 +1,353 @@
+"""Curves and histograms of a report as plain data: smoothed and binned here, so that pages stay small and quick."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rejeu.reporting.runs import Episodes, Run
+from rejeu.reporting.tables import Table
+
+MAX_DOTS = 1500
+"""Most episodes that are drawn one by one; more are binned."""
+MAX_POINTS = 400
+"""Most points of a curve, and bins of episodes."""
+BARS = 30
+"""Bars of a histogram."""
+LISTED = 40
+"""Most episodes that are listed behind a bar."""
+MAX_METRICS = 60
+"""Most metrics that are drawn."""
+DIGITS = 6
+"""Significant digits of the numbers in a page."""
+HUGE = 1e100
+"""Magnitude from which a return is taken for damage."""
+NORMAL = 1.959964
+"""Half-width of the central 95 % of a standard normal distribution."""
+
+Series = dict[str, Any]
+"""A curve: kind, name, color, x (steps), t (minutes) and y, with low and high for a band or error bars."""
+
+
+class Binned(NamedTuple):
+    """A series of episodes, smoothed for drawing."""
+
+    step: np.ndarray
+    minutes: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    """Lower end of the 95 % confidence interval of the mean."""
+    high: np.ndarray
+    spread: tuple[np.ndarray, np.ndarray] | None
+    """The 5 % and 95 % quantiles of each bin; None where all episodes are drawn."""
+
+
+def plain(values: Iterable[float] | np.ndarray) -> list[float | None]:
+    """Returns numbers for JSON: rounded, with None for those that are not finite.
+
+    >>> plain([1.23456789, float("nan")])
+    [1.23457, None]
+    """
+    return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in np.asarray(values).tolist()]
+
+
+def usable(values: np.ndarray) -> np.ndarray:
+    """Returns which numbers can be drawn, ``bool (n,)``."""
+    return np.abs(values) < HUGE
+
+
+def steps(values: Iterable[float] | np.ndarray) -> list[int]:
+    """Returns steps for JSON."""
+    return np.asarray(values, np.float64).astype(np.int64).tolist()
+
+
+def window_of(n: int) -> int:
+    """Returns the number of episodes that a point of a smoothed curve averages.
+
+    >>> [window_of(n) for n in (4, 100, 1500, 1_000_000)]
+    [3, 20, 50, 2500]
+    """
+    return math.ceil(n / MAX_POINTS) if n > MAX_DOTS else min(max(n // 5, 3), 50)
+
+
+def smooth(episodes: Episodes, values: np.ndarray, is_rate: bool = False) -> Binned:
+    """Returns the means of one column with 95 % confidence intervals, those of rates after Wilson.
+
+    Up to ``MAX_DOTS`` episodes get a moving average, more are averaged in bins of equally many. NaN is ignored.
+    """
+    known = usable(values)
+    step, seconds, values = episodes.step[known], episodes.seconds[known], values[known]
+    window = window_of(len(values))
+    if len(values) <= MAX_DOTS:
+        count = np.minimum(np.arange(1, len(values) + 1), window).astype(float)
+        mean, square = (moving_sum(part, window) / count for part in (values, values**2))
+        at: Any = thinned(len(values))
+        parts = (step, seconds, mean, np.maximum(square - mean**2, 0.0), count)
+        step, seconds, mean, variance, count = (part[at] for part in parts)
+        spread = None
+    else:
+        edges = np.linspace(0, len(values), MAX_POINTS + 1).astype(int)
+        rows = [values[start:end] for start, end in pairwise(edges)]
+        count = np.diff(edges).astype(float)
+        mean, variance = (np.array([function(row) for row in rows]) for function in (np.mean, np.var))
+        low, high = np.array([np.quantile(row, (0.05, 0.95)) for row in rows]).T
+        step, seconds, spread = step[edges[1:] - 1], seconds[edges[1:] - 1], (low, high)
+    low, high = wilson(mean, count) if is_rate else normal(mean, variance, count)
+    return Binned(step, seconds / 60, mean, low, high, spread)
+
+
+def moving_sum(values: np.ndarray, window: int) -> np.ndarray:
+    """Returns the sum of each value and up to ``window - 1`` values before it."""
+    sums = np.cumsum(values)
+    sums[window:] -= sums[:-window].copy()
+    return sums
+
+
+def normal(mean: np.ndarray, variance: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of the interval of a mean, from the normal distribution."""
+    half = NORMAL * np.sqrt(variance / np.maximum(count - 1, 1))
+    return mean - half, mean + half
+
+
+def wilson(rate: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of Wilson's interval of a rate.
+
+    >>> [round(float(end), 3) for end in wilson(np.array([1.0]), np.array([20.0]))[0]]
+    [0.839]
+    """
+    square = NORMAL**2
+    center = (rate + square / (2 * count)) / (1 + square / count)
+    half = NORMAL / (1 + square / count) * np.sqrt(rate * (1 - rate) / count + square / (4 * count**2))
+    return np.clip(center - half, 0, 1), np.clip(center + half, 0, 1)
+
+
+def thinned(n: int, most: int = MAX_POINTS) -> np.ndarray:
+    """Returns up to ``most`` row numbers, evenly spaced, with the first and the last."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else np.zeros(0, int)
+
+
+def series(kind: str, name: str, color: str, step: Any, minutes: Any, y: Any = (), **more: Any) -> Series:
+    """Returns a series for JSON."""
+    own = {key: plain(value) if isinstance(value, np.ndarray) else value for key, value in more.items()}
+    return {
+        "kind": kind,
+        "name": name,
+        "color": color,
+        "x": steps(step),
+        "t": plain(minutes),
+        "y": plain(y),
+        **own,
+    }
+
+
+def fit(values: np.ndarray, further: np.ndarray) -> list[float | None] | None:
+    """Returns the range of an axis that shows all but the extreme half percent of values, and all further ones."""
+    values, further = values[usable(values)], further[usable(further)]
+    shown = np.concatenate([np.quantile(values, (0.005, 0.995)) if len(values) else [], further])
+    if not len(shown):
+        return None
+    margin = 0.06 * (np.ptp(shown) or max(abs(shown[0]), 1.0))
+    return plain(np.array([shown.min() - margin, shown.max() + margin]))
+
+
+def episode_chart(run: Run, column: str) -> dict[str, Any] | None:
+    """Returns the chart of returns, successes or lengths over training; None without any number."""
+    values = getattr(run.episodes, {"return": "returns"}.get(column, column))
+    known, is_rate = usable(values), column == "success"
+    evaluated = evaluation_points(run, column)
+    if not known.any() and evaluated is None:
+        return None
+    found: list[Series] = []
+    if known.any():
+        curve = smooth(run.episodes, values, is_rate)
+        at = curve.step, curve.minutes
+        if is_rate:
+            pass
+        elif curve.spread is None:
+            where = run.episodes.step[known], run.episodes.seconds[known] / 60
+            found.append(series("dots", "episodes", "dots", *where, values[known]))
+        else:
+            low, high = curve.spread
+            found.append(series("band", "5 % to 95 % of episodes", "dots", *at, low=low, high=high))
+        found.append(series("band", "95 % interval", "line", *at, low=curve.low, high=curve.high))
+        found.append(series("line", f"mean of {window_of(int(known.sum())):,} episodes", "line", *at, curve.mean))
+    if evaluated is not None:
+        found.append(evaluated)
+    own = np.array(
+        [] if evaluated is None else [y for end in ("y", "low", "high") for y in evaluated[end] if y is not None]
+    )
+    return {
+        "y": {"return": "return", "success": "success rate", "length": "steps"}[column],
+        "percent": is_rate,
+        "range": [-0.03, 1.03] if is_rate else fit(values, own),
+        "series": found,
+        "note": binned_note(int(known.sum())),
+    }
+
+
+def binned_note(n: int) -> str:
+    """Returns how many episodes a point of a binned curve stands for; empty if all are drawn."""
+    if n <= MAX_DOTS:
+        return ""
+    return f"{n:,} episodes, averaged in {MAX_POINTS} bins of about {round(n / MAX_POINTS):,}"
+
+
+def evaluation_points(run: Run, column: str) -> Series | None:
+    """Returns the evaluations as points with error bars, where their interval is known; None if there are none."""
+    name = {"return": "mean_return", "success": "success_rate", "length": "mean_length"}[column]
+    table = run.evaluations
+    mean = table.column(name)
+    at = np.flatnonzero(usable(mean))
+    if not len(at):
+        return None
+    at = at[thinned(len(at))]
+    low, high = interval(table, column)
+    where = table.column("step")[at], table.column("seconds")[at] / 60
+    return series("points", "evaluation", "accent", *where, mean[at], low=low[at], high=high[at])
+
+
+def interval(table: Table, column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of the 95 % intervals of evaluations; NaN where unknown.
+
+    Student's t for mean returns, Wilson's score for success rates.
+    """
+    n = table.column("episodes")
+    n = np.where(n >= 1, n, np.nan)
+    if column == "success":
+        rate = table.column("success_rate")
+        return wilson(np.where((rate >= 0) & (rate <= 1), rate, np.nan), n)
+    mean = table.column("mean_return" if column == "return" else "mean_length")
+    if column == "length" or not len(mean):
+        return np.full(len(mean), np.nan), np.full(len(mean), np.nan)
+    from scipy import special  # scipy.stats takes much longer to import
+
+    n = np.where(n >= 2, n, np.nan)
+    half = special.stdtrit(n - 1, 0.975) * np.abs(table.column("std_return")) / np.sqrt(n - 1)
+    return mean - half, mean + half
+
+
+GROUPS = ("Losses", "Exploration", "Other metrics")
+"""Headings of the charts of metrics."""
+EXPLORATION = ("entropy", "ent_coef", "epsilon", "exploration", "noise", "std", "sigma", "temperature", "beta")
+SHARES = {"env": "environment", "replay": "replay buffer", "update": "update", "rest": "rest"}
+LEFT_OUT = {
+    "rollout/ep_len_mean",
+    "rollout/ep_rew_mean",
+    "rollout/ep_rew_best",
+    "rollout/success_rate",
+    "train/n_updates",
+}
+"""Metrics that are drawn elsewhere, or say nothing."""
+
+
+def group_of(name: str) -> str:
+    """Returns the heading under which a metric is drawn.
+
+    >>> group_of("train/critic_loss"), group_of("train/ent_coef"), group_of("train/q_value")
+    ('Losses', 'Exploration', 'Other metrics')
+    """
+    last = name.rpartition("/")[2].lower()
+    if "loss" in last:
+        return GROUPS[0]
+    return GROUPS[1] if any(word in last for word in EXPLORATION) else GROUPS[2]
+
+
+def metric_charts(run: Run) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+    """Returns name and chart of every metric with a finite value, by heading."""
+    found: dict[str, list[tuple[str, dict[str, Any]]]] = {group: [] for group in GROUPS}
+    names = [name for name in run.metrics.columns if name != "step" and not name.startswith("time/")]
+    speed = [name for name in ("time/fps",) if name in run.metrics.columns]
+    for name in [*(name for name in names if name not in LEFT_OUT), *speed][:MAX_METRICS]:
+        values = run.metrics.columns[name]
+        at = np.flatnonzero(usable(values))
+        if len(at):
+            found[group_of(name)].append((name, metric_chart(run.metrics, values, at)))
+    return {group: charts for group, charts in found.items() if charts}
+
+
+def metric_chart(table: Table, values: np.ndarray, at: np.ndarray) -> dict[str, Any]:
+    """Returns the chart of one metric at the rows ``at``; of many rows the mean, least and highest of each bin."""
+    step, minutes = table.column("step"), table.column("time/time_elapsed") / 60
+    note = ""
+    if len(at) <= MAX_POINTS:
+        kind = "line" if len(at) > 1 else "points"
+        found = [series(kind, "", "line", step[at], minutes[at], values[at])]
+    else:
+        rows = np.array_split(at, MAX_POINTS)
+        last = np.array([row[-1] for row in rows])
+        mean, low, high = (np.array([f(values[row]) for row in rows]) for f in (np.mean, np.min, np.max))
+        found = [
+            series("band", "range", "line", step[last], minutes[last], low=low, high=high),
+            series("line", "mean", "line", step[last], minutes[last], mean),
+        ]
+        note = f"{len(at):,} values, averaged in {MAX_POINTS} bins"
+    return {
+        "y": "",
+        "percent": False,
+        "range": fit(values[at], np.zeros(0)),
+        "series": found,
+        "note": note,
+        "small": True,
+    }
+
+
+def time_chart(table: Table) -> dict[str, Any] | None:
+    """Returns the shares of time as stacked areas; None if they are unknown."""
+    shares = {name: table.column(f"time/{name}_share") for name in SHARES}
+    known = np.flatnonzero(np.isfinite(list(shares.values())).all(0))
+    if not len(known):
+        return None
+    at = known[thinned(len(known), MAX_POINTS // 2)]
+    where = table.column("step")[at], table.column("time/time_elapsed")[at] / 60
+    found = [
+        series("area", SHARES[name], f"area{i}", *where, np.clip(shares[name][at], 0, 1))
+        for i, name in enumerate(SHARES)
+    ]
+    return {"y": "", "percent": True, "range": [0, 1], "series": found, "note": ""}
+
+
+def histogram(
+    values: np.ndarray, columns: Mapping[str, np.ndarray], command: str = "", listed: int = LISTED
+) -> dict[str, Any] | None:
+    """Returns the histogram of returns, with the episodes behind each bar; None without any return.
+
+    The bars cover all but the extreme half percent, which the first and the last bar contain too.
+
+    Args:
+        values: returns of the episodes, ``(n,)``.
+        columns: what is listed of each episode, by name, ``(n,)``.
+        command: how to see the episode of seed ``N``, if the columns contain seeds.
+        listed: most episodes of a bar that are listed, evenly spaced in time.
+    """
+    known = np.flatnonzero(usable(values))
+    if not len(known):
+        return None
+    low, high = np.quantile(values[known], (0.005, 0.995)) if len(known) > 400 else np.array([0, 0])
+    if low == high:
+        low, high = values[known].min(), values[known].max()
+    if low == high:
+        low, high = low - 0.5, high + 0.5
+    n_bars = min(BARS, max(round(2 * math.sqrt(len(known))), 5))
+    edges = np.linspace(low, high, n_bars + 1)
+    bar = np.clip(np.searchsorted(edges, values[known], "right") - 1, 0, n_bars - 1)
+    order = np.argsort(bar, kind="stable")
+    counts = np.bincount(bar, minlength=n_bars)
+    ends = np.cumsum(counts)
+    rows = []
+    for i in range(n_bars):
+        members = known[order[ends[i] - counts[i] : ends[i]]]
+        chosen = members[thinned(len(members), listed)]
+        rows.append([plain(row) for row in np.array([column[chosen] for column in columns.values()]).T])
+    return {
+        "edges": plain(edges),
+        "counts": counts.tolist(),
+        "columns": [*columns],
+        "rows": rows,
+        "least": plain([values[known].min()])[0],
+        "most": plain([values[known].max()])[0],
+        "command": command,
+    }

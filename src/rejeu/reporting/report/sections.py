@@ -1,0 +1,343 @@
+"""What a report says of each run, as texts for the templates and data for the script."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rejeu.io.records import shown
+from rejeu.reporting.report import curves, videos
+from rejeu.reporting.runs import Run, flat
+from rejeu.reporting.text import counted
+
+LAST = 100
+"""Training episodes that stand in for a final evaluation."""
+MAX_EVALUATIONS = 200
+"""Most rows of the table of evaluations."""
+MAX_SETTINGS = 300
+STATES = {
+    "running": "running",
+    "finished": "finished",
+    "interrupted": "interrupted",
+    "crashed": "crashed",
+    "unknown": "state unknown",
+}
+MINUS = "\N{MINUS SIGN}"
+
+
+class Tile(NamedTuple):
+    """A figure of the headline."""
+
+    title: str
+    value: str
+    note: str = ""
+    more: str = ""
+
+
+class Parts(NamedTuple):
+    """The content of a page."""
+
+    runs: list[dict[str, Any]]
+    """For the template."""
+    data: dict[str, Any]
+    """For the script."""
+
+
+def title_of(runs: Sequence[Run]) -> str:
+    """Returns the title of a page."""
+    if len(runs) > 1:
+        return f"{len(runs)} runs"
+    return f"{runs[0].env_id or runs[0].name}, {runs[0].algorithm or 'unknown algorithm'}"
+
+
+def build(runs: Sequence[Run], folder: Path | None) -> Parts:
+    """Returns the content of a report; ``folder`` as for :func:`rejeu.reporting.report.render`."""
+    with np.errstate(all="ignore"):  # files may hold any number
+        return build_all(runs, folder)
+
+
+def build_all(runs: Sequence[Run], folder: Path | None) -> Parts:
+    """Returns the content of a report."""
+    parts, budget = [], videos.BUDGET
+    charts: dict[str, Any] = {}
+    histograms: dict[str, Any] = {}
+    for i, run in enumerate(runs):
+        own_charts, groups = charts_of(run, f"run{i}")
+        charts |= own_charts
+        own = {"episodes": histogram_of(run), "replays": replays_of(run)}
+        histograms |= {f"run{i}-{name}": one for name, one in own.items() if one is not None}
+        found, notes, spent = videos.collect(run, folder, budget)
+        budget -= spent
+        parts.append(describe(run, f"run{i}", groups, found, notes, {name for name, one in own.items() if one}))
+    return Parts(parts, {"charts": charts, "histograms": histograms})
+
+
+def charts_of(run: Run, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Returns the charts of a run by id, and groups of their ids and titles for the template."""
+    charts: dict[str, Any] = {}
+    titles = {"return": "Return", "success": "Success rate", "length": "Episode length"}
+    curve_ids = []
+    for column, title in titles.items():
+        chart = curves.episode_chart(run, column)
+        if chart is not None:
+            charts[f"{prefix}-{column}"] = chart
+            curve_ids.append({"id": f"{prefix}-{column}", "title": title, "note": chart["note"]})
+    groups = [{"title": "Learning curves", "charts": curve_ids}] if curve_ids else []
+    for group, found in curves.metric_charts(run).items():
+        entries = []
+        for name, chart in found:
+            key = f"{prefix}-metric{len(charts)}"
+            charts[key] = chart
+            entries.append({"id": key, "title": shown(name), "note": chart["note"]})
+        groups.append({"title": group, "charts": entries})
+    shares = curves.time_chart(run.metrics)
+    if shares is not None:
+        charts[f"{prefix}-time"] = shares
+        entry = {"id": f"{prefix}-time", "title": "Shares of the time", "note": "update includes compilation"}
+        groups.append({"title": "Time", "charts": [entry]})
+    return charts, groups
+
+
+def histogram_of(run: Run) -> dict[str, Any] | None:
+    """Returns the histogram of the training episodes."""
+    episodes = run.episodes
+    columns = {
+        "episode": np.arange(1, len(episodes) + 1),
+        "step": episodes.step,
+        "environment": episodes.env,
+        "return": episodes.returns,
+        "length": episodes.length,
+        "success": episodes.success,
+    }
+    return curves.histogram(episodes.returns, columns)
+
+
+def replays_of(run: Run) -> dict[str, Any] | None:
+    """Returns the histogram of the episodes that the trained agent played from known seeds; None without any."""
+    columns = {name: run.replays.column(name) for name in ("seed", "return", "length", "success")}
+    return curves.histogram(columns["return"], columns, replay_command(run))
+
+
+def describe(
+    run: Run, key: str, groups: list[dict[str, Any]], found: list[videos.Video], notes: list[str], histograms: set[str]
+) -> dict[str, Any]:
+    """Returns what the template shows of a run."""
+    return {
+        "id": key,
+        "name": run.name,
+        "env": run.env_id or "unknown environment",
+        "algorithm": run.algorithm or "unknown algorithm",
+        "state": run.state,
+        "state_text": STATES[run.state],
+        "tiles": tiles(run),
+        "facts": facts(run),
+        "groups": groups,
+        "videos": found,
+        "other_videos": max(len(run.videos) - len(found), 0),
+        "histograms": histograms,
+        "n_episodes": len(run.episodes),
+        "evaluations": evaluation_rows(run),
+        "has_success": bool(np.isfinite(run.evaluations.column("success_rate")).any()),
+        "evaluations_note": evaluations_note(run),
+        "settings": settings(run),
+        "changed": [row for row in hyperparameters(run) if row["changed"]],
+        "unchanged": [row for row in hyperparameters(run) if not row["changed"]],
+        "versions": [(shown(name), shown(value)) for name, value in run.versions.items()],
+        "warnings": [*run.warnings],
+        "notes": [*run.notes, *notes],
+        "command": run.command,
+        "replay_command": f"rejeu report {quoted(run.path)} --replay 100"
+        if run.format == "rejeu" and run.models
+        else "",
+    }
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Returns a number for people: with separators and a typographic minus sign, a dash if it is unknown.
+
+    >>> number(-1234.5), number(math.nan), number(1e12)
+    ('−1,234.50', '–', '1e+12')
+    """
+    if not math.isfinite(value):
+        return "\N{EN DASH}"
+    text = f"{value:,.{digits}f}" if abs(value) < 1e9 else f"{value:.4g}"
+    return text.replace("-", MINUS, 1)
+
+
+def percent(value: float) -> str:
+    """Returns a share as a percentage, a dash if it is unknown."""
+    return f"{number(100 * value, 1)} %" if math.isfinite(value) else "\N{EN DASH}"
+
+
+def between(low: float, high: float, as_text: Any = number) -> str:
+    """Returns an interval, empty if it is unknown."""
+    return f"{as_text(low)} to {as_text(high)}" if math.isfinite(low) and math.isfinite(high) else ""
+
+
+def duration(seconds: float) -> str:
+    """Returns a time in words, a dash if it is unknown.
+
+    >>> duration(75), duration(4000), duration(7.25)
+    ('1 min 15 s', '1 h 6 min', '7.2 s')
+    """
+    if not math.isfinite(seconds) or seconds < 0:
+        return "\N{EN DASH}"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+def tiles(run: Run) -> list[Tile]:
+    """Returns the figures of the headline."""
+    mean, found = run.evaluations.column("mean_return"), []
+    best = best_row(run)
+    if best is not None:
+        found += evaluation_tiles(run, "Best evaluation", best)
+        found += evaluation_tiles(run, "Final evaluation", int(np.flatnonzero(np.isfinite(mean))[-1]))
+    else:
+        found += training_tiles(run)
+    done = f"of {run.steps_asked:,}" if run.steps_asked else ""
+    time = f"of {duration(60 * run.minutes_asked)}" if run.minutes_asked else ""
+    return [
+        *found,
+        Tile("Environment steps", f"{run.steps:,}", done),
+        Tile("Training time", duration(run.seconds), time),
+    ]
+
+
+def best_row(run: Run) -> int | None:
+    """Returns the row of the best evaluation, by success rate and then by mean return; None if there is none."""
+    mean, rate = run.evaluations.column("mean_return"), run.evaluations.column("success_rate")
+    known = np.flatnonzero(np.isfinite(mean)).tolist()
+    return max(known, key=lambda row: (np.nan_to_num(rate[row], nan=-1.0), mean[row]), default=None)
+
+
+def evaluation_tiles(run: Run, title: str, row: int) -> list[Tile]:
+    """Returns the figures of one evaluation: the success rate, if it is known, with the return below, else the return."""
+    table = run.evaluations
+    mean, rate = table.column("mean_return")[row], table.column("success_rate")[row]
+    at = f"step {number(table.column('step')[row], 0)}"
+    low, high = (end[row] for end in curves.interval(table, "return"))
+    interval = between(low, high)
+    if math.isfinite(rate):
+        least, most = (end[row] for end in curves.interval(table, "success"))
+        note = f"success, 95 % interval {between(least, most, percent)}" if math.isfinite(least) else "success"
+        more = f"return {number(mean)}" + (f" ({interval})" if interval else "")
+        return [Tile(f"{title}, {at}", percent(rate), note, more)]
+    note = f"return, 95 % interval {interval}" if interval else "return"
+    return [Tile(f"{title}, {at}", number(mean), note)]
+
+
+def training_tiles(run: Run) -> list[Tile]:
+    """Returns the figures of the last training episodes of a run without evaluations."""
+    returns = run.episodes.returns[-LAST:]
+    returns = returns[np.isfinite(returns)]
+    if not len(returns):
+        return [Tile("Evaluation", "\N{EN DASH}", "none yet")]
+    title = f"Last {counted(len(returns), 'training episode')}"
+    return [Tile(title, number(float(np.mean(returns))), "return; no evaluation yet")]
+
+
+def facts(run: Run) -> list[str]:
+    """Returns the line below the headline."""
+    config = run.config
+    found = [counted(len(run.episodes), "episode")]
+    found += [f"seed {run.seed}"] if run.seed is not None else []
+    found += [f"{counted(run.n_envs, 'environment')} at once"] if run.n_envs else []
+    found += [f"{shown(config['backend'])} backend"] if isinstance(config.get("backend"), str) else []
+    found += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
+    return found
+
+
+def evaluation_rows(run: Run) -> list[dict[str, Any]]:
+    """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
+    table = run.evaluations
+    (low, high), (least, most) = curves.interval(table, "return"), curves.interval(table, "success")
+    best = best_row(run)
+    return [
+        {
+            "step": number(table.column("step")[row], 0),
+            "success": percent(table.column("success_rate")[row]),
+            "success_interval": between(least[row], most[row], percent),
+            "return": number(table.column("mean_return")[row]),
+            "return_interval": between(low[row], high[row]),
+            "deviation": number(table.column("std_return")[row]),
+            "length": number(table.column("mean_length")[row], 1),
+            "episodes": number(table.column("episodes")[row], 0),
+            "time": duration(table.column("seconds")[row]),
+            "best": row == best,
+        }
+        for row in curves.thinned(len(table), MAX_EVALUATIONS).tolist()
+    ]
+
+
+def evaluations_note(run: Run) -> str:
+    """Returns which evaluations are listed; empty if all are."""
+    n = len(run.evaluations)
+    return f"{MAX_EVALUATIONS} of {n:,} evaluations, evenly spaced" if n > MAX_EVALUATIONS else ""
+
+
+def value_text(value: Any) -> str:
+    """Returns a value of a configuration as text; a schedule in words.
+
+    >>> value_text({"schedule": "linear", "start": 0.2, "end": 0.0, "fraction": 1.0}), value_text(None)
+    ('linear: start 0.2, end 0.0, fraction 1.0', 'None')
+    """
+    if isinstance(value, dict) and isinstance(kind := value.get("schedule", value.get("noise")), str):
+        rest = ", ".join(
+            f"{name} {value_text(part)}" for name, part in value.items() if name not in ("schedule", "noise")
+        )
+        return shown(f"{kind}: {rest}", 200)
+    if value is None or isinstance(value, bool):
+        return str(value)
+    return shown(value if isinstance(value, str) else json.dumps(value), 200)
+
+
+def hyperparameters(run: Run) -> list[dict[str, Any]]:
+    """Returns all hyperparameters, and which differ from the default."""
+    return [
+        {
+            "name": shown(name),
+            "value": value_text(value),
+            "changed": name in run.changed,
+            "default": value_text(run.changed[name][1]) if name in run.changed else "",
+        }
+        for name, value in list(flat(run.hyperparameters))[:MAX_SETTINGS]
+    ]
+
+
+def settings(run: Run) -> list[tuple[str, str]]:
+    """Returns the configuration of the run without the hyperparameters."""
+    hidden = ("hyperparameters", "versions", "env", "algorithm")
+    rows = [
+        (name, value) for name, value in run.config.items() if name not in hidden and value not in (None, {}, [], "")
+    ]
+    return [(shown(name), value_text(value)) for name, value in rows[:MAX_SETTINGS]]
+
+
+def replay_command(run: Run) -> str:
+    """Returns the command that shows episodes of the trained agent; empty if there is no model."""
+    if run.format != "rejeu" or not run.models:
+        return ""
+    which = "" if "best.safetensors" in run.models else " --which last"
+    return f"rejeu watch {quoted(run.path)}{which} --seed N --episodes 1"
+
+
+def quoted(path: Path) -> str:
+    """Returns a path for a shell, relative to the current folder if it is inside."""
+    import shlex
+
+    here = Path.cwd()
+    text = str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+    text = shown(text, 500)
+    if os.name == "nt":
+        return f'"{text}"' if " " in text else text
+    return shlex.quote(text)

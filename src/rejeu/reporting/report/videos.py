@@ -1,0 +1,96 @@
+"""The videos of a report: a few are embedded within a budget, the others are linked."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+from rejeu.io.records import shown
+from rejeu.reporting.runs import Run
+from rejeu.reporting.tables import read_bytes
+
+BUDGET = 5 * 2**19
+"""Bytes of videos in a page; in base64 they take a third more."""
+BEST = "video.mp4"
+
+
+class Video(NamedTuple):
+    """A video as a page shows it."""
+
+    title: str
+    name: str
+    source: str
+    """A data URL, empty if it is not embedded."""
+    link: str
+    """A relative link, empty if there is none."""
+    step: int | None
+    """Environment step of the policy, None if unknown."""
+    megabytes: float
+
+
+def collect(run: Run, folder: Path | None, budget: int) -> tuple[list[Video], list[str], int]:
+    """Returns first, last and best video of a run, notes on damaged ones, and the bytes that were embedded.
+
+    Args:
+        run: the run.
+        folder: where the page will be, for relative links; None for no links.
+        budget: most bytes to embed.
+    """
+    during = [path for path in run.videos if path.name != BEST]
+    best = [path for path in run.videos if path.name == BEST]
+    chosen = [(path, "Best model") for path in best]
+    chosen += [(path, "Last") for path in during[-1:]] + [(path, "First") for path in during[:-1][:1]]
+    found, notes, spent = [], [], 0
+    for path, title in chosen:
+        try:
+            size = path.stat().st_size
+            content = read_bytes(path, min(size, budget - spent + 1))
+        except OSError as error:
+            notes.append(f"{shown(path.name)} cannot be read: {shown(error.strerror or error)}")
+            continue
+        if content[4:8] != b"ftyp":
+            notes.append(f"{shown(path.name)} is no mp4 video")
+            continue
+        source = ""
+        if size <= budget - spent:
+            source = "data:video/mp4;base64," + base64.b64encode(content).decode("ascii")
+            spent += size
+        step = step_of(path)
+        label = title if step is None or title == "Best model" else f"{title} (step {step:,})"
+        found.append(Video(label, shown(path.name), source, link_to(path, folder), step, size / 2**20))
+    return in_order(found), notes, spent
+
+
+def in_order(videos: Iterable[Video]) -> list[Video]:
+    """Returns the first video, the last, and the best."""
+    return sorted(videos, key=lambda video: ("First", "Last", "Best").index(video.title.split()[0]))
+
+
+def step_of(path: Path) -> int | None:
+    """Returns the step in the name of a video, None if there is none.
+
+    >>> step_of(Path("step_000001500.mp4"))
+    1500
+    """
+    found = re.fullmatch(r"step_(\d{1,15})\.mp4", path.name)
+    return int(found[1]) if found else None
+
+
+def link_to(path: Path, folder: Path | None) -> str:
+    """Returns a relative link to a file, empty if there is none.
+
+    >>> link_to(Path("/runs/a/javascript:x.mp4"), Path("/runs"))
+    './a/javascript%3Ax.mp4'
+    """
+    if folder is None:
+        return ""
+    try:
+        relative = Path(os.path.relpath(path, folder.resolve()))
+    except ValueError:  # on another drive
+        return ""
+    return "./" + quote(relative.as_posix().encode("utf-8", "surrogateescape"))

@@ -1,0 +1,132 @@
+"""Finding runs: of rejeu, of Stable-Baselines3 and RL Zoo, and TensorBoard files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from rejeu.io.records import shown
+from rejeu.reporting import foreign
+from rejeu.reporting.runs import CONFIG, EPISODES, METRICS, Run, is_file, read_run
+
+MAX_DEPTH = 4
+"""Levels of folders that are searched for runs."""
+MAX_RUNS = 10_000
+SKIPPED = {"checkpoints", "videos", "films", "node_modules", "__pycache__"}
+
+
+def read(path: str | Path, table_only: bool = False) -> Run:
+    """Returns the run in a folder, or of a ``monitor.csv``, whichever program wrote it.
+
+    Args:
+        path: a run folder of rejeu, a folder with ``monitor.csv`` or TensorBoard files, or a ``monitor.csv``.
+        table_only: read of the episodes only what comparisons need: step, return and time.
+
+    Raises:
+        FileNotFoundError: if there is no run.
+        ValueError: if a file is not what its name says.
+    """
+    path = Path(path)
+    if path.is_file() and foreign.MONITOR.fullmatch(path.name):
+        return foreign.read_monitor(path)
+    if not path.is_dir() or is_ours(path):
+        return read_run(path, ("step", "return", "seconds") if table_only else None)
+    if foreign.monitor_files(path):
+        return foreign.read_monitor(path)
+    if foreign.event_files(path):
+        return foreign.read_tensorboard(path)
+    return read_run(path)
+
+
+def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list[Run], list[str]]:
+    """Returns the runs of several paths, and notes about what could not be read.
+
+    A folder that is no run itself is searched for run folders.
+
+    Raises:
+        FileNotFoundError: if a path does not exist, or holds no run.
+    """
+    found: list[Path | Run] = []
+    notes: list[str] = []
+    seen = set()
+    for one in [paths] if isinstance(paths, str | Path | Run) else paths:
+        if isinstance(one, Run):
+            found.append(one)
+            continue
+        inside = find(Path(one))
+        if not inside:
+            raise FileNotFoundError(
+                f"{shown(one, 300)} holds no run; expected a run folder of rejeu train, a monitor.csv or TensorBoard files"
+            )
+        for path in inside:
+            if (resolved := path.resolve()) in seen:
+                continue
+            seen.add(resolved)
+            found.append(path)
+    runs = []
+    with ThreadPoolExecutor(2) as pool:  # NumPy computes outside of Python's lock
+        for run in pool.map(read_or_note, found):
+            if isinstance(run, str):
+                notes.append(run)
+                continue
+            runs.append(run)
+            notes += [f"{run.name}: {note}" for note in run.notes if "damaged" in note]
+    return runs, notes
+
+
+def read_or_note(path: Path | Run) -> Run | str:
+    """Returns a run as comparisons need it, or a note if it cannot be read."""
+    try:
+        return path if isinstance(path, Run) else read(path, table_only=True)
+    except (OSError, ValueError) as error:
+        return shown(f"{path} is left out: {error}", 300)
+
+
+def find(path: Path) -> list[Path]:
+    """Returns the runs at or below a path, sorted; symbolic links below it are not followed.
+
+    Raises:
+        FileNotFoundError: if the path does not exist.
+    """
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise FileNotFoundError(f"there is no run folder {shown(path, 300)}")
+    found: list[Path] = []
+    level = [path]
+    for _ in range(MAX_DEPTH + 1):
+        below: list[Path] = []
+        for folder in level:
+            if is_run(folder):
+                found.append(folder)
+            else:
+                below += subfolders(folder)
+        level = below[: MAX_RUNS * 2]
+    return sorted(found)[:MAX_RUNS]
+
+
+def subfolders(folder: Path) -> list[Path]:
+    """Returns the folders in a folder that may hold runs."""
+    try:
+        inside = sorted(folder.iterdir())
+    except OSError:
+        return []
+    return [
+        one
+        for one in inside
+        if one.name not in SKIPPED and one.name[0] != "." and not one.is_symlink() and one.is_dir()
+    ]
+
+
+def is_ours(folder: Path) -> bool:
+    """Returns whether a folder is one of ``rejeu train``."""
+    return any(is_file(folder / name) for name in (CONFIG, EPISODES, METRICS))
+
+
+def is_run(folder: Path) -> bool:
+    """Returns whether a folder is a run of any known program."""
+    try:
+        return is_ours(folder) or bool(foreign.monitor_files(folder) or foreign.event_files(folder))
+    except OSError:
+        return False

@@ -1,0 +1,386 @@
+"""Run folders as records that reports and comparisons are made from.
+
+Everything in a run folder is untrusted: sizes are bounded, symbolic links are not followed, nothing is imported or
+evaluated, and whatever is missing or damaged becomes a note. A folder can be read while it is being written.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+import stat
+import time
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from rejeu.io.records import Malformed, parse_json, shown
+from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
+
+RENAMED = {
+    "time/seconds": "time/time_elapsed",
+    "time/steps_per_second": "time/fps",
+    "train/exploration_rate": "rollout/exploration_rate",
+}
+"""Names of metrics in older run folders, and their present names."""
+CONFIG, EPISODES, METRICS, EVALUATIONS = "config.json", "episodes.csv", "metrics.csv", "evaluations.csv"
+REPLAYS = "replays.csv"
+"""Episodes of the trained agent from known seeds, which ``rejeu report --replay`` writes."""
+WARNINGS = "warnings.txt"
+"""Warnings of the training, and the error that ended it, one a line."""
+MAX_CONFIG_BYTES = 2**20
+MAX_WARNINGS = 100
+MAX_WARNINGS_BYTES = 2**16
+MAX_VIDEOS = 1000
+MAX_NAME = 200
+"""Upper limit on the length of a name or an id, in characters."""
+MAX_STEP = 2**53
+"""Upper limit on environment steps; larger numbers are damage."""
+RECENT = 60.0
+"""Seconds since the last write up to which a run without a lock counts as running."""
+
+State = Literal["running", "finished", "interrupted", "crashed", "unknown"]
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Episodes of training, in the order in which they ended; arrays ``float64 (n_episodes,)``."""
+
+    step: np.ndarray
+    """Environment steps, over all environments, at the end of the episode; never decreases."""
+    env: np.ndarray
+    returns: np.ndarray
+    """NaN where the file had no finite number."""
+    length: np.ndarray
+    success: np.ndarray
+    """1 for a success, 0 for none, NaN where unknown."""
+    seconds: np.ndarray
+    """Training time at the end of the episode."""
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+
+NO_EPISODES = Episodes(*[np.zeros(0)] * 6)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """What is known of one run; see :func:`read_run`."""
+
+    path: Path
+    name: str
+    format: Literal["rejeu", "monitor", "tensorboard"] = "rejeu"
+    """Which program's files they are: ``"monitor"`` are Stable-Baselines3's ``monitor.csv``."""
+    algorithm: str = ""
+    """Empty if unknown."""
+    env_id: str = ""
+    """Empty if unknown."""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    seed: int | None = None
+    n_envs: int | None = None
+    config: Mapping[str, Any] = field(default_factory=dict)
+    """The content of ``config.json``: JSON values, not checked."""
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    """All hyperparameters, as JSON values."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    state: State = "unknown"
+    steps: int = 0
+    """Environment steps done."""
+    steps_asked: int | None = None
+    """Environment steps to do; None if unknown, or if the run is limited by ``minutes_asked``."""
+    minutes_asked: float | None = None
+    seconds: float = math.nan
+    """Training time so far."""
+    episodes: Episodes = NO_EPISODES
+    evaluations: Table = EMPTY
+    """Columns ``step``, ``seconds``, ``success_rate``, ``mean_return``, ``std_return``, ``mean_length``, ``episodes``,
+    ``best``."""
+    metrics: Table = EMPTY
+    """Columns ``step``, ``rollout/...``, ``time/...``, ``train/...``."""
+    replays: Table = EMPTY
+    """Columns ``seed``, ``return``, ``length``, ``success``: episodes of the trained agent, each from its seed."""
+    warnings: tuple[str, ...] = ()
+    videos: tuple[Path, ...] = ()
+    """Paths of mp4 files inside the folder, oldest first; the video of the best model is last."""
+    models: tuple[str, ...] = ()
+    """Names of the model files, ``best.safetensors`` first."""
+    notes: tuple[str, ...] = ()
+    """One line for each thing that was missing or damaged."""
+
+    @cached_property
+    def changed(self) -> dict[str, tuple[Any, Any]]:
+        """Value and default of each hyperparameter that differs from the algorithm's default, by dotted name.
+
+        Empty if the algorithm is none of rejeu's.
+        """
+        defaults = default_hyperparameters(self.algorithm)
+        if not defaults:
+            return {}
+        default, value = dict(flat(defaults)), dict(flat(self.hyperparameters))
+        return {name: (value[name], default.get(name)) for name in value if value[name] != default.get(name)}
+
+    @cached_property
+    def command(self) -> str:
+        """The command that repeats the run, made from its configuration; empty if that is not known."""
+        if self.format != "rejeu" or not (self.config and self.env_id and self.algorithm):
+            return ""
+        config = self.config
+        words = ["rejeu", "train", text(config.get("env_argument")) or self.env_id, "--algo", self.algorithm]
+        limit = ["--minutes", f"{self.minutes_asked:g}"] if self.minutes_asked else ["--steps", str(self.steps_asked)]
+        words += limit if self.minutes_asked or self.steps_asked else []
+        options = {"seed": self.seed, "envs": self.n_envs, "backend": config.get("backend")}
+        options |= {name: config.get(name) for name in ("evaluate_every", "evaluate_episodes", "success_threshold")}
+        for name, value in options.items():
+            words += [] if value is None else [f"--{name.replace('_', '-')}", text(value)]
+        if self.env_kwargs:
+            words += ["--env-kwargs", *(f"{name}={text(value)}" for name, value in self.env_kwargs.items())]
+        if self.changed:
+            words += ["--set", *(f"{name}={text(value)}" for name, (value, _) in self.changed.items())]
+        return shlex.join(shown(word, 1000) for word in words)
+
+
+def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
+    """Returns what is known of the run in a folder that ``rejeu train`` wrote or is writing.
+
+    Args:
+        path: the folder.
+        columns: of the table of episodes, for speed; None for all. The others are NaN.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or it holds nothing of a run.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no run folder {shown(folder, 300)}")
+    folder = folder.resolve()
+    if not any((folder / name).is_file() for name in (CONFIG, EPISODES, METRICS, EVALUATIONS)):
+        raise FileNotFoundError(f"{shown(folder, 300)} is no run folder: it holds no {CONFIG}")
+    config, notes = read_config(folder / CONFIG)
+    metrics, evaluations = (ordered(read_table(folder / name)) for name in (METRICS, EVALUATIONS))
+    metrics = statistics_rows(metrics)
+    table = ordered(read_table(folder / EPISODES, columns))
+    replays = read_table(folder / REPLAYS) if is_file(folder / REPLAYS) else EMPTY
+    names = ("step", "env", "return", "length", "success", "seconds")
+    episodes = Episodes(*(table.column(name) for name in names))
+    for part in (table, metrics, evaluations, replays):
+        notes += part.notes
+    steps = max((int(part.column("step")[-1]) for part in (table, metrics, evaluations) if len(part)), default=0)
+    seconds = [
+        *table.column("seconds")[-1:],
+        *metrics.column("time/time_elapsed")[-1:],
+        *evaluations.column("seconds")[-1:],
+    ]
+    asked = whole(config.get("steps"), 1), positive(config.get("minutes"))
+    total = max((one for one in seconds if math.isfinite(one)), default=math.nan)
+    models = tuple(name for name in ("best.safetensors", "agent.safetensors") if is_file(folder / name))
+    return Run(
+        path=folder,
+        name=shown(folder.name, MAX_NAME),
+        algorithm=text(config.get("algorithm")),
+        env_id=text(config.get("env")),
+        env_kwargs=mapping(config.get("env_kwargs")),
+        seed=whole(config.get("seed")),
+        n_envs=whole(config.get("n_envs"), 1),
+        config=config,
+        hyperparameters=mapping(config.get("hyperparameters")),
+        versions={
+            text(key): text(value) for key, value in mapping(config.get("versions")).items() if value is not None
+        },
+        state=state_of(folder, "agent.safetensors" in models, steps, total, *asked),
+        steps=steps,
+        steps_asked=asked[0],
+        minutes_asked=asked[1],
+        seconds=total,
+        episodes=episodes,
+        evaluations=evaluations,
+        metrics=metrics,
+        replays=replays,
+        warnings=read_warnings(folder / WARNINGS),
+        videos=tuple(find_videos(folder)),
+        models=models,
+        notes=tuple(notes),
+    )
+
+
+def statistics_rows(table: Table) -> Table:
+    """Returns a table of metrics under their present names, without the rows of evaluations, which have no time.
+
+    >>> older = Table({"step": np.arange(2.0), "time/seconds": np.array([0.5, np.nan]), "eval/mean_reward": np.ones(2)})
+    >>> statistics_rows(older).columns
+    {'step': array([0.]), 'time/time_elapsed': array([0.5])}
+    """
+    columns = {RENAMED.get(name, name): values for name, values in table.columns.items()}
+    known = np.isfinite(columns.get("time/time_elapsed", np.zeros(len(table))))
+    return Table({name: values[known] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
+
+
+def read_config(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Returns the content of a ``config.json``, and notes; empty if it is missing or damaged."""
+    try:
+        data = read_bytes(path, MAX_CONFIG_BYTES + 1)
+        if len(data) > MAX_CONFIG_BYTES:
+            raise Malformed(f"it has more than {MAX_CONFIG_BYTES:,} bytes")
+        content = parse_json(data)
+        if not isinstance(content, dict):
+            raise Malformed("it is not a JSON object")
+        if is_deep(content):
+            raise Malformed("it is nested too deeply")
+        return content, []
+    except FileNotFoundError:
+        return {}, [f"there is no {CONFIG}, so the configuration is not known"]
+    except (OSError, Malformed) as error:
+        return {}, [f"{CONFIG} is damaged: {shown(error)}"]
+
+
+def is_deep(value: Any, most: int = 20) -> bool:
+    """Returns whether a JSON value has more than ``most`` levels."""
+    level = [value]
+    for _ in range(most):
+        level = [
+            child
+            for one in level
+            if isinstance(one, dict | list)
+            for child in (one.values() if isinstance(one, dict) else one)
+        ]
+    return bool(level)
+
+
+def ordered(table: Table) -> Table:
+    """Returns a table without the rows whose step is not a valid number, in the order of the steps."""
+    if "step" not in table.columns:
+        return Table({}, table.notes if not len(table) else (*table.notes, "a table lacks the column step"))
+    step = table.columns["step"]
+    columns = {name: np.where(np.isfinite(values), values, np.nan) for name, values in table.columns.items()}
+    notes = table.notes
+    valid = (step >= 0) & (step <= MAX_STEP)
+    if not valid.all():
+        columns = {name: values[valid] for name, values in columns.items()}
+        notes += (f"{np.sum(~valid):,} rows without a valid step were left out",)
+    step = columns["step"]
+    if (np.diff(step) < 0).any():
+        order = np.argsort(step, kind="stable")
+        columns = {name: values[order] for name, values in columns.items()}
+        notes += ("the steps of a table decreased; its rows were sorted",)
+    return Table(columns, notes)
+
+
+def state_of(
+    folder: Path, has_model: bool, steps: int, seconds: float, steps_asked: int | None, minutes_asked: float | None
+) -> State:
+    """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
+    locks = [is_locked(path) for path in (folder / "lock", folder / "checkpoints" / "lock") if is_file(path)]
+    if any(locks) or (not locks and not has_model and is_recent(folder)):
+        return "running"
+    reached_steps = steps_asked is not None and steps >= steps_asked
+    reached_minutes = minutes_asked is not None and seconds >= 0.98 * 60 * minutes_asked
+    if has_model and (reached_steps or reached_minutes):
+        return "finished"
+    return "interrupted" if has_model else "crashed"
+
+
+def is_locked(path: Path) -> bool:
+    """Returns whether another process holds the lock on a file; the file is not changed."""
+    if os.name != "posix":
+        try:
+            with FileLock(path).acquire(timeout=0):
+                return False
+        except Timeout:
+            return True
+        except OSError:
+            return False
+    import fcntl
+
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+
+
+def is_recent(folder: Path) -> bool:
+    """Returns whether a table of a run was written in the last minute."""
+    files = [folder / name for name in (CONFIG, METRICS, EVALUATIONS, EPISODES)]
+    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in files if is_file(path))
+
+
+def read_warnings(path: Path) -> tuple[str, ...]:
+    """Returns the lines of a file of warnings."""
+    try:
+        lines = read_bytes(path, MAX_WARNINGS_BYTES).decode("utf-8", "replace").splitlines()
+    except OSError:
+        return ()
+    return tuple(shown(line, 1000) for line in lines[:MAX_WARNINGS] if line.strip())
+
+
+def find_videos(folder: Path) -> Iterator[Path]:
+    """Yields the mp4 files of a run folder that are not symbolic links and not in linked folders."""
+    for videos in (folder / "videos", folder / "films"):
+        if videos.is_dir() and not videos.is_symlink():
+            found = [
+                path for path in videos.iterdir() if path.suffix == ".mp4" and path.name[0] != "." and is_file(path)
+            ]
+            yield from sorted(found)[:MAX_VIDEOS]
+    if is_file(folder / "video.mp4"):
+        yield folder / "video.mp4"
+
+
+def is_file(path: Path) -> bool:
+    """Returns whether a path inside a run folder is a regular file, and no symbolic link."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode) and not path.parent.is_symlink()
+    except (OSError, ValueError):
+        return False
+
+
+def default_hyperparameters(algorithm: str) -> dict[str, Any]:
+    """Returns the defaults of one of rejeu's algorithms as JSON values; empty for another."""
+    from rejeu.algorithms import a2c, config, crossq, ddpg, dqn, maskable_ppo, ppo, qrdqn, recurrent_ppo, sac, td3, tqc
+
+    modules: tuple[Any, ...] = (a2c, crossq, ddpg, dqn, maskable_ppo, ppo, qrdqn, recurrent_ppo, sac, td3, tqc)
+    kinds = {module.Config.name: module.Config for module in modules}
+    return config.to_json(kinds[algorithm]()) if algorithm in kinds else {}
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the values of nested mappings by dotted name. A schedule is one value."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value and not {"schedule", "noise"} & value.keys():
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def text(value: Any) -> str:
+    """Returns a value of a configuration as short text, empty for None."""
+    if value is None:
+        return ""
+    return shown(value if isinstance(value, str) else json.dumps(value), MAX_NAME)
+
+
+def mapping(value: Any) -> dict[str, Any]:
+    """Returns a value if it is a JSON object, else an empty one."""
+    return value if isinstance(value, dict) else {}
+
+
+def whole(value: Any, least: int = 0) -> int | None:
+    """Returns a value if it is an integer in a sensible range, else None."""
+    return value if type(value) is int and least <= value <= MAX_STEP else None
+
+
+def positive(value: Any) -> float | None:
+    """Returns a value if it is a positive number, else None."""
+    return float(value) if type(value) in (int, float) and 0 < value < 1e9 else None

@@ -1,0 +1,206 @@
+"""Pages about runs: their content, and everything that can be wrong with a run folder. No browser; see test_browser.py."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.cli import main
+from rejeu.loops.run import Episode
+from rejeu.reporting.evaluation import Evaluation
+from rejeu.reporting.report import curves, page, write_report
+from rejeu.reporting.runs import Episodes
+from tests.reporting.report.folders import EVIL, MP4, write, write_hostile
+
+
+@pytest.fixture(autouse=True)
+def small_script(monkeypatch):
+    """Pages without the two megabytes of Plotly."""
+    monkeypatch.setattr(page, "plotly_script", lambda: "plotly")
+
+
+def text_of(*folders, **options):
+    return write_report([*folders], **options).read_text(encoding="utf-8")
+
+
+def data_of(text):
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    return json.loads(found[1])
+
+
+def test_page_of_a_run(tmp_path):
+    folder = write(tmp_path / "run")
+    text = text_of(folder)
+    assert (folder / "report.html").is_file()
+    assert "CartPole-v1" in text
+    assert ">finished<" in text
+    assert "Best evaluation, step 2,000" in text
+    assert "50.0 %" in text
+    assert "return 160.00 (155.68 to 164.32)" in text  # 160 +- 2.093 * 9 / sqrt(19)
+    assert "Final evaluation, step 3,000" in text
+    assert "rejeu train CartPole-v1 --algo DQN --steps 3000 --seed 3" in text
+    assert "default 0.99" in text
+    assert "linear: start 0.001, end 0.0" in text
+    data = data_of(text)
+    assert {"run0-return", "run0-success", "run0-length", "run0-time"} < set(data["charts"])
+    assert sum(data["histograms"]["run0-episodes"]["counts"]) == 60
+
+
+def test_charts_of_metrics_are_grouped(tmp_path):
+    text = text_of(write(tmp_path / "run"))
+    headings = re.findall(r"<h2>(.*?)</h2>", text)
+    assert headings == [
+        *("Learning curves", "Videos", "Evaluations", "Episodes", "Losses", "Exploration", "Time"),
+        *("Configuration", "Repeat this run"),
+    ]
+
+
+def test_several_runs_share_a_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = write_report([write(tmp_path / "a"), write(tmp_path / "b", videos=False)])
+    text = path.read_text(encoding="utf-8")
+    assert path.name == "report.html"
+    assert "2 runs" in text
+    assert {"run0-return", "run1-return"} < set(data_of(text)["charts"])
+
+
+def test_hostile_text_is_escaped_everywhere(tmp_path):
+    text = text_of(write_hostile(tmp_path))
+    assert text.count("<script") == 3  # data, Plotly and the page's own
+    assert EVIL not in text
+    assert "<img" not in text
+    assert "49" not in re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+    assert "{{ 7 * 7 }}{% raw %}" in text
+    assert "secret" not in text
+    assert "video.mp4 is no mp4 video" in text
+    assert "incomplete" in text
+    assert data_of(text)
+
+
+@pytest.mark.parametrize(
+    "missing", ["config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "agent.safetensors", "videos"]
+)
+def test_page_is_complete_without_a_file(tmp_path, missing):
+    folder = write(tmp_path / "run")
+    path = folder / missing
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    text = text_of(folder)
+    assert text.rstrip().endswith("</html>")
+    assert "<h2>Configuration</h2>" in text
+
+
+def test_run_that_crashed_before_the_first_evaluation(tmp_path):
+    folder = write(tmp_path / "run", episodes=0, videos=False)
+    for name in ("evaluations.csv", "metrics.csv", "agent.safetensors"):
+        (folder / name).unlink()
+    (folder / "warnings.txt").write_text("BadEnvironmentError: reward is NaN\n", encoding="utf-8")
+    text = text_of(folder)
+    assert "none yet" in text
+    assert "There is no evaluation yet." in text
+    assert "BadEnvironmentError: reward is NaN" in text
+    assert data_of(text) == {"charts": {}, "histograms": {}}
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        [],
+        {"hyperparameters": 3, "env": {"a": 1}, "versions": [1], "env_kwargs": "x"},
+        {"seed": -1, "n_envs": "many", "steps": 1e300},
+    ],
+)
+def test_page_is_complete_with_a_configuration_of_other_types(tmp_path, config):
+    assert "</html>" in text_of(write(tmp_path / "run", config))
+
+
+def test_deeply_nested_configuration_is_a_note(tmp_path):
+    folder = write(tmp_path / "run")
+    deep = '{"schedule": "x", "a":' * 400 + "1" + "}" * 400
+    (folder / "config.json").write_text(f'{{"hyperparameters": {{"a": {deep}}}, "env": "E"}}', encoding="utf-8")
+    assert "</html>" in text_of(folder)
+
+
+def test_videos_are_embedded_within_the_budget_and_else_linked(tmp_path, monkeypatch):
+    folder = write(tmp_path / "run")
+    (folder / "video.mp4").write_bytes(MP4)
+    monkeypatch.setattr("rejeu.reporting.report.videos.BUDGET", len(MP4) * 2 + 10)
+    text = text_of(folder)
+    assert text.count('src="data:video/mp4;base64,') == 2  # of the best model and the last
+    assert 'href="./videos/step_000001000.mp4"' in text
+    assert re.findall(r"<h3>((?:First|Last|Best).*?)</h3>", text) == [
+        "First (step 1,000)",
+        "Last (step 3,000)",
+        "Best model",
+    ]
+
+
+def test_policy_of_the_page_allows_its_own_scripts_and_no_network(tmp_path):
+    first, second = text_of(write(tmp_path / "a")), text_of(write(tmp_path / "b"))
+    policy = re.search(r'Content-Security-Policy" content="(.*?)"', first)[1].replace("&#39;", "'")
+    assert "default-src 'none'" in policy
+    assert "connect-src 'none'" in policy
+    nonce = re.search(r"'nonce-([\w-]{20,})'", policy)[1]
+    assert f'<script nonce="{nonce}">' in first
+    assert nonce not in second
+
+
+def test_million_episodes_are_binned(tmp_path):
+    n = 1_000_000
+    returns = np.sin(np.arange(n) / n)
+    episodes = Episodes(
+        np.arange(n) * 10.0, np.zeros(n), returns, np.full(n, 10.0), np.full(n, np.nan), np.arange(n) / 1e4
+    )
+    curve = curves.smooth(episodes, returns)
+    assert len(curve.step) == curves.MAX_POINTS
+    np.testing.assert_allclose(curve.mean[0], returns[:2500].mean())
+    histogram = curves.histogram(returns, {"episode": np.arange(n)})
+    assert sum(histogram["counts"]) == n
+    assert max(map(len, histogram["rows"])) == curves.LISTED
+
+
+def test_moving_average_and_its_interval():
+    values = np.array([1.0, 3.0, 2.0, 6.0, np.nan, 4.0])
+    episodes = Episodes(np.arange(6.0), *[np.zeros(6)] * 5)
+    curve = curves.smooth(episodes, values)  # a window of 3
+    np.testing.assert_allclose(curve.mean, [1, 2, 2, 11 / 3, 4])
+    deviation = np.std([2.0, 6.0, 4.0], ddof=1) / np.sqrt(3)
+    np.testing.assert_allclose(curve.high[-1] - curve.mean[-1], 1.959964 * deviation)
+    np.testing.assert_array_equal(curve.step, [0, 1, 2, 3, 5])
+
+
+def test_command_writes_where_asked(tmp_path, capsys):
+    folder = write(tmp_path / "run")
+    assert main(["report", str(folder), "--out", str(tmp_path / "page.html")]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'page.html'}\n"
+    assert (tmp_path / "page.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["report"], "rejeu report needs RUN"),
+        (["report", "nowhere"], "there is no run folder nowhere"),
+        (["report", ".", "--live", "--out", "x.html"], "--live serves the page"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, monkeypatch, capsys, argv, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_page_of_an_agent_without_a_run_folder(tmp_path):
+    agent = rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=64, gamma=0.9, seed=4)
+    assert "0 episodes" in agent.report(tmp_path / "new.html").read_text(encoding="utf-8")
+    for step in (20, 50):
+        agent.history.append(Episode(step, 0, step / 2, 20, np.nan, step / 100))
+    evaluation = Evaluation(np.array([30.0, 32.0]), np.array([30, 32]), np.array([np.nan, np.nan]))
+    text = agent.report(tmp_path / "agent.html", [(50, evaluation)]).read_text(encoding="utf-8")
+    assert "Best evaluation, step 50" in text
+    assert "31.00" in text
+    assert "default 0.99" in text
+    assert sum(data_of(text)["histograms"]["run0-episodes"]["counts"]) == 2
+    assert "rejeu train" not in text  # the run is not repeated by a command

@@ -1,0 +1,208 @@
+"""Comparison of groups of runs."""
+
+import csv
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.reporting.comparison import compare
+
+
+def write_run(folder, algorithm="DQN", env="CartPole-v1", seed=0, level=10.0, steps=1000, every=10, **config):
+    """Writes a run whose return rises linearly over the first half and then stays at ``level``."""
+    folder.mkdir(parents=True)
+    content = {
+        "env": env,
+        "algorithm": algorithm,
+        "seed": seed,
+        "hyperparameters": {"gamma": 0.9},
+        "steps": steps,
+        **config,
+    }
+    (folder / "config.json").write_text(json.dumps(content), encoding="utf-8")
+    step = np.arange(every, steps + 1, every)
+    rows = [f"{x},0,{level * min(2 * x / steps, 1.0)},{every},nan,{x / 100}" for x in step.tolist()]
+    (folder / "episodes.csv").write_text(
+        "\n".join(["step,env,return,length,success,seconds", *rows, ""]), encoding="utf-8"
+    )
+    (folder / "evaluations.csv").write_text(
+        f"step,seconds,success_rate,mean_return\n{steps},9,nan,{level + 1}\n", encoding="utf-8"
+    )
+    (folder / "agent.safetensors").write_bytes(b"")
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for algorithm, base in (("DQN", 10.0), ("PPO", 20.0)):
+        for seed in range(5):
+            write_run(tmp_path / f"{algorithm}_{seed}", algorithm, seed=seed, level=base + seed)
+    return tmp_path
+
+
+def test_two_algorithms(runs):
+    comparison = rejeu.compare(runs, samples=200)
+    assert comparison.by == "algorithm"
+    assert [(group.label, group.env_id, len(group.runs)) for group in comparison.groups] == [
+        ("DQN", "CartPole-v1", 5),
+        ("PPO", "CartPole-v1", 5),
+    ]
+    dqn, ppo = comparison.groups
+    np.testing.assert_allclose(dqn.scores[0], [10, 11, 12, 13, 14])
+    assert dqn.score[0] == pytest.approx(12.0)
+    assert 10 <= dqn.score[1] < 12 < dqn.score[2] <= 14
+    assert (dqn.mean, dqn.median) == pytest.approx((12.0, 12.0))
+    assert dqn.curve[0, -1] == pytest.approx(12.0)
+    assert math.isnan(dqn.curve[0, 0])
+    (improvement,) = comparison.improvements
+    assert (improvement.label, improvement.other, improvement.probability) == ("PPO", "DQN", 1.0)
+    count, steps, level = ppo.reached
+    assert (count, level) == (5, pytest.approx(12.0))
+    assert 200 < steps < 400  # the return of the middle run, 22 at the end, is 12 after 273 steps
+    assert dqn.profile[0, 0] == pytest.approx(0.8)  # four of five are above the lowest score
+    assert comparison.notes == ()
+
+
+def test_curve_is_a_moving_mean_of_the_returns(tmp_path):
+    run = write_run(tmp_path / "run")
+    (group,) = compare([run], samples=10).groups
+    step = np.arange(10, 1001, 10)
+    returns = 10 * np.minimum(2 * step / 1000, 1)
+    for x, value in zip(group.x[2:], group.curve[0, 2:], strict=True):
+        assert value == pytest.approx(returns[(step > x - 50) & (step <= x)].mean())
+
+
+def test_final_score_by_evaluation(runs):
+    comparison = compare(runs, score="evaluation", samples=50)
+    np.testing.assert_allclose(comparison.groups[0].scores[0], [11, 12, 13, 14, 15])
+    assert "last evaluation" in comparison.definition
+
+
+def test_groups_by_the_settings_that_differ(tmp_path):
+    for i, gamma in enumerate((0.9, 0.9, 0.99)):
+        write_run(tmp_path / str(i), seed=i, hyperparameters={"gamma": gamma, "tau": 1.0})
+    comparison = compare(tmp_path, samples=10)
+    assert comparison.by == "setting"
+    assert [(group.label, len(group.runs)) for group in comparison.groups] == [
+        ("DQN, gamma=0.9", 2),
+        ("DQN, gamma=0.99", 1),
+    ]
+    assert "1 of 2 groups have one run" in comparison.notes[0]
+
+
+def test_different_budgets_are_cut_to_the_shortest(tmp_path):
+    write_run(tmp_path / "a", seed=0)
+    write_run(tmp_path / "b", seed=1, steps=500)
+    comparison = compare(tmp_path, samples=10)
+    assert comparison.groups[0].x[-1] == 500
+    assert comparison.notes[0] == (
+        "the runs on CartPole-v1 have between 500 and 1,000 steps; all are compared up to those of b (finished)"
+    )
+
+
+def test_over_time(tmp_path):
+    write_run(tmp_path / "a")
+    assert compare(tmp_path, x="time", samples=10).groups[0].x[-1] == 10.0
+
+
+def test_several_environments_are_not_averaged_unless_normalized(tmp_path):
+    for env, level in (("A-v0", 1.0), ("B-v0", 1000.0)):
+        for algorithm, factor in (("DQN", 1.0), ("PPO", 2.0)):
+            for seed in range(2):
+                write_run(tmp_path / f"{env}{algorithm}{seed}", algorithm, env, seed, level * factor)
+    apart = compare(tmp_path, "algorithm", samples=20)
+    assert [(group.label, group.env_id) for group in apart.groups] == [
+        ("DQN", "A-v0"),
+        ("PPO", "A-v0"),
+        ("DQN", "B-v0"),
+        ("PPO", "B-v0"),
+    ]
+    assert "their returns cannot be averaged" in apart.notes[0]
+    together = compare(tmp_path, "algorithm", normalize="range", samples=20)
+    assert [(group.label, group.score[0]) for group in together.groups] == [("DQN", 0.0), ("PPO", 1.0)]
+    references = {"A-v0": (0.0, 2.0), "B-v0": (0.0, 4000.0)}
+    scaled = compare(tmp_path, "algorithm", normalize=references, samples=20)
+    assert [group.mean for group in scaled.groups] == pytest.approx([0.375, 0.75])
+    with pytest.raises(ValueError, match="has no reference returns for 'B-v0'"):
+        compare(tmp_path, normalize={"A-v0": (0.0, 2.0)})
+
+
+def test_runs_without_episodes_are_left_out(runs):
+    folder = write_run(runs / "crashed", seed=9)
+    (folder / "episodes.csv").unlink()
+    comparison = compare(runs, samples=10)
+    assert comparison.notes == ("crashed has no episode yet and is left out",)
+    assert sum(len(group.runs) for group in comparison.groups) == 10
+    with pytest.raises(ValueError, match="there is nothing to compare; crashed has no episode yet"):
+        compare(folder)
+
+
+def test_run_in_progress_is_compared_by_its_means(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "episodes.csv").unlink()
+    (folder / "metrics.csv").write_text("step,rollout/ep_rew_mean,time/seconds\n500,3,1\n1000,5,2\n", encoding="utf-8")
+    assert compare(folder, samples=10).groups[0].score[0] == 5.0
+
+
+def test_outputs(runs, tmp_path):
+    comparison = compare(runs, samples=20)
+    table = list(csv.DictReader(io.StringIO(comparison.to_csv())))
+    assert [row["group"] for row in table] == ["DQN", "PPO"]
+    assert "| DQN | CartPole-v1 | 5 |" in comparison.to_markdown()
+    content = json.loads(comparison.to_json())
+    assert content["groups"][0]["curve"]["value"][0] is None
+    assert len(list(csv.DictReader(io.StringIO(comparison.curves_csv())))) == 202
+    assert "final score" in repr(comparison)
+    (path,) = comparison.save(tmp_path / "out" / "table.md")
+    assert path.read_text(encoding="utf-8") == comparison.to_markdown()
+    with pytest.raises(ValueError, match=r"'a\.txt' must end in md, csv"):
+        comparison.save(tmp_path / "a.txt")
+
+
+def test_plot(runs, tmp_path):
+    pytest.importorskip("matplotlib")
+    figure = compare(runs, samples=20).plot(tmp_path / "a.png")
+    assert len(figure.axes) == 1
+    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+
+
+HOSTILE = "<script>alert(1)</script>|=cmd()$x_{$"
+
+
+def test_hostile_names_are_escaped(tmp_path):
+    for seed, algorithm in enumerate((HOSTILE, "=1+1")):
+        write_run(tmp_path / str(seed), algorithm, env=HOSTILE, seed=seed)
+    comparison = compare(tmp_path, samples=10)
+    assert "<script" not in comparison._repr_html_()
+    assert "<script" not in comparison.to_markdown().replace("\\<", "")
+    assert "'=1+1" in comparison.to_csv()
+    pytest.importorskip("matplotlib")
+    comparison.plot(tmp_path / "a.png")
+
+
+def test_page(runs):
+    pytest.importorskip("plotly")
+    pytest.importorskip("jinja2")
+    write_run(runs / "hostile", HOSTILE, seed=0)
+    text = compare(runs, samples=20).to_html()
+    assert HOSTILE not in text
+    assert "Probability of improvement" in text
+    assert 'http-equiv="Content-Security-Policy"' in text
+    assert len(text) < 6_000_000
+
+
+@pytest.mark.parametrize("arguments", [{"by": "seed"}, {"x": "epochs"}, {"score": "best"}, {"statistic": "mode"}])
+def test_invalid_arguments(runs, arguments):
+    with pytest.raises(ValueError, match="must be"):
+        compare(runs, **arguments)
+
+
+def test_folder_without_runs(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no run"):
+        compare(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no run folder"):
+        compare(tmp_path / "none")

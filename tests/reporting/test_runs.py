@@ -1,0 +1,168 @@
+"""Run folders as records: complete, partial, damaged and hostile ones."""
+
+import json
+import os
+import sys
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+from rejeu.reporting.runs import read_run
+
+CONFIG = {
+    "env": "CartPole-v1",
+    "algorithm": "DQN",
+    "preset": False,
+    "hyperparameters": {"gamma": 0.9, "batch_size": 32, "policy_kwargs": {"net_arch": [64, 64]}},
+    "seed": 3,
+    "n_envs": 2,
+    "backend": "gymnasium",
+    "steps": 100,
+    "minutes": None,
+    "evaluate_every": 50,
+    "evaluate_episodes": 5,
+    "env_argument": "CartPole-v1",
+    "env_kwargs": {"sutton_barto_reward": True},
+    "versions": {"python": "3.11.7", "envpool": None},
+}
+EPISODES = "step,env,return,length,success,seconds\r\n40,0,20.0,20,nan,0.5\r\n100,1,30.5,30,nan,1.25\r\n"
+EVALUATIONS = "step,seconds,success_rate,mean_return\r\n50,0.7,nan,25.0\r\n"
+METRICS = "step,rollout/ep_rew_mean,train/loss\r\n50,20.0,\r\n90,21.0,0.5\r\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "run"
+    path.mkdir()
+    (path / "config.json").write_text(json.dumps(CONFIG), encoding="utf-8")
+    for name, content in (("episodes", EPISODES), ("evaluations", EVALUATIONS), ("metrics", METRICS)):
+        (path / f"{name}.csv").write_bytes(content.encode())
+    (path / "agent.safetensors").write_bytes(b"")
+    return path
+
+
+def aged(folder):
+    """Makes the files of a folder look an hour old."""
+    for path in folder.iterdir():
+        os.utime(path, (path.stat().st_mtime - 3600,) * 2)
+    return folder
+
+
+def test_complete_run(folder):
+    run = read_run(folder)
+    assert (run.name, run.algorithm, run.env_id, run.seed, run.n_envs) == ("run", "DQN", "CartPole-v1", 3, 2)
+    assert (run.state, run.steps, run.steps_asked, run.seconds) == ("finished", 100, 100, 1.25)
+    np.testing.assert_array_equal(run.episodes.step, [40, 100])
+    np.testing.assert_array_equal(run.episodes.returns, [20.0, 30.5])
+    np.testing.assert_array_equal(run.metrics.column("train/loss"), [np.nan, 0.5])
+    np.testing.assert_array_equal(run.evaluations.column("mean_return"), [25.0])
+    assert run.versions == {"python": "3.11.7"}
+    assert run.notes == ()
+
+
+def test_changed_hyperparameters_and_command(folder):
+    run = read_run(folder)
+    assert run.changed == {"gamma": (0.9, 0.99), "policy_kwargs.net_arch": ([64, 64], None)}
+    assert run.command == (
+        "rejeu train CartPole-v1 --algo DQN --steps 100 --seed 3 --envs 2 --backend gymnasium --evaluate-every 50 "
+        "--evaluate-episodes 5 --env-kwargs sutton_barto_reward=true --set gamma=0.9 'policy_kwargs.net_arch=[64, 64]'"
+    )
+
+
+def test_interrupted_and_crashed_run(folder):
+    (folder / "config.json").write_text(json.dumps({**CONFIG, "steps": 500}), encoding="utf-8")
+    assert read_run(folder).state == "interrupted"
+    (folder / "agent.safetensors").unlink()
+    assert read_run(aged(folder)).state == "crashed"
+
+
+def test_running_run_by_its_lock(folder):
+    (folder / "checkpoints").mkdir()
+    with FileLock(folder / "checkpoints" / "lock"):
+        assert read_run(folder).state == "running"
+    assert read_run(folder).state == "finished"
+
+
+def test_crash_before_the_first_row(folder):
+    for name in ("episodes.csv", "evaluations.csv", "agent.safetensors"):
+        (folder / name).unlink()
+    (folder / "metrics.csv").write_bytes(b"")
+    run = read_run(aged(folder))
+    assert (run.state, run.steps, len(run.episodes), len(run.metrics)) == ("crashed", 0, 0, 0)
+    assert run.notes == ("there is no episodes.csv", "metrics.csv is empty", "there is no evaluations.csv")
+
+
+def test_truncated_and_damaged_rows_are_left_out(folder):
+    content = EPISODES + "x,0,1,1,nan,1\r\n120,0\r\n-5,0,1,1,nan,1\r\n110,0,inf,5,1.0,2.0\r\n130,0,12"
+    (folder / "episodes.csv").write_bytes(content.encode())
+    run = read_run(folder)
+    np.testing.assert_array_equal(run.episodes.step, [40, 100, 110])
+    np.testing.assert_array_equal(run.episodes.returns, [20.0, 30.5, np.nan])
+    assert run.notes == (
+        "the last row of episodes.csv is incomplete and was left out",
+        "left out of episodes.csv: 1 damaged row",
+        "2 rows without a valid step were left out",
+    )
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\xff\xfe\x00", b"[" * 100_000, b"[1]", b'{"env": 1e999}', b'{"a": 1, "a": 2}', b"x" * 2_000_000],
+    ids=["not UTF-8", "deep", "no object", "huge number", "repeated name", "large"],
+)
+def test_damaged_config_becomes_a_note(folder, content):
+    (folder / "config.json").write_bytes(content)
+    run = read_run(folder)
+    assert len(run.episodes) == 2
+    assert run.notes[0].startswith("config.json is damaged: ")
+    assert run.command == ""
+
+
+def test_config_with_values_of_wrong_types(folder):
+    bad = {"env": {"a": 1}, "algorithm": ["<script>"], "seed": "x", "steps": -1, "minutes": True, "hyperparameters": 3}
+    (folder / "config.json").write_text(json.dumps(bad), encoding="utf-8")
+    run = read_run(folder)
+    assert (run.seed, run.steps_asked, run.minutes_asked, run.hyperparameters) == (None, None, None, {})
+    assert run.algorithm == '["<script>"]'
+
+
+def test_tables_that_are_not_text(folder):
+    (folder / "episodes.csv").write_bytes(b"\xff,\xfe\n\x00\x01,1\n" + bytes(range(256)))
+    (folder / "metrics.csv").write_bytes(b"," * 100_000)
+    run = read_run(folder)
+    assert len(run.episodes) == 0
+    assert len(run.metrics) == 0
+    assert run.steps == 50
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights")
+def test_links_out_of_the_folder_are_not_followed(folder, tmp_path):
+    secret = tmp_path / "secret.mp4"
+    secret.write_bytes(b"1")
+    (tmp_path / "secret.csv").write_bytes(EPISODES.encode())
+    (folder / "episodes.csv").unlink()
+    (folder / "episodes.csv").symlink_to(tmp_path / "secret.csv")
+    (folder / "video.mp4").symlink_to(secret)
+    (folder / "videos").mkdir()
+    (folder / "videos" / "step_1.mp4").write_bytes(b"1")
+    (folder / "videos" / "step_2.mp4").symlink_to(secret)
+    (folder / "films").symlink_to(tmp_path)
+    run = read_run(folder)
+    assert run.videos == (folder / "videos" / "step_1.mp4",)
+    assert len(run.episodes) == 0
+    assert "episodes.csv cannot be read: episodes.csv is not a regular file" in run.notes
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_named_pipe_does_not_block(folder):
+    (folder / "metrics.csv").unlink()
+    os.mkfifo(folder / "metrics.csv")
+    assert "metrics.csv cannot be read: metrics.csv is not a regular file" in read_run(folder).notes
+
+
+def test_folder_without_a_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is no run folder"):
+        read_run(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no run folder"):
+        read_run(tmp_path / "none")
