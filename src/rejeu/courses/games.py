@@ -1,0 +1,33 @@
+"""Games in a notebook, which runs on without a display."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from typing import Any
+
+from rejeu.errors import MissingExtra
+
+
+def by_hand(env: str, episodes: int, seed: int | None = None, against: Any = None) -> list[float]:
+    """Opens a window to play an environment by hand, and returns your scores; without a display it prints that and returns.
+
+    Args:
+        env: an id, or Car, Mountain or Lunar.
+        episodes: the window closes after this number of episodes.
+        seed: seed of the first episode; each further one adds one.
+        against: an agent that plays the same episodes next to you. Its scores are printed.
+    """
+    from rejeu.play import play
+
+    if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
+        os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
+    try:
+        game = play(env, episodes=episodes, seed=seed, against=against)
+    except (MissingExtra, OSError) as error:
+        print(error)
+        return []
+    for opponent in game.players[1:]:
+        print(opponent.name, opponent.scores)
+    return game.players[0].scores

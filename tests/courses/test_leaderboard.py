@@ -1,0 +1,131 @@
+"""The leaderboard of a folder of models: ranks, limits, and files that are not what they should be."""
+
+import json
+
+import pytest
+
+import rejeu
+from rejeu.cli import main
+from rejeu.courses import leaderboard
+
+HOSTILE = "<script>alert(1)<_script> | *x*"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with two equal models, one of another environment, and damaged files."""
+    folder = tmp_path_factory.mktemp("class")
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", seed=0)
+    agent.save(folder / "anna")
+    (folder / "second").mkdir()
+    agent.save(folder / "second" / HOSTILE)
+    rejeu.DQN("MlpPolicy", "MountainCar-v0", seed=0).save(folder / "other")
+    data = (folder / "anna.safetensors").read_bytes()
+    (folder / "cut.safetensors").write_bytes(data[: len(data) // 2])
+    (folder / "empty.safetensors").write_bytes(b"")
+    (folder / "flipped.safetensors").write_bytes(data[:-20] + bytes([data[-20] ^ 255]) + data[-19:])
+    (folder / "notes.txt").write_text("not a model", encoding="utf-8")
+    return folder
+
+
+def run(folder, out, *options):
+    return main(["class", str(folder), "--episodes", "3", "--out", str(out), *options])
+
+
+def test_models_are_ranked_and_other_files_get_one_line_each(folder, tmp_path, capsys):
+    assert run(folder, tmp_path / "board.json") == 0
+    out = capsys.readouterr().out
+    assert len(out.splitlines()) == 8  # the environment, six files, the page
+    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    assert board["env_id"] == "CartPole-v1"
+    assert [model["name"] for model in board["models"]] == ["anna", f"second/{HOSTILE}"]
+    assert [model["places"] for model in board["models"]] == [[1, 2], [1, 2]]
+    reasons = {one["name"]: one["reason"] for one in board["not_evaluated"]}
+    assert reasons.keys() == {"cut", "empty", "flipped", "other"}
+    assert reasons["other"] == "it was trained on MountainCar-v0, not on CartPole-v1"
+    assert "checksum" in reasons["flipped"]
+
+
+def test_all_models_play_the_same_episodes(folder, tmp_path):
+    run(folder, tmp_path / "board.json")
+    first, second = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))["models"]
+    assert first["returns"] == second["returns"]
+    assert len(set(first["returns"])) > 1
+
+
+def test_names_are_escaped_in_the_page_and_in_markdown(folder, tmp_path):
+    pytest.importorskip("jinja2")
+    run(folder, tmp_path / "board.html")
+    html = (tmp_path / "board.html").read_text(encoding="utf-8")
+    assert "<script" not in html
+    assert "second/&lt;script&gt;" in html
+    assert "http" not in html.replace('http-equiv="Content-Security-Policy"', "")
+    run(folder, tmp_path / "board.md")
+    row = next(line for line in (tmp_path / "board.md").read_text(encoding="utf-8").splitlines() if "second" in line)
+    assert r"second/&lt;script&gt;alert(1)&lt;\_script&gt; \| \*x\*" in row
+
+
+def test_another_environment_can_be_chosen(folder, tmp_path):
+    run(folder, tmp_path / "board.json", "--env", "MountainCar-v0")
+    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    assert [model["name"] for model in board["models"]] == ["other"]
+
+
+def test_a_model_that_takes_too_long_is_not_ranked(folder, tmp_path):
+    run(folder, tmp_path / "board.json", "--minutes", "0.00001")
+    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    assert not board["models"]
+    assert "it needs more than" in board["not_evaluated"][0]["reason"]
+
+
+def test_a_page_without_models_says_so(folder):
+    pytest.importorskip("jinja2")
+    page = leaderboard.page(leaderboard.Leaderboard("CartPole-v1", 1, (), (("anna", "damaged"),)))
+    assert "No model could be evaluated." in page
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--out", "board.txt"), "--out board.txt must end in .html, .md, .json"),
+        (("--episodes", "0"), "episodes"),
+        (("--minutes", "0"), "minutes"),
+        (("--env", "CartPol-v1"), "CartPole"),
+    ],
+)
+def test_invalid_options_give_one_line(folder, options, message, capsys):
+    assert main(["class", str(folder), *options]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_folder_without_models_gives_one_line(tmp_path, capsys):
+    assert main(["class", str(tmp_path)]) == 2
+    assert "holds no .safetensors files" in capsys.readouterr().err
+    assert main(["class", str(tmp_path / "missing")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+
+
+def test_large_files_and_symbolic_links_are_not_opened(tmp_path, monkeypatch, capsys):
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0)
+    small = agent.save(tmp_path / "small")
+    rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [64, 64]}, seed=0).save(tmp_path / "large")
+    try:
+        (tmp_path / "link.safetensors").symlink_to(small)
+    except OSError:
+        pytest.skip("no symbolic links here")
+    monkeypatch.setattr(leaderboard, "MAX_BYTES", small.stat().st_size)
+    assert run(tmp_path, tmp_path / "board.json") == 0
+    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    assert [model["name"] for model in board["models"]] == ["small"]
+    assert [one["name"] for one in board["not_evaluated"]] == ["large"]
+    assert "MiB at most" in board["not_evaluated"][0]["reason"]
+
+
+def test_json_is_all_of_standard_output(folder, tmp_path, capsys):
+    assert run(folder, tmp_path / "board.md", "--json") == 0
+    printed = capsys.readouterr()
+    board = json.loads(printed.out)
+    assert board.keys() == {"env_id", "episodes", "models", "not_evaluated", "file"}
+    assert "cut: " in printed.err
