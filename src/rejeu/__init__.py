@@ -53,7 +53,9 @@ if TYPE_CHECKING:
     from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
     from rejeu.exploration.parameter_space import ParameterNoise
     from rejeu.reporting import plots
+    from rejeu.reporting.comparison import compare
     from rejeu.reporting.evaluation import Evaluation
+    from rejeu.reporting.report import write_report
     from rejeu.reporting.video import record_video, show_videos
     from rejeu.sb3.common.evaluation import evaluate_policy
     from rejeu.sb3.common.monitor import Monitor
@@ -77,7 +79,9 @@ _MODULES = {
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",
     "rejeu.exploration.parameter_space": "ParameterNoise",
     "rejeu.reporting": "plots",
+    "rejeu.reporting.comparison": "compare",
     "rejeu.reporting.evaluation": "Evaluation",
+    "rejeu.reporting.report": "write_report",
     "rejeu.reporting.video": "record_video show_videos",
     "rejeu.schedules": "Exponential Linear",
 }
@@ -121,6 +125,7 @@ __all__ = [
     "Transition",
     "WorkerError",
     "check_env",
+    "compare",
     "evaluate_policy",
     "load",
     "make_vec",
@@ -129,6 +134,7 @@ __all__ = [
     "record_video",
     "register",
     "show_videos",
+    "write_report",
 ]
 
 if not TYPE_CHECKING:  # type checkers find the names above, and report misspelt ones

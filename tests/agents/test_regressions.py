@@ -153,7 +153,7 @@ from tests.every_agent import KINDS, env_of, small
 from tests.helpers import assert_same_parameters, count_updates, small_sac
 from tests.reporting.test_video import Lamp
 from tests.sharing import shared_learners
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 NEVER = 10**6
 HERE = Path(__file__).parents[1]
@@ -436,6 +436,7 @@ def test_net_arch_none_is_the_default_before_and_after_saving(name):
 # Memory.
 
 
+@exhaustive
 def test_loading_a_hundred_times_keeps_no_memory(tmp_path):
     agent = small_sac(Counter((5,)), learning_starts=NEVER, buffer_size=3000).learn(3000)
     model, buffer = agent.save(tmp_path / "model"), agent.save_replay_buffer(tmp_path / "buffer")

@@ -25,6 +25,7 @@ from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops.run import Episode, Progress
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.history import History
+from rejeu.reporting.logging import Logger
 from tests.environments import Counter
 from tests.helpers import small_sac
 
@@ -47,6 +48,7 @@ def scripted_agent(evaluations):
     saved = []
     agent = SimpleNamespace(env=None, n_envs=1, saved=saved, remember_best=lambda score, by: True)
     agent.failed_writes, agent.snapshot = FailedWrites(), lambda path: lambda: saved.append(path)
+    agent.logger = Logger()
     agent.evaluate = lambda episodes, env, seed: remaining.popleft()
     return agent
 

@@ -16,7 +16,9 @@ import rejeu
 from rejeu.callbacks import Evaluate
 from rejeu.cli import main, one_line, run_folder, settings
 from rejeu.reporting.logging import CsvFile
+from rejeu.reporting.report.page import plotly_script
 from tests.full_disk import FullDisk
+from tests.tiers import exhaustive
 
 FILES = {
     "agent.safetensors",
@@ -27,6 +29,7 @@ FILES = {
     "episodes.csv",
     "evaluations.csv",
     "metrics.csv",
+    "report.html",
     "video.mp4",
 }
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=8", "buffer_size=5000", "learning_starts=50"]
@@ -140,6 +143,7 @@ def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert re.search(r"[\d.]+ s in all, [\d.]+ s of them compiling", text)
 
 
+@exhaustive
 def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "envpool", None)
     assert train(tmp_path / "run", "--seed", "1", steps=60) == 0
@@ -150,6 +154,7 @@ def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_pat
     assert json.loads((tmp_path / "run" / "config.json").read_text())["backend"] == "gymnasium"
 
 
+@exhaustive
 def test_train_stops_after_the_minutes_given(tmp_path):
     out = tmp_path / "run"
     argv = ["train", "Pendulum-v1", "--minutes", "0.01", "--evaluate-episodes", "1", "--out", str(out), "--set", *TINY]
@@ -176,11 +181,14 @@ def test_without_a_name_the_run_folder_is_new_each_time(tmp_path, monkeypatch):
 def test_without_the_video_extra_the_run_goes_on_and_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert train(tmp_path / "run", steps=60) == 0
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    plotly_script.cache_clear()
+    assert train(tmp_path / "run", "--backend", "gymnasium", steps=60) == 0
     text = capsys.readouterr().out
+    assert re.search(r"no report: .*rejeu\[report\]", text)
     assert re.search(r"no curve: .*rejeu\[plot\]", text)
     assert re.search(r"no video: .*rejeu\[video\]", text)
-    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES - {"curve.png", "video.mp4"}
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES - {"curve.png", "report.html", "video.mp4"}
 
 
 def test_evaluate_prints_the_result_and_writes_nothing(run, capsys):
@@ -228,10 +236,10 @@ def test_list_groups_presets_by_environment_in_columns(capsys):
     main(["list"])
     lines = capsys.readouterr().out.partition("environments with")[2].splitlines()[1:]
     rows = [line for line in lines if " steps  " in line]
-    assert len(rows) == len(rejeu.presets.ALL)
+    assert len(rows) == len(rejeu.presets.every())
     assert len({row.index(" steps  ") for row in rows}) == 1
     named = [row.split()[0] for row in rows if not row.startswith("   ")]
-    assert sorted(named) == sorted({preset.env_id for preset in rejeu.presets.ALL})
+    assert sorted(named) == sorted({preset.env_id for preset in rejeu.presets.every()})
 
 
 def test_version_is_printed(capsys):
@@ -273,6 +281,7 @@ def test_set_leaves_the_preset_as_it_was():
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
 
 
+@exhaustive
 def test_set_may_be_given_more_than_once(tmp_path):
     assert train(tmp_path / "run", "--set", "gamma=0.5", steps=60) == 0
     hyperparameters = json.loads((tmp_path / "run" / "config.json").read_text())["hyperparameters"]
@@ -444,6 +453,7 @@ def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
     assert all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
+@exhaustive
 def test_the_best_model_is_kept_when_a_complete_run_is_trained_further(tmp_path, capsys, monkeypatch):
     """The last evaluation of the first part, at step 60, is the best by far and must be remembered."""
     better = iter([10.0, 1.0])
@@ -558,3 +568,21 @@ def test_ctrl_c_saves_everything_and_exits_130(tmp_path):
     steps = rejeu.load(out / "agent.safetensors").num_timesteps
     assert steps >= 500
     assert len(rows(out / "episodes.csv")) == steps // 200
+
+
+def test_report_replays_the_episodes_that_record_and_watch_show(run, tmp_path):
+    folder = shutil.copytree(run, tmp_path / "run")
+    assert main(["report", str(folder), "--replay", "2"]) == 0
+    with (folder / "replays.csv").open(encoding="utf-8") as file:
+        replayed = [float(row["return"]) for row in csv.DictReader(file)]
+    agent, env, returns = rejeu.load(folder), gym.make("Pendulum-v1"), []
+    for seed in range(2):  # as rejeu.record_video plays
+        obs, _ = env.reset(seed=seed)
+        state, total, done = None, 0.0, False
+        while not done:
+            action, state = agent.predict(obs, state, deterministic=True)
+            obs, reward, terminated, truncated, _ = env.step(action)
+            total, done = total + np.float32(reward), terminated or truncated
+        returns.append(total)
+    assert replayed == pytest.approx(returns, abs=1e-3)
+    assert "--seed N --episodes 1" in (folder / "report.html").read_text(encoding="utf-8")

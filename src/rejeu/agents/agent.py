@@ -12,6 +12,7 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy, resume, training
 from rejeu.agents.base import BaseAgent
+from rejeu.agents.record import record
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
 from rejeu.envs.adapters import vec_env_view
@@ -20,6 +21,7 @@ from rejeu.io import checkpoint
 from rejeu.reporting import summary
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.logging import Logger, Sink
+from rejeu.reporting.report import write_page
 
 
 class Agent(BaseAgent):
@@ -47,7 +49,7 @@ class Agent(BaseAgent):
                 A :class:`rejeu.callbacks.TrainingCallback` is also called when training starts and ends, as are those
                 of :mod:`rejeu.sb3.common.callbacks`.
             log_interval: episodes between two rows of statistics.
-            tb_log_name: name of the run in ``tensorboard_log``; None: the algorithm's.
+            tb_log_name: name of the folder of the logs, without its number; None: the algorithm's.
             reset_num_timesteps: count steps from 0 and restart schedules (learning rate, exploration, clip range, beta).
                 With False both continue as in Stable-Baselines3: earlier steps count as done and as part of the total,
                 so ``learn(300, reset_num_timesteps=False)`` after 100 steps moves schedules from 1/4 to the end.
@@ -56,7 +58,8 @@ class Agent(BaseAgent):
             episodes: stop after this number of episodes, over all environments.
             minutes: stop after this wall time. Schedules follow the nearest limit; with ``reset_num_timesteps=False``
                 earlier episodes and training time count as earlier steps do.
-            sinks: further outputs for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)``.
+            sinks: further outputs for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)`` or
+                ``rejeu.reporting.trackers.WandB(project="car")``; they are not closed.
 
         Without any limit, an agent from :meth:`resume` completes the ``learn`` that was interrupted, with the limits and
         the ``log_interval`` of that call.
@@ -154,6 +157,21 @@ class Agent(BaseAgent):
         """
         return policy.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
 
+    def report(self, path: str | Path, evaluations: Iterable[tuple[int, Evaluation]] = ()) -> Path:
+        """Writes a page about the training so far, one HTML file that needs no network, and returns its path.
+
+        A run of ``rejeu train`` has more to show; see :func:`rejeu.write_report`.
+
+        Args:
+            path: of the page.
+            evaluations: ``(step, Evaluation)`` pairs, such as ``Evaluate.results``.
+
+        Raises:
+            MissingExtra: if plotly or jinja2 is not installed.
+        """
+        path = Path(path)
+        return write_page([record(self, path, [*evaluations])], path)
+
     def save(self, path: str | Path) -> Path:
         """Writes the model to one safetensors file, without the replay buffer, and returns its path.
 
@@ -234,7 +252,7 @@ class Agent(BaseAgent):
         return env.venv
 
     def set_logger(self, logger: Logger) -> None:
-        """Replaces console and TensorBoard by the outputs of a logger."""
+        """Replaces the console and the outputs of ``log`` by those of a logger."""
         self.logger = logger
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:

@@ -10,7 +10,7 @@ import math
 import secrets
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -32,7 +32,8 @@ from rejeu.loops.run import Progress, Run, initial_run
 from rejeu.loops.training_call import TrainingCall
 from rejeu.normalization import normalized
 from rejeu.reporting.history import History
-from rejeu.reporting.logging import Logger
+from rejeu.reporting.logging import Logger, check_logs
+from rejeu.reporting.text import counted, html_table
 
 BEST_WINDOW = 20
 """Default number of training episodes over whose mean return the best weights are chosen."""
@@ -43,7 +44,9 @@ AGENT_ARGUMENTS = {
     "env": "An id, a Gymnasium environment, a function that makes one, or a vector environment.",
     "seed": "Seed of networks, exploration, batches and environments. None draws one.",
     "verbose": "0 is silent, 1 prints a table of statistics every ``log_interval`` episodes.",
-    "tensorboard_log": "Folder for TensorBoard logs, None for none.",
+    "log": "Where rows of statistics go: any of ``csv``, ``json``, ``tensorboard``, ``wandb``, ``mlflow`` and ``trackio``, "
+    "one or several. Files are written to a new folder ``logs/NAME_1``, ``NAME_2``, ...",
+    "tensorboard_log": "Folder of the folders ``NAME_k`` instead of ``logs``; adds ``tensorboard`` to ``log``.",
     "stats_window_size": "Episodes over which reported means are taken.",
     "success_threshold": "Least return of a successful episode where the environment does not report success; None: "
     "the environment's own reward threshold, if it has one.",
@@ -104,6 +107,7 @@ class BaseAgent(ABC):
         *,
         seed: int | None = None,
         verbose: int = 0,
+        log: str | Sequence[str] = (),
         tensorboard_log: str | Path | None = None,
         stats_window_size: int = 100,
         success_threshold: float | None = None,
@@ -120,6 +124,7 @@ class BaseAgent(ABC):
             self.algorithm.Config(**hyperparameters),
             int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed),
             verbose,
+            check_logs("log", log),
             tensorboard_log,
             validation.whole("stats_window_size", stats_window_size, least=1),
             None if success_threshold is None else validation.number("success_threshold", success_threshold),
@@ -138,6 +143,7 @@ class BaseAgent(ABC):
         config: Any,
         seed: int,
         verbose: int,
+        log: tuple[str, ...],
         tensorboard_log: str | Path | None,
         stats_window_size: int,
         success_threshold: float | None,
@@ -145,6 +151,7 @@ class BaseAgent(ABC):
     ) -> None:
         """Sets the attributes that do not depend on the environment."""
         self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
+        self.log = log if tensorboard_log is None else tuple(dict.fromkeys((*log, "tensorboard")))
         self.tensorboard_log = tensorboard_log
         self.stats_window_size, self.success_threshold = stats_window_size, success_threshold
         self.best_window = best_window
@@ -329,6 +336,15 @@ class BaseAgent(ABC):
     def __repr__(self) -> str:
         where = self.run.env.env_id if self.run.env is not None else "no environment"
         return f"<rejeu.{self.name} on {where}, {self.run.step} steps, {self.run.n_updates} updates>"
+
+    def _repr_html_(self) -> str:
+        """Returns a table for notebooks."""
+        where = self.run.env.env_id if self.run.env is not None else "no environment"
+        counts = f"{counted(self.run.step, 'step')}, {counted(self.run.n_updates, 'update')}"
+        rows = [(self.name, where), ("seed", str(self.seed)), ("trained", counts)]
+        if len(self.history):
+            rows.append(("episodes", repr(self.history).removeprefix("<History: ").removesuffix(">")))
+        return html_table(rows)
 
     def __init_subclass__(cls) -> None:
         """Adds the hyperparameters of the configuration to docstring and signature, which are made when asked for."""

@@ -20,6 +20,7 @@ from rejeu.errors import CheckpointError, MissingObjectError
 from rejeu.io import checkpoint
 from rejeu.io.records import Positive, Seed, convert
 from rejeu.networks import settled
+from rejeu.reporting.logging import check_logs
 
 if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv
@@ -300,6 +301,7 @@ def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
         saved.config,
         whole_seed(seed),
         given.get("verbose", 0),
+        check_logs("log", given.get("log", ())),
         given.get("tensorboard_log"),
         validation.whole("stats_window_size", stats_window_size, 1),
         None if success_threshold is None else validation.number("success_threshold", success_threshold),

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import xla
+from rejeu import schedules, xla
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.agents.model_files import WRONG, brief
+from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import Callback, Stateful, TrainingCallback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.errors import CheckpointError
@@ -23,14 +24,19 @@ from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress
 from rejeu.loops.timing import time_shares
 from rejeu.loops.training_call import TrainingCall
-from rejeu.reporting.logging import Console, RetryingSink, Sink, TensorBoard, next_folder
+from rejeu.reporting.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
 from rejeu.reporting.text import counted
+from rejeu.reporting.trackers import Background
 from rejeu.validation import number, whole
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
+LOG_FOLDER = "logs"
+"""Folder of the folders of logs, in the current folder."""
 DETERMINISTIC = ("DDPG", "TD3")
 """Algorithms whose policy for continuous actions does not explore by itself."""
+LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
+"""Names of metrics in the log, where they are not ``train/NAME``."""
 RENAMED_CALLBACKS = {"Film": "RecordVideo"}
 """Classes of callbacks that older checkpoints know by another name."""
 
@@ -120,6 +126,8 @@ def train(
         stack.callback(agent.failed_writes.warn)
         outputs = open_outputs(agent, sinks, tb_log_name, stack)
         stack.callback(agent.failed_writes.retry)
+        for output in outputs:
+            output.write_config(run_config(agent, call))
         stack.enter_context(marked_as_learning(agent, outputs))
         stack.enter_context(listening(agent, callbacks))
         try:
@@ -253,19 +261,50 @@ def warn_without_noise(agent: BaseAgent) -> None:
 
 def open_outputs(
     agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
-) -> Sequence[RetryingSink]:
+) -> Sequence[RetryingSink | Background]:
     """Returns the outputs for rows of statistics; ``stack`` closes those that are opened here."""
-    loggers = agent.logger.outputs
-    outputs: list[Sink] = [*sinks, *loggers]
-    if agent.verbose and not loggers:
-        console = Console(TABLE_SECONDS)
-        stack.callback(console.close)
-        outputs.append(console)
-    if agent.tensorboard_log is not None and not loggers:
-        tensorboard = TensorBoard(next_folder(agent.tensorboard_log, tb_log_name or agent.name))
-        stack.callback(tensorboard.close)
-        outputs.append(tensorboard)
-    return [RetryingSink(output, agent.failed_writes) for output in outputs]
+    given, opened = [*sinks, *agent.logger.outputs], list[Sink]()
+    if agent.verbose and not agent.logger.outputs:
+        opened.append(Console(TABLE_SECONDS))
+    if agent.log and not agent.logger.outputs:
+        folder = next_folder(agent.tensorboard_log or LOG_FOLDER, tb_log_name or agent.name)
+        opened += [open_log(kind, folder, run_name(agent), tracker_id(agent)) for kind in agent.log]
+    outputs = [guarded(one, agent.failed_writes) for one in given]
+    for one, output in zip(given, outputs, strict=True):
+        if isinstance(output, Background) and output is not one:
+            stack.callback(output.close)
+    for one in opened:
+        outputs.append(guarded(one, agent.failed_writes, closes=True))
+        stack.callback(outputs[-1].close)
+    return outputs
+
+
+def run_name(agent: BaseAgent) -> str:
+    """Returns a name for the run in a tracker: environment, algorithm, seed and :func:`tracker_id`."""
+    assert agent.env is not None
+    return f"{agent.env.env_id}-{agent.name}-seed{agent.seed}-{tracker_id(agent)}"
+
+
+def tracker_id(agent: BaseAgent) -> str:
+    """Returns what identifies the run in a tracker. A ``learn`` that counts steps from 0 starts another run."""
+    return agent.run_id + (f"-{agent.reset_step}" if agent.reset_step else "")
+
+
+def run_config(agent: BaseAgent, call: TrainingCall) -> dict[str, Any]:
+    """Returns what trackers show as the configuration of a run: environment, algorithm, limits, hyperparameters."""
+    assert agent.env is not None
+    return {
+        "algorithm": agent.name,
+        "env_id": agent.env.env_id,
+        "n_envs": agent.n_envs,
+        "backend": agent.env.backend,
+        "policy": agent.policy,
+        "seed": agent.seed,
+        "total_timesteps": call.n_steps,
+        "episodes": call.n_episodes,
+        "minutes": None if call.seconds is None else call.seconds / 60,
+        **configs.to_json(agent.config),
+    }
 
 
 def note_training_return(agent: BaseAgent, ended: int) -> None:
@@ -331,14 +370,18 @@ def statistics_row(agent: BaseAgent) -> dict[str, float]:
         numbers["rollout/success_rate"] = float(np.mean(agent.ep_success_buffer))
     run = agent.run
     numbers["time/episodes"] = run.episode
-    numbers["time/steps_per_second"] = float(agent.steps_per_second)
-    numbers["time/seconds"] = run.seconds["total"]
+    numbers["time/fps"] = float(agent.steps_per_second)
+    numbers["time/time_elapsed"] = run.seconds["total"]
+    numbers["time/total_timesteps"] = agent.num_timesteps
     for part, share in time_shares(run.seconds).items():
         numbers[f"time/{part}_share"] = share
     numbers["time/compile_seconds"] = xla.seconds()
     numbers["train/n_updates"] = run.n_updates
     if agent.learner.skips:
         numbers["train/skipped_updates"] = run.monitor.n_skipped
+    if agent.training_call is not None:
+        progress = agent.training_call.progress(run.step, run.episode)
+        numbers["train/learning_rate"] = float(schedules.at(agent.config.learning_rate, progress))
     for key, value in (run.metrics or {}).items():
-        numbers[f"train/{key}"] = float(value)
+        numbers[LOGGED_AS.get(key, f"train/{key}")] = float(value)
     return numbers

@@ -38,7 +38,7 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardized,
 )
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.schedules import Schedule, at
 from rejeu.validation import coerce, flag, number
 
@@ -118,8 +118,12 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network, optimizer_state = clip_and_descend(
             state.network, gradients, state.optimizer, optimizer, config, clock.progress
         )
-        metrics = losses._asdict()
-        metrics["explained_variance"] = explained_variance(data.value, data.target, data.valid)
+        metrics = {
+            "policy_loss": losses.policy_loss,
+            "value_loss": losses.value_loss,
+            "entropy_loss": -losses.entropy,
+            EXPLAINED_VARIANCE: explained_variance(data.value, data.target, data.valid),
+        }
         if network.log_std is not None:
             metrics["std"] = jnp.mean(jnp.exp(network.log_std))
         return State(network, optimizer_state, state.n_updates + 1), metrics

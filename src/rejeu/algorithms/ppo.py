@@ -47,7 +47,7 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardized,
 )
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.validation import coerce, number, whole
@@ -181,11 +181,20 @@ def metrics_of(
     config: Config,
     clock: Clock,
 ) -> Metrics:
-    """Returns the metrics of an update."""
-    metrics = losses._asdict()
-    metrics["gradient_steps"] = n_steps.astype(jnp.float32)
-    metrics["explained_variance"] = explained_variance(value, target, valid)
-    metrics["learning_rate"] = jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32)
+    """Returns the metrics of an update, under the names of Stable-Baselines3."""
+    ent_coef = at(config.ent_coef, clock.progress)
+    metrics = {
+        "loss": losses.policy_loss + config.vf_coef * losses.value_loss - ent_coef * losses.entropy,
+        "policy_gradient_loss": losses.policy_loss,
+        "value_loss": losses.value_loss,
+        "entropy_loss": -losses.entropy,
+        "approx_kl": losses.approx_kl,
+        "clip_fraction": losses.clip_fraction,
+        "clip_range": jnp.asarray(at(config.clip_range, clock.progress), jnp.float32),
+        "gradient_steps": n_steps.astype(jnp.float32),
+        EXPLAINED_VARIANCE: explained_variance(value, target, valid),
+        "learning_rate": jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32),
+    }
     if network.log_std is not None:
         metrics["std"] = jnp.mean(jnp.exp(network.log_std))
     return metrics

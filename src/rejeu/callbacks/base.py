@@ -14,6 +14,7 @@ from rejeu.loops.run import Progress, Run
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.history import History
+from rejeu.reporting.logging import Logger
 
 Callback = Callable[[Any, Progress], bool | None]
 """Called after every step of the environments as ``callback(agent, progress)``. Only ``False`` stops training."""
@@ -70,6 +71,7 @@ class TrainedAgent(Protocol):
     history: History
     seed: int
     failed_writes: FailedWrites
+    logger: Logger
     ep_info_buffer: deque[dict[str, float]]
     """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
     ep_success_buffer: deque[float]

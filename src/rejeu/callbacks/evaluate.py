@@ -102,6 +102,7 @@ class Evaluate:
             agent.remember_best(merit(result.evaluation), "evaluation")
             if self.best_path is not None:
                 agent.failed_writes.attempt(f"best model {self.best_path}", agent.snapshot(self.best_path))
+        agent.logger.write(step, logged(result.evaluation))
         if self.report is not None:
             self.report(result, is_best)
         return result
@@ -129,6 +130,14 @@ class Evaluate:
         """Closes the environments, unless they were given as objects."""
         if self._made_here:
             self.env.close()
+
+
+def logged(evaluation: Evaluation) -> dict[str, float]:
+    """Returns an evaluation as metrics, under the names of Stable-Baselines3."""
+    metrics = {"eval/mean_reward": evaluation.mean_return, "eval/mean_ep_length": evaluation.mean_length}
+    if not math.isnan(evaluation.success_rate):
+        metrics["eval/success_rate"] = evaluation.success_rate
+    return metrics
 
 
 def better(evaluation: Evaluation, other: Evaluation) -> bool:

@@ -80,6 +80,7 @@ class RecordVideo:
             record = partial(record_video, agent, path, self.env, self.episodes, self.max_steps, self.seed)
             if agent.failed_writes.attempt(f"video {path}", record, retry=False):
                 self.paths.append(path)
+                agent.logger.write_video(progress.step, path)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns its state for a checkpoint."""

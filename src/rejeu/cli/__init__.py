@@ -20,7 +20,7 @@ from tyro.extras import subcommand_cli_from_dict
 import rejeu
 from rejeu import errors, interrupt
 from rejeu.cli import parsing
-from rejeu.cli.commands import COMMANDS
+from rejeu.cli.commands import COMMANDS, MODULES
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
 
@@ -53,9 +53,9 @@ def run_command(argv: Sequence[str]) -> int:
         argv = parsing.checked(argv, COMMANDS)
         arguments = subcommand_cli_from_dict(COMMANDS, prog="rejeu", description=DESCRIPTION, args=argv)
         importlib.import_module("rejeu.cli.settings").check_values(arguments)
-        for name in arguments.imports:
+        for name in getattr(arguments, "imports", ()):
             importlib.import_module("rejeu.cli.importing").import_source(name)
-        return importlib.import_module(f"rejeu.cli.{argv[0]}").run(arguments)
+        return importlib.import_module(f"rejeu.cli.{MODULES.get(argv[0], argv[0])}").run(arguments)
     except KeyboardInterrupt as error:
         print("rejeu: interrupted", file=sys.stderr)
         return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)

@@ -9,14 +9,17 @@ from pathlib import Path
 
 import gymnasium as gym
 
-from rejeu.cli import environment
+from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Check
 from rejeu.envs.checker import findings
 
 
 def run(arguments: Check) -> int:
     """Prints the findings, errors first, and returns the exit status: 1 if there are errors, else 0."""
-    with closing(environment.from_arguments(arguments.env, arguments).make()) as env:
+    with (
+        jsonout.messages(arguments.json) as output,
+        closing(environment.from_arguments(arguments.env, arguments).make()) as env,
+    ):
         found = sorted(findings(env))
         package = None if arguments.all else installed_package(env)
     n_notes = 0
@@ -24,9 +27,14 @@ def run(arguments: Check) -> int:
         n_notes = len(found)
         found = [finding for finding in found if finding.level == "error"]
         n_notes -= len(found)
+    n_errors = sum(finding.level == "error" for finding in found)
+    if arguments.json:
+        counts = {"errors": n_errors, "warnings": len(found) - n_errors, "hidden_warnings": n_notes}
+        found_as_dicts = [finding._asdict() for finding in found]
+        jsonout.emit({"env_id": arguments.env, **counts, "findings": found_as_dicts}, output)
+        return int(n_errors > 0)
     for finding in found:
         print(f"{finding.level}: {finding.text}")
-    n_errors = sum(finding.level == "error" for finding in found)
     print(f"{arguments.env}: {counted(n_errors, 'error')}, {counted(len(found) - n_errors, 'warning')}", flush=True)
     if n_notes:
         print(

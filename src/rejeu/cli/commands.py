@@ -18,6 +18,7 @@ Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 Return = Annotated[float | None, arg(metavar="RETURN", help_behavior_hint="")]
 Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 Assignments = tuple[tuple[str, ...], ...]
+Json = Annotated[bool, FlagCreatePairsOff]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,10 @@ class Train(EnvironmentOptions):
     """With --backend gymnasium-async: how many worker processes that crashed or hung are restarted."""
     seed: Count = None
     """Seeds everything; by default a random one."""
+    seeds: Count = None
+    """Train this many seeds, from --seed on, each in a process and a folder of its own, and compare them at the end."""
+    jobs: Count = None
+    """With --seeds: how many are trained at once; by default half as many as there are cores."""
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
     """Hyperparameters, dotted where nested: policy_kwargs.net_arch=[64,64] train_freq=[1,"episode"]."""
     out: Folder = None
@@ -77,6 +82,12 @@ class Train(EnvironmentOptions):
     """Environment steps between two evaluations; by default the preset's, else 5000."""
     evaluate_episodes: Count = None
     """Episodes of each evaluation; by default the preset's, else 20."""
+    no_report: Annotated[bool, FlagCreatePairsOff] = False
+    """Write no report.html at the end."""
+    log: Annotated[Assignments, UseAppendAction, arg(metavar="NAME ...")] = ()
+    """Log to these too: json, tensorboard, wandb, mlflow, trackio. metrics.csv is always written."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +103,10 @@ class Resume(RunOptions):
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
     minutes: Minutes = None
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
+    no_report: Annotated[bool, FlagCreatePairsOff] = False
+    """Write no report.html at the end."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +127,8 @@ class Evaluate(RunOptions):
     """Return from which on an episode counts as a success; by default as in training."""
     which: Which = "best"
     """Of a folder: the model that evaluated best in training, or the last."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +145,8 @@ class Record(RunOptions):
     """Of the environment; by default a random one."""
     which: Which = "best"
     """Of a folder: the model that evaluated best in training, or the last."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +172,8 @@ class Play(EnvironmentOptions):
     """Folder of a run, or a .safetensors file, whose agent plays the same episodes next to you."""
     which: Which = "best"
     """Of a folder: the model that evaluated best in training, or the last."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +193,8 @@ class Watch(RunOptions):
     """Of a folder: the model that evaluated best in training, or the last."""
     fps: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
     """Steps a second; by default the environment's own."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +208,8 @@ class Check(EnvironmentOptions):
     """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
     all: Annotated[bool, FlagCreatePairsOff] = False
     """Of an installed package's environment, show the warnings too, which only its authors can act on."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +218,115 @@ class List:
 
     imports: Annotated[tuple[str, ...], UseAppendAction, arg(name="import", metavar="MODULE")] = ()
     """Import this module or Python file first: one that registers algorithms; repeat for several."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Writes the notebooks of the courses, exercises and solutions, to a folder. Existing files are never changed."""
+
+    language: Annotated[Positional[Literal["en", "fr"]], arg(metavar="LANGUAGE")]
+    """en or fr."""
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Where to write; it is created."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
+
+
+@dataclass(frozen=True)
+class Report(RunOptions):
+    """Writes a page about one or several runs: curves, evaluations, videos, episodes, configuration.
+
+    The page is one file that needs no network. Example: rejeu report runs/NAME --open
+    """
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...")]
+    """Run folders, also of runs in progress."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """File to write; by default report.html in the folder of a single run, else in the current folder."""
+    open: Annotated[bool, FlagCreatePairsOff] = False
+    """Open the page in the web browser."""
+    live: Annotated[bool, FlagCreatePairsOff] = False
+    """Serve the page to this computer and update it while the runs train, until Ctrl-C."""
+    replay: Count = None
+    """First let the trained agent play this many episodes, from the seeds 0, 1, 2 ...; the page lists them by return."""
+
+
+@dataclass(frozen=True)
+class Class(EnvironmentOptions):
+    """Evaluates the models in a folder, such as those of a class, and writes a leaderboard with confidence intervals.
+
+    Every model plays the same episodes. A file that is damaged or of another environment gets one line.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Folder with .safetensors files, also in folders in it. Their names are the names on the leaderboard."""
+    env: Annotated[str | None, arg(metavar="ENV", help_behavior_hint="")] = None
+    """Environment, as for rejeu train; by default the one that most models were trained on."""
+    episodes: Annotated[int, arg(metavar="N")] = 50
+    """Episodes of each model, up to 1000."""
+    minutes: Annotated[float, arg(metavar="M")] = 1.0
+    """Wall time of each model; one that needs more is not ranked."""
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Of the episodes, the same for all models."""
+    out: Annotated[Path, arg(metavar="FILE")] = Path("leaderboard.html")
+    """Page to write; a name that ends in .md or .json is written as Markdown or JSON."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compares groups of runs, such as several seeds of two algorithms: curves, final scores, 95 % intervals.
+
+    Also reads monitor.csv of Stable-Baselines3 and TensorBoard files. Example: rejeu compare runs --by setting --out page.html
+    """
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...", help_behavior_hint="")]
+    """Run folders, or folders of run folders."""
+    by: Annotated[
+        Literal["algorithm", "setting", "env"] | None, arg(metavar="{algorithm,setting,env}", help_behavior_hint="")
+    ] = None
+    """What makes a group; by default the first of these in which the runs differ."""
+    x: Literal["steps", "time"] = "steps"
+    """Compare over environment steps or over training time."""
+    score: Literal["training", "evaluation"] = "training"
+    """Final score: mean return of the last tenth of training, or of the last evaluation."""
+    statistic: Literal["iqm", "mean", "median"] = "iqm"
+    """Statistic of the curves over the runs."""
+    normalize: Annotated[Literal["range"] | None, arg(metavar="range", help_behavior_hint="")] = None
+    """Scale the returns of each environment to its range of final scores, so that environments can be averaged."""
+    reference: Annotated[Assignments, UseAppendAction, arg(metavar="ENV=LOW,HIGH ...")] = ()
+    """Scale with these reference returns instead, which become 0 and 1; needed for every environment."""
+    threshold: Return = None
+    """Return that counts as learned; by default the mean final score of the weakest group."""
+    out: Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")] = None
+    """File to write (.md, .csv, .json, .png or .html), or a folder for all of them."""
+    open: Annotated[bool, FlagCreatePairsOff] = False
+    """Open the page in the web browser; it is written to compare.html unless --out says otherwise."""
+    json: Annotated[bool, FlagCreatePairsOff] = False
+    """Print the result as JSON."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Lists the runs in a folder and its subfolders with state, steps and best results."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER", help_behavior_hint="(default: runs)")] = Path("runs")
+    """Folder that is searched."""
+    json: Annotated[bool, FlagCreatePairsOff] = False
+    """Print the result as JSON."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Shows how far a run is, also while it trains; exit status 3 if it was interrupted, 4 if it crashed."""
+
+    run: RunPath
+    """Its folder."""
+    json: Annotated[bool, FlagCreatePairsOff] = False
+    """Print the result as JSON."""
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {
@@ -204,5 +338,13 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "watch": Watch,
     "check": Check,
     "list": List,
+    "compare": Compare,
+    "runs": Runs,
+    "status": Status,
+    "course": Course,
+    "report": Report,
+    "class": Class,
 }
 """The arguments of each command, by its name."""
+MODULES = {"class": "leaderboard"}
+"""The modules of commands whose name cannot be that of a module."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from contextlib import closing
 
 from rejeu.agents import load
-from rejeu.cli import run_folder
+from rejeu.cli import jsonout, run_folder
 from rejeu.cli.commands import Evaluate
 
 
 def run(arguments: Evaluate) -> int:
-    """Evaluates, prints one line, and returns the exit status."""
+    """Evaluates, prints the result, and returns the exit status."""
     episodes, minutes = arguments.episodes, arguments.minutes
     if minutes is None and episodes is None:
         episodes = 100
@@ -18,8 +18,16 @@ def run(arguments: Evaluate) -> int:
     environment = run_folder.environment_of(model, arguments)
     agent = load(model)
     n_envs = 16 if episodes is None else min(episodes, 16)
-    with closing(environment.vector(n_envs, arguments.backend, arguments.seed)) as env:
+    with (
+        jsonout.messages(arguments.json) as output,
+        closing(environment.vector(n_envs, arguments.backend, arguments.seed)) as env,
+    ):
         print(f"{environment} on {env.backend}, {model}", flush=True)
         threshold = arguments.success_threshold
-        print(agent.evaluate(episodes, env=env, success_threshold=threshold, minutes=minutes), flush=True)
+        result = agent.evaluate(episodes, env=env, success_threshold=threshold, minutes=minutes)
+        print(result, flush=True)
+        if arguments.json:
+            about = {"model": model, "env_id": environment.env_id, "backend": env.backend}
+            episodes_of = {"returns": result.returns, "lengths": result.lengths, "successes": result.successes}
+            jsonout.emit({**about, **result.to_dict(), **episodes_of}, output)
     return 0

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rejeu import presets
 from rejeu.agents import AGENTS
+from rejeu.cli import jsonout
 from rejeu.cli.commands import List
+from rejeu.presets import Preset
 
 
 def run(arguments: List) -> int:
     """Prints the lists and returns the exit status."""
+    algorithms = {name: (agent.__doc__ or "").partition("\n")[0] for name, agent in AGENTS.items()}
+    if arguments.json:
+        jsonout.emit({"algorithms": algorithms, "presets": [as_dict(preset) for preset in presets.every()]})
+        return 0
     print("algorithms")
-    print(columns([(name, (agent.__doc__ or "").partition("\n")[0]) for name, agent in AGENTS.items()]))
+    print(columns([*algorithms.items()]))
     print("\nenvironments with tuned hyperparameters, the preset of rejeu train first")
     env_ids = list(dict.fromkeys(preset.env_id for preset in presets.every()))
     rows = []
@@ -26,6 +33,21 @@ def run(arguments: List) -> int:
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
     return 0
+
+
+def as_dict(preset: Preset) -> dict[str, Any]:
+    """Returns a preset with its measured result, which is None if there is none."""
+    return {
+        "env_id": preset.env_id,
+        "algorithm": preset.algorithm,
+        "n_envs": preset.n_envs,
+        "total_steps": preset.total_steps,
+        "evaluate_every": preset.evaluate_every,
+        "evaluate_episodes": preset.evaluate_episodes,
+        "hyperparameters": preset.hyperparameters,
+        "source": preset.source,
+        "result": presets.find_result(preset.env_id, preset.algorithm),
+    }
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> str:

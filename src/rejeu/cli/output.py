@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,8 +98,68 @@ def summary(
     )
 
 
+def as_dict(
+    agent: Agent,
+    folder: RunFolder,
+    evaluate: Evaluate,
+    signal: int | None,
+    is_complete: bool,
+    seconds: float,
+    compile_seconds: float,
+) -> dict[str, Any]:
+    """Returns what :func:`summary` says, for ``--json``."""
+    last = agent.history.summary(agent.stats_window_size).last
+    best = evaluate.best
+    return {
+        "run": folder.path,
+        "env_id": None if agent.env is None else agent.env.env_id,
+        "algorithm": agent.name,
+        "seed": agent.seed,
+        "complete": is_complete,
+        "signal": signal,
+        "steps": agent.num_timesteps,
+        "episodes": len(agent.history),
+        "seconds": seconds,
+        "compile_seconds": compile_seconds,
+        "steps_per_second": agent.steps_per_second,
+        "training": {
+            "episodes": last.n,
+            "mean_return": last.mean_return,
+            "std_return": last.std_return,
+            "mean_length": last.mean_length,
+            "success_rate": last.success_rate,
+        },
+        "best": None if best is None else {"step": best.step, **best.evaluation.to_dict()},
+        "files": sorted(path.name for path in folder.path.iterdir()),
+        "not_written": [what for what, failure in agent.failed_writes.failures.items() if not failure.written],
+    }
+
+
 def training_statistics(agent: Agent) -> str:
     """Returns return, length and, where it is known, success of the last training episodes."""
     returns, lengths = ([episode[key] for episode in agent.ep_info_buffer] for key in ("r", "l"))
     text = f"return {np.mean(returns):.2f} ± {np.std(returns):.2f}, length {np.mean(lengths):.1f}"
     return f"success {np.mean(agent.ep_success_buffer):.1%}, {text}" if agent.ep_success_buffer else text
+
+
+@contextmanager
+def noted_in(path: Path) -> Iterator[None]:
+    """Context whose warnings, and the error that ends it, are also written to a file, one a line."""
+    show = warnings.showwarning
+
+    def note(text: object) -> None:
+        with suppress(OSError), path.open("a", encoding="utf-8") as file:
+            print(*str(text).split(), file=file)
+
+    def show_and_note(message: Warning | str, *arguments: Any, **options: Any) -> None:
+        show(message, *arguments, **options)
+        note(message)
+
+    warnings.showwarning = show_and_note
+    try:
+        yield
+    except Exception as error:
+        note(f"{type(error).__name__}: {error}")
+        raise
+    finally:
+        warnings.showwarning = show

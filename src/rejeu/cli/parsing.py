@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 from collections.abc import Mapping, Sequence
 from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import Positional, arg
 
@@ -26,7 +26,7 @@ class Option(NamedTuple):
     is_flag: bool
     """Whether it takes no value."""
     takes_many: bool
-    """Whether it takes all words up to the next option."""
+    """Whether it takes all words up to the next option; a positional argument, all further positional words."""
     is_positional: bool
     is_required: bool
 
@@ -46,7 +46,7 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
     known = options(commands[command])
     positionals = [one for one in known if one.is_positional]
     by_name = {one.name: one for one in known if not one.is_positional}
-    result, filled, i = [command], 0, 0
+    result, places, received, filled, i = [], [], set[str](), 0, 0
     while i < len(words):
         word = words[i]
         i += 1
@@ -73,11 +73,12 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
         elif filled == len(positionals):
             raise ValueError(f"rejeu {command} does not expect {word!r}; rejeu {command} --help shows what it takes")
         else:
-            result.append(read(positionals[filled], word))
-            filled += 1
-    if missing := [one.name for one in positionals[filled:] if one.is_required]:
+            places.append(read(positionals[filled], word))
+            received.add(positionals[filled].name)
+            filled += not positionals[filled].takes_many
+    if missing := [one.name for one in positionals if one.is_required and one.name not in received]:
         raise ValueError(f"rejeu {command} needs {' and '.join(missing)}; rejeu {command} --help shows what it takes")
-    return result
+    return [command, *places, *result]
 
 
 def read(option: Option, text: str) -> str:
@@ -121,12 +122,13 @@ def _option(field: dataclasses.Field[Any], hint: Any) -> Option:
     hint, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     said: Any = next((mark for mark in marks if isinstance(mark, type(arg()))), arg())
     is_positional = any(mark is Positional for mark in marks)
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     return Option(
         name=str(said.metavar) if is_positional else f"--{said.name or field.name}".replace("_", "-"),
-        kinds=get_args(hint) if isinstance(hint, UnionType) else (hint,),
-        choices=get_args(hint) if get_origin(hint) is Literal else (),
+        kinds=kinds,
+        choices=next((get_args(one) for one in kinds if get_origin(one) is Literal), ()),
         is_flag=hint is bool,
-        takes_many=get_origin(hint) is tuple and get_origin(get_args(hint)[0]) is tuple,
+        takes_many=get_origin(hint) is tuple and (is_positional or get_origin(get_args(hint)[0]) is tuple),
         is_positional=is_positional,
         is_required=field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING,
     )

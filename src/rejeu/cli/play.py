@@ -7,7 +7,7 @@ from itertools import chain
 from typing import Any
 
 from rejeu.agents import load
-from rejeu.cli import environment, run_folder, settings
+from rejeu.cli import environment, jsonout, run_folder, settings
 from rejeu.cli.commands import Play
 from rejeu.play import Game, play
 from rejeu.play.known import full_name
@@ -24,19 +24,22 @@ def run(arguments: Play) -> int:
         if trained_on != made.env_id:
             raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {made.env_id}")
         agent = load(model)
-    game = play(
-        made.make,
-        keys=parse_keys(chain.from_iterable(arguments.keys)),
-        seed=arguments.seed,
-        fps=arguments.fps,
-        episodes=arguments.episodes,
-        record=arguments.record,
-        against=agent,
-    )
-    print(scores(game), flush=True)
-    recording = game.players[0].recording
-    if recording is not None:
-        print(recording, flush=True)
+    with jsonout.messages(arguments.json) as output:
+        game = play(
+            made.make,
+            keys=parse_keys(chain.from_iterable(arguments.keys)),
+            seed=arguments.seed,
+            fps=arguments.fps,
+            episodes=arguments.episodes,
+            record=arguments.record,
+            against=agent,
+        )
+        print(scores(game), flush=True)
+        recording = game.players[0].recording
+        if recording is not None:
+            print(recording, flush=True)
+        if arguments.json:
+            jsonout.emit(as_dict(game), output)
     return 0
 
 
@@ -56,6 +59,16 @@ def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
             raise ValueError(f"--keys {assignment!r} must be keys=action, such as a=0 or a+w=[1,-1]")
         result[keys.strip()] = settings.value(text)
     return result
+
+
+def as_dict(game: Game) -> dict[str, Any]:
+    """Returns the players with their scores."""
+    return {
+        "players": [
+            {"name": one.name, "episodes": len(one.scores), "mean": one.mean, "best": one.best, "scores": one.scores}
+            for one in game.players
+        ]
+    }
 
 
 def scores(game: Game) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rejeu.agents import load
-from rejeu.cli import run_folder
+from rejeu.cli import jsonout, run_folder
 from rejeu.cli.commands import Record
 from rejeu.cli.run_folder import RunFolder
 from rejeu.reporting.text import counted
@@ -16,6 +16,12 @@ def run(arguments: Record) -> int:
     default = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
     out = default if arguments.out is None else arguments.out
     environment = run_folder.environment_of(model, arguments)
-    path = record_video(load(model), out, env=environment.rendering, episodes=arguments.episodes, seed=arguments.seed)
-    print(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {environment}", flush=True)
+    with jsonout.messages(arguments.json) as output:
+        path = record_video(
+            load(model), out, env=environment.rendering, episodes=arguments.episodes, seed=arguments.seed
+        )
+        print(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {environment}", flush=True)
+        if arguments.json:
+            about = {"model": model, "env_id": environment.env_id}
+            jsonout.emit({"video": path, "episodes": arguments.episodes, **about}, output)
     return 0

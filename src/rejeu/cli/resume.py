@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import warnings
 from contextlib import closing
+from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
-from rejeu.cli import run_folder
+from rejeu.cli import jsonout, run_folder
 from rejeu.cli.commands import Resume
 from rejeu.cli.output import echo
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
 from rejeu.interrupt import Interrupt
+from rejeu.reporting.logging import require
 
 
 def run(arguments: Resume) -> int:
     """Trains and returns the exit status, as ``rejeu train`` does."""
+    return jsonout.run(resume, arguments)
+
+
+def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
     folder = RunFolder(arguments.run)
     config = run_folder.read_config(folder)
+    require(config.log)
     kind = agent_of_file(config.algorithm, folder.config)
     environment = run_folder.of_run(folder, config, arguments)
     with closing(environment.vector(config.n_envs, config.backend, config.seed)) as env:
@@ -29,7 +37,16 @@ def run(arguments: Resume) -> int:
         echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
         echo(f"checkpoint    {agent.resumed}")
         with closing(make_evaluation_env(config, environment)) as evaluation_env, Interrupt() as stop:
-            session = Session(agent, config, folder, environment, evaluation_env, limits, is_new=False)
+            session = Session(
+                agent,
+                config,
+                folder,
+                environment,
+                evaluation_env,
+                limits,
+                is_new=False,
+                has_report=not arguments.no_report,
+            )
             return session.run(stop, stopwatch)
 
 

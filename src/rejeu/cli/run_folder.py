@@ -20,7 +20,9 @@ from rejeu.cli.settings import MAX_EPISODES
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic, checkpoint
 from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json
+from rejeu.reporting.logging import LOGS
 
+LogName = Annotated[str, Meta(pattern=f"^({'|'.join(LOGS)})$")]
 MAX_CONFIG_BYTES = 2**20
 """Upper limit on the size of a ``config.json``."""
 
@@ -73,6 +75,21 @@ class RunFolder:
         return self.path / "curve.png"
 
     @property
+    def replays(self) -> Path:
+        """Episodes of the trained agent, one row each; read by :mod:`rejeu.reporting.runs`."""
+        return self.path / "replays.csv"
+
+    @property
+    def report(self) -> Path:
+        """The page about the run."""
+        return self.path / "report.html"
+
+    @property
+    def warnings(self) -> Path:
+        """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.reporting.runs`."""
+        return self.path / "warnings.txt"
+
+    @property
     def videos(self) -> Path:
         """Folder of videos of the policy during training; earlier versions called it ``films``."""
         videos, films = self.path / "videos", self.path / "films"
@@ -119,6 +136,8 @@ class RunConfig:
     """Keyword arguments of the environment."""
     wrappers: tuple[str, ...] = ()
     """Names of its wrappers, innermost first; used in messages only."""
+    log: tuple[LogName, ...] = ()
+    """Logs beside ``metrics.csv``."""
 
 
 def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:

@@ -13,15 +13,19 @@ import numpy as np
 
 from rejeu import errors, xla
 from rejeu.agents import Agent, load
+from rejeu.agents.training import run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
 from rejeu.cli.environment import Environment
-from rejeu.cli.output import echo, reporter, summary
+from rejeu.cli.output import as_dict, echo, noted_in, reporter, summary
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.envs.make import VectorEnv
 from rejeu.interrupt import Interrupt, leaving
 from rejeu.loops.run import Progress
 from rejeu.reporting import plots
-from rejeu.reporting.logging import CsvFile, RetryingSink
+from rejeu.reporting.history import EpisodeTable
+from rejeu.reporting.logging import CsvFile, RetryingSink, guarded, open_log
+from rejeu.reporting.report import write_report
+from rejeu.reporting.trackers import Background
 from rejeu.reporting.video import record_video
 
 VIDEO_EPISODES = 3
@@ -64,34 +68,56 @@ class Session(NamedTuple):
     limits: Limits
     is_new: bool
     """Whether the run begins here, rather than being resumed."""
+    has_report: bool = True
+    """Whether ``report.html`` is written at the end."""
 
-    def run(self, stop: Interrupt, stopwatch: Stopwatch) -> int:
-        """Trains, evaluates, plots and records a video; prints a summary and returns the exit status.
+    def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
+        """Trains, evaluates, plots and records a video; prints a summary, and returns the exit status and the result.
 
-        That is 0, 2 if something could not be written, 130 after Ctrl-C and 143 after SIGTERM. Until the models are saved,
-        signals are requests to stop after the current step; afterwards they end the process at once.
+        The status is 0, 2 if something could not be written, 130 after Ctrl-C and 143 after SIGTERM. Until the models are
+        saved, signals are requests to stop after the current step; afterwards they end the process at once.
         """
         agent, folder = self.agent, self.folder
-        evaluate, is_complete = self.train(stop)
-        written = agent.failed_writes.retry()
-        if is_complete:
-            with leaving(f"interrupted after training; the models are saved in {folder.path}"):
-                evaluate_now(evaluate, agent)
+        outputs = self.outputs()
+        try:
+            with noted_in(folder.warnings):
+                evaluate, is_complete = self.train(stop, outputs)
+            agent.failed_writes.retry()
+            if is_complete:
+                with leaving(f"interrupted after training; the models are saved in {folder.path}"):
+                    evaluate_now(evaluate, agent)
+                    self.plot_curve(evaluate)
+                    self.record_video(outputs)
+            else:
                 self.plot_curve(evaluate)
-                self.record_video()
-        else:
-            self.plot_curve(evaluate)
-            echo(
-                f"no video of a run that was stopped; rejeu record {folder.path}{self.environment.options()} makes one"
-            )
-        echo(summary(agent, folder, self.environment, evaluate, stop.signal, is_complete, *stopwatch.seconds()))
+                options = self.environment.options()
+                echo(f"no video of a run that was stopped; rejeu record {folder.path}{options} makes one")
+        except Exception:
+            self.write_report()
+            raise
+        finally:
+            for output in outputs:
+                output.close()
+        self.write_report()
+        seconds = stopwatch.seconds()
+        echo(summary(agent, folder, self.environment, evaluate, stop.signal, is_complete, *seconds))
         if failed := agent.failed_writes.summary():
             print(f"warning: {failed}", file=sys.stderr)
+        result = as_dict(agent, folder, evaluate, stop.signal, is_complete, *seconds)
         if stop.signal is not None:
-            return 128 + stop.signal
-        return 0 if written else 2
+            return 128 + stop.signal, result
+        return (0 if agent.failed_writes.complete else 2), result
 
-    def train(self, stop: Interrupt) -> tuple[Evaluate, bool]:
+    def outputs(self) -> list[RetryingSink | Background]:
+        """Returns the outputs of the rows of statistics."""
+        agent, up_to = self.agent, None if self.is_new else self.agent.num_timesteps
+        sinks = [
+            open_log(kind, self.folder.path, run_name(agent), tracker_id(agent), self.folder.metrics.stem, up_to)
+            for kind in dict.fromkeys(("csv", *self.config.log))
+        ]
+        return [guarded(sink, agent.failed_writes, closes=True) for sink in sinks]
+
+    def train(self, stop: Interrupt, outputs: list[RetryingSink | Background]) -> tuple[Evaluate, bool]:
         """Trains and saves; returns the evaluations, and whether the goal was reached.
 
         Models and tables are written also after an error of the environment or of the numbers.
@@ -99,7 +125,7 @@ class Session(NamedTuple):
         agent, folder, limits = self.agent, self.folder, self.limits
         agent.report_folder = folder.path
         evaluate, callbacks = self.callbacks(stop)
-        metrics = CsvFile(folder.metrics, None if self.is_new else agent.num_timesteps)
+        episodes = EpisodeTable(lambda: agent.history, folder.episodes)
         try:
             agent.learn(
                 limits.steps,
@@ -108,7 +134,7 @@ class Session(NamedTuple):
                 reset_num_timesteps=self.is_new,
                 progress_bar=True,
                 minutes=limits.minutes,
-                sinks=[metrics],
+                sinks=[*outputs, RetryingSink(episodes, agent.failed_writes)],
             )
             save(agent, folder.agent)
             if not evaluate.results:
@@ -150,13 +176,25 @@ class Session(NamedTuple):
         except (ImportError, OSError) as error:
             echo(f"no curve: {' '.join(str(error).split())}")
 
-    def record_video(self) -> None:
-        """Records a video of the best model, or prints why not."""
+    def record_video(self, outputs: list[RetryingSink | Background]) -> None:
+        """Records a video of the best model and adds it to the outputs, or prints why not."""
         folder, render = self.folder, self.environment.rendering
         try:
             record_video(load(folder.best), folder.video, render, VIDEO_EPISODES, VIDEO_STEPS, self.config.seed)
         except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
             echo(f"no video: {' '.join(str(error).split())}")
+            return
+        for output in outputs:
+            output.write_video(self.agent.num_timesteps, folder.video)
+
+    def write_report(self) -> None:
+        """Writes the page about the run, or prints why not."""
+        if not self.has_report:
+            return
+        try:
+            write_report(self.folder.path, self.folder.report)
+        except (ImportError, OSError) as error:
+            echo(f"no report: {' '.join(str(error).split())}")
 
 
 def make_evaluation_env(config: RunConfig, environment: Environment) -> VectorEnv:

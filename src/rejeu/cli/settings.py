@@ -20,6 +20,8 @@ INTEGERS = {
     "evaluate_episodes": (1, MAX_EPISODES),
     "video_every": (1, 2**63 - 1),
     "seed": (0, 2**32 - 1),
+    "seeds": (1, 1000),
+    "jobs": (1, 1000),
 }
 """The smallest and the largest value of options that are whole numbers, in all commands."""
 
@@ -29,6 +31,8 @@ def check_values(arguments: Any) -> None:
     given = {key: value for key, value in vars(arguments).items() if value is not None}
     if {"steps", "minutes"} <= given.keys():
         raise ValueError("--steps and --minutes exclude each other; give one of them")
+    if "jobs" in given and "seeds" not in given:
+        raise ValueError("--jobs is for several seeds; give --seeds N too")
     for key, value in given.items():
         option = f"--{key.replace('_', '-')}"
         if key in INTEGERS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from itertools import chain
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -11,7 +12,7 @@ from gymnasium import spaces
 from rejeu import presets, validation
 from rejeu.agents import AGENTS, find_agent
 from rejeu.algorithms import config as configs
-from rejeu.cli import environment, run_folder, settings
+from rejeu.cli import environment, jsonout, run_folder, seeds, settings
 from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo, header
@@ -21,18 +22,28 @@ from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
 from rejeu.interrupt import Interrupt
 from rejeu.presets import Preset
+from rejeu.reporting.logging import check_logs, require
 
 
 def run(arguments: Train) -> int:
     """Trains and returns the exit status: 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
+    if arguments.seeds is not None:
+        return seeds.run(arguments)
+    return jsonout.run(train, arguments)
+
+
+def train(arguments: Train) -> tuple[int, dict[str, Any]]:
+    """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
+    logs = check_logs("--log", chain.from_iterable(arguments.log))
+    require(logs)
     run_folder.check_free(arguments.out)
     algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
     preset = presets.find(made.env_id, algorithm)
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with closing(make_env(arguments, made, preset, seed)) as env:
-        config = make_config(arguments, made, preset, algorithm or choose_algorithm(preset, env), env, seed)
+        config = make_config(arguments, made, preset, algorithm or choose_algorithm(preset, env), env, seed, logs)
         agent = AGENTS[config.algorithm](
             config.policy, env, seed=seed, success_threshold=config.success_threshold, **config.hyperparameters
         )
@@ -41,7 +52,10 @@ def run(arguments: Train) -> int:
             run_folder.write_config(folder, config)
             echo(header(config, made, describe_backend(env, made, preset), folder))
             limits = Limits(config.steps, config.minutes)
-            return Session(agent, config, folder, made, evaluation_env, limits, is_new=True).run(stop, stopwatch)
+            session = Session(
+                agent, config, folder, made, evaluation_env, limits, is_new=True, has_report=not arguments.no_report
+            )
+            return session.run(stop, stopwatch)
 
 
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
@@ -81,7 +95,13 @@ def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
 
 
 def make_config(
-    arguments: Train, made: Environment, preset: Preset | None, algorithm: str, env: VectorEnv, seed: int
+    arguments: Train,
+    made: Environment,
+    preset: Preset | None,
+    algorithm: str,
+    env: VectorEnv,
+    seed: int,
+    logs: tuple[str, ...],
 ) -> RunConfig:
     """Returns the configuration of the run: the arguments, then the preset, then the defaults.
 
@@ -112,4 +132,5 @@ def make_config(
         evaluate_every=arguments.evaluate_every or base.evaluate_every,
         evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
         checkpoint_minutes=arguments.checkpoint_minutes or None,
+        log=logs,
     )

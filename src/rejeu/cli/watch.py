@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from rejeu.agents import load
-from rejeu.cli import run_folder
+from rejeu.cli import jsonout, run_folder
 from rejeu.cli.commands import Watch
-from rejeu.cli.play import scores
+from rejeu.cli.play import as_dict, scores
 from rejeu.play import watch
 
 
@@ -13,6 +13,9 @@ def run(arguments: Watch) -> int:
     """Shows the agent, prints its scores, and returns the exit status."""
     model = run_folder.find_model(arguments.run, arguments.which)
     environment = run_folder.environment_of(model, arguments)
-    game = watch(load(model), environment.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
-    print(scores(game), flush=True)
+    with jsonout.messages(arguments.json) as output:
+        game = watch(load(model), environment.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
+        print(scores(game), flush=True)
+        if arguments.json:
+            jsonout.emit(as_dict(game), output)
     return 0

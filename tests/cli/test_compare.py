@@ -1,0 +1,80 @@
+"""The commands compare, runs and status."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rejeu import cli
+from tests.reporting.test_comparison import HOSTILE, write_run
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for algorithm, base in (("DQN", 10.0), ("PPO", 20.0)):
+        for seed in range(3):
+            write_run(tmp_path / "runs" / f"{algorithm}_{seed}", algorithm, seed=seed, level=base + seed)
+    return tmp_path / "runs"
+
+
+def test_compare_prints_groups_and_writes_files(runs, tmp_path, capsys):
+    out = tmp_path / "table.csv"
+    assert cli.main(["compare", str(runs), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "PPO scores higher than DQN on CartPole-v1 with probability 100%" in printed
+    assert "final score: mean return of the training episodes" in printed
+    assert out.read_text(encoding="utf-8").startswith("group,env,runs,iqm")
+
+
+def test_compare_as_json(runs, capsys):
+    arguments = ["--by", "env", "--x", "time", "--score", "evaluation", "--json", "--reference", "CartPole-v1=0,100"]
+    assert cli.main(["compare", *map(str, sorted(runs.iterdir())), *arguments]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert [(group["group"], group["runs"]) for group in content["groups"]] == [("CartPole-v1", 6)]
+    assert content["groups"][0]["mean"] == pytest.approx(0.17)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--reference", "CartPole-v1=1"], "--reference 'CartPole-v1=1' must be ENV=LOW,HIGH"),
+        (["--by", "seed"], "--by"),
+        (["--out", "a.pdf"], "'a.pdf' must end in md, csv, json, png, html, or be a folder"),
+    ],
+)
+def test_errors_are_one_line(runs, capsys, arguments, message):
+    assert cli.main(["compare", str(runs), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_runs_lists_every_run(runs, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    write_run(runs / "odd", HOSTILE)
+    assert cli.main(["runs", str(runs)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("finished") == 7
+    assert "21.00 (step 1,000)" in printed
+    assert cli.main(["runs", str(runs), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert sorted(Path(row["run"]).name for row in content["runs"]) == sorted(path.name for path in runs.iterdir())
+    assert content["unreadable"] == []
+
+
+def test_runs_in_an_empty_folder(tmp_path, capsys):
+    assert cli.main(["runs", str(tmp_path)]) == 0
+    assert "there are no runs in" in capsys.readouterr().out
+
+
+def test_status(runs, capsys):
+    assert cli.main(["status", str(runs / "DQN_0")]) == 0
+    assert "steps         1,000 of 1,000 (100%)" in capsys.readouterr().out
+    assert cli.main(["status", str(runs / "DQN_0"), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert (content["state"], content["best"]["mean_return"]) == ("finished", 11.0)
+    write_run(runs / "short", steps=1000, every=10)
+    config = runs / "short" / "config.json"
+    config.write_text(config.read_text(encoding="utf-8").replace("1000", "5000"), encoding="utf-8")
+    assert cli.main(["status", str(runs / "short")]) == 3
+    assert cli.main(["status", str(runs / "none")]) == 2
