@@ -10,6 +10,7 @@ in ``benchmarks/results``.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import re
 import shlex
@@ -18,17 +19,25 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from gymnasium import spaces
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
 from benchmarks.bench.text import table, times  # noqa: E402
+from rejeu import presets, validation  # noqa: E402
+from rejeu.agents import AGENTS  # noqa: E402
+from rejeu.envs.masks import n_choices  # noqa: E402
 from rejeu.presets.result import Result  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
 PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
+CURVE_WINDOW = 20
+"""Episodes over which ``benchmarks/curves.py`` averages."""
 JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
 
@@ -75,6 +84,16 @@ def result_of(data: dict[str, Any]) -> Result:
     )
 
 
+def published(result: Result) -> str:
+    """Returns the published return for the algorithm, environment and number of steps of a result, with its source."""
+    for entry in load("published.json"):
+        same = (entry["algorithm"], entry["env"], f"{entry['steps']:,} steps")
+        if same == (result.algorithm, result.env_id, result.budget) and result.measure == "mean return":
+            version = f" ({entry['version']})" if "version" in entry else ""
+            return f"[{entry['return']:.1f}]({entry['source']}){version}"
+    return ""
+
+
 def results(*algorithms: str) -> str:
     """The results of some algorithms, one row for each environment and setting."""
     rows = []
@@ -84,9 +103,109 @@ def results(*algorithms: str) -> str:
             setting = f", {result.setting}" if result.setting else ""
             figures = f"{result.measure} {result.figures}"
             rows.append(
-                (env + setting, result.budget, figures, str(result.seeds), time_of(result), f"`{result.command}`")
+                (
+                    env + setting,
+                    result.budget,
+                    figures,
+                    published(result),
+                    str(result.seeds),
+                    time_of(result),
+                    f"`{result.command}`",
+                )
             )
-    return table(("environment", "trained for", "result", "seeds", "time for each seed", "command"), rows)
+    header = ("environment", "trained for", "result", "published", "seeds", "time for each seed", "command")
+    return table(header, rows)
+
+
+def curve(algorithm: str) -> str:
+    """Return at the end of each recorded learning curve of an algorithm, mean and range over the seeds."""
+    data = load(f"curves/{algorithm}.json")
+    last = [values[-1] for values in data["returns"]]
+    return (
+        f"The last {CURVE_WINDOW} training episodes of the {len(last)} seeds have a mean return of "
+        f"{sum(last) / len(last):.1f} ({min(last):.1f} to\n{max(last):.1f}) on {data['env'].removeprefix('rejeu/')} after "
+        f"{data['steps'][-1]:,} steps (`{data['command']}`)."
+    )
+
+
+def hyperparameters(algorithm: str) -> str:
+    """Every hyperparameter of an algorithm with its default and meaning, those of its own class first."""
+    config = AGENTS[algorithm].algorithm.Config
+    docs, defaults = validation.field_docs(config), validation.field_defaults(config)
+    names = dict.fromkeys(name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()))
+    rows = []
+    for name in (name for name in names if name in defaults):
+        default = "" if dataclasses.is_dataclass(defaults[name]) else f"`{defaults[name]!r}`"
+        rows.append((f"`{name}`", default, docs[name].replace("``", "`").replace("|", "\\|")))
+    return table(("hyperparameter", "default", "meaning"), rows)
+
+
+def supported(algorithm: str) -> str:
+    """The action and observation spaces for which an algorithm can be made, and the kinds of replay and policy."""
+    agent = AGENTS[algorithm]
+    config = agent.algorithm.Config()
+    fields = validation.field_names(type(config))
+    box = spaces.Box(-1, 1, (2,))
+    actions = {
+        "Box": box,
+        "Box of integers": spaces.Box(0, 3, (2,), np.int32),
+        "Discrete": spaces.Discrete(3),
+        "MultiDiscrete": spaces.MultiDiscrete([2, 3]),
+        "MultiBinary": spaces.MultiBinary(3),
+    }
+    observations = {
+        **actions,
+        "images": spaces.Box(0, 255, (36, 36, 3), np.uint8),
+        "Dict and Tuple": spaces.Dict({"a": spaces.Tuple([box, spaces.Discrete(2)]), "b": box}),
+    }
+    possible = [name for name, space in actions.items() if can_make(agent, config, box, space)]
+    readable = [name for name, space in observations.items() if can_make(agent, config, space, actions[possible[0]])]
+    is_off_policy = "replay_buffer_class" in fields
+    rows = [
+        ("actions", ", ".join(possible)),
+        ("observations", ", ".join(readable)),
+        ("several environments", "yes"),
+        ("HER, prioritized replay, n-step returns", "yes" if is_off_policy else "no (on-policy)"),
+        ("action masks", "yes" if agent.takes_masks else "no"),
+        ("memory (LSTM, GRU)", "yes" if "cell" in validation.field_names(type(config.policy_kwargs)) else "no"),
+        ("normalization, schedules, own networks", "yes"),
+    ]
+    return table(("", "supported"), rows)
+
+
+def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_space: spaces.Space) -> bool:
+    """Returns whether an algorithm accepts these spaces."""
+    try:
+        if agent.takes_masks:
+            n_choices(action_space, "")
+        agent.algorithm.make(config, observation_space, action_space)
+    except ValueError:
+        return False
+    return True
+
+
+def training_times() -> str:
+    """The presets with their budgets and results, in the order of ``rejeu list``."""
+    found = {(result.env_id, result.algorithm): result for result in reversed(measured())}
+    rows = []
+    for preset in presets.ALL:
+        result = found.get((preset.env_id, preset.algorithm))
+        budget = f"{preset.total_steps:,}"
+        measure = f"{result.measure} {result.figures}" if result else ""
+        rows.append((preset.env_id, preset.algorithm, budget, measure, time_of(result) if result else ""))
+    return table(("environment", "algorithm", "steps of the preset", "result", "time for each seed"), rows)
+
+
+def bit_flipping() -> str:
+    """Success rates of DQN with and without HER, by the number of bits."""
+    data = load("bit_flipping.json")
+    rates = data["success_rate"]
+    rows = [
+        (name, *(f"{100 * sum(values) / len(values):.0f} %" for values in by_bits.values()))
+        for name, by_bits in rates.items()
+    ]
+    header = f"success rate, mean of {len(data['seeds'])} seeds"
+    return table((header, *(f"{n} bits" for n in next(iter(rates.values())))), rows)
 
 
 def time_of(result: Result) -> str:
@@ -245,6 +364,11 @@ def size() -> str:
 
 BLOCKS: dict[str, Callable[..., str]] = {
     "results": results,
+    "curve": curve,
+    "hyperparameters": hyperparameters,
+    "supported": supported,
+    "presets": training_times,
+    "bit-flipping": bit_flipping,
     "ball": ball,
     "parking": parking,
     "speed": speed,

@@ -35,6 +35,8 @@ def parse(src: Path) -> dict[str, tuple[Path, ast.Module]]:
     """Returns path and syntax tree of every module of the package, by dotted name."""
     modules = {}
     for path in sorted((src / PACKAGE).rglob("*.py")):
+        if not path.stem.isidentifier():  # a notebook of the courses
+            continue
         parts = path.relative_to(src).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         modules[name] = path, ast.parse(path.read_text(encoding="utf-8"))

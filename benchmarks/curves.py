@@ -1,0 +1,126 @@
+"""Records the learning curves of the pages on algorithms, and plots them.
+
+    python benchmarks/curves.py record SAC     # trains three seeds; writes benchmarks/results/curves/SAC.json
+    python benchmarks/curves.py plot           # writes docs/images/curves/ALGORITHM.png for each of these files
+
+A curve is the mean return of the latest 20 training episodes, exploration included, at 100 equally spaced steps. The dashed
+line is the published return of ``benchmarks/results/published.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rejeu
+from rejeu import presets, validation
+from rejeu.algorithms import config as configs
+from rejeu.envs import make_vector
+from rejeu.reporting.plots import style
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS, PICTURES = ROOT / "benchmarks" / "results", ROOT / "docs" / "images" / "curves"
+SEEDS = (0, 1, 2)
+WINDOW, POINTS = 20, 100
+ENVIRONMENTS = {
+    **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ", "PPO"), "Pendulum-v1"),
+    **dict.fromkeys(("DQN", "QRDQN", "A2C"), "CartPole-v1"),
+    "RecurrentPPO": "rejeu/CartPoleNoVelocity-v0",
+}
+WITHOUT_PRESET = {
+    # The tuned values of RL Zoo for QR-DQN on CartPole-v1.
+    "QRDQN": presets.Preset(
+        env_id="CartPole-v1",
+        algorithm="QRDQN",
+        hyperparameters={
+            "learning_rate": 2.3e-3,
+            "batch_size": 64,
+            "buffer_size": 100_000,
+            "learning_starts": 1_000,
+            "target_update_interval": 10,
+            "train_freq": 256,
+            "gradient_steps": 128,
+            "exploration_fraction": 0.16,
+            "exploration_final_eps": 0.04,
+            "n_quantiles": 10,
+            "policy_kwargs": {"net_arch": [256, 256]},
+        },
+        source="RL Zoo",
+        n_envs=1,
+        total_steps=50_000,
+        evaluate_every=5_000,
+        evaluate_episodes=20,
+    )
+}
+
+
+def curve(steps: np.ndarray, returns: np.ndarray, grid: np.ndarray) -> list[float | None]:
+    """Returns the mean of the latest episodes at each step of the grid, None before the first episode has ended."""
+    finished = np.searchsorted(steps, grid, side="right")
+    return [round(float(np.mean(returns[max(n - WINDOW, 0) : n])), 2) if n else None for n in finished]
+
+
+def record(name: str) -> None:
+    """Trains an algorithm on all seeds and writes its curves."""
+    env_id = ENVIRONMENTS[name]
+    preset = WITHOUT_PRESET.get(name) or presets.find(env_id, name)
+    assert preset is not None, f"there is no preset of {name} for {env_id}"
+    grid = np.linspace(0, preset.total_steps, POINTS + 1)[1:].astype(int)
+    curves = []
+    for seed in SEEDS:
+        env = make_vector(env_id, preset.n_envs, preset.backend, seed)
+        agent = rejeu.AGENTS[name]("MlpPolicy", env, seed=seed, **preset.hyperparameters).learn(preset.total_steps)
+        assert not agent.interrupted
+        curves.append(curve(agent.history["step"], agent.history["return"], grid))
+        print(name, seed, curves[-1][-1], flush=True)
+    versions = {package: importlib.metadata.version(package) for package in ("jax", "gymnasium", "envpool")}
+    data: dict[str, Any] = {"command": f"python benchmarks/curves.py record {name}", "env": env_id, "algorithm": name}
+    config = validation.build(rejeu.AGENTS[name].algorithm.Config, preset.hyperparameters)
+    data |= {"versions": versions, "hyperparameters": configs.to_json(config), "seeds": SEEDS}
+    data |= {"steps": grid.tolist(), "returns": curves}
+    path = RESULTS / "curves" / f"{name}.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(data) + "\n", encoding="utf-8")
+
+
+def plot(path: Path, published: list[dict[str, Any]]) -> None:
+    """Plots the curves of one file: every seed, their mean, and the published return."""
+    data = json.loads(path.read_text(encoding="utf-8"))
+    returns = np.array(data["returns"], float)  # None becomes NaN
+    figure = style.make_figure("the learning curve", height=3.4)
+    panel = figure.subplots()
+    style.format_axes(panel)
+    for values in returns:
+        panel.plot(data["steps"], values, color=style.DOT_COLOR, linewidth=0.8, alpha=0.7)
+    panel.plot(data["steps"], returns.mean(axis=0), label=f"mean of {len(returns)} seeds", **style.LINE)
+    for entry in published:
+        if (entry["algorithm"], entry["env"]) == (data["algorithm"], data["env"]):
+            label = f"published: {entry['by']}, {entry['return']:.0f}"
+            panel.axhline(entry["return"], color=style.ACCENT_COLOR, linewidth=1.4, linestyle="--", label=label)
+    panel.set(xlabel="environment steps", ylabel=f"return, last {WINDOW} episodes")
+    panel.xaxis.set_major_formatter("{x:,.0f}")
+    style.add_title_and_legend(panel, f"{data['algorithm']} on {data['env'].removeprefix('rejeu/')}")
+    style.save(figure, PICTURES / f"{data['algorithm']}.png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("record", "plot"))
+    parser.add_argument("algorithm", nargs="?", choices=tuple(ENVIRONMENTS))
+    given = parser.parse_args()
+    if given.action == "record":
+        for name in [given.algorithm] if given.algorithm else ENVIRONMENTS:
+            record(name)
+        return
+    published = json.loads((RESULTS / "published.json").read_text(encoding="utf-8"))
+    for path in sorted((RESULTS / "curves").glob("*.json")):
+        plot(path, published)
+
+
+if __name__ == "__main__":
+    main()
