@@ -55,6 +55,21 @@ def strict_dtypes() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def forget_registered_algorithms() -> Iterator[None]:
+    """Removes the algorithms and presets that a test registered, for example with a page of the documentation."""
+    import rejeu
+    from rejeu import presets
+
+    registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered)
+    before = [dict(registry) for registry in registries]
+    yield
+    for registry, entries in zip(registries, before, strict=True):
+        if registry != entries:
+            registry.clear()
+            registry.update(entries)
+
+
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shortens the training and the evaluations of an example."""

@@ -13,6 +13,7 @@ import rejeu
 from benchmarks.bench import __main__ as command, machine, plan, report, runner, summary
 from benchmarks.bench.work import buffers
 from benchmarks.bench.work.flops import flops, off_policy, sac_by_hand
+from tests.tiers import exhaustive
 
 X = np.ones((32, 32), np.float32)
 PRODUCT = 2 * 32**3
@@ -103,6 +104,7 @@ def row_of(text, *cells):
     raise AssertionError(f"no row {cells} in\n{text}")
 
 
+@exhaustive
 def test_the_page_has_medians_spreads_ratios_of_rounds_and_limits(results, tmp_path):
     page = tmp_path / "performance.md"
     report.write(results, page)
@@ -146,6 +148,7 @@ def test_the_page_of_some_cases_alone_leaves_the_others_out(results, tmp_path):
     assert not (tmp_path / "images" / "speed-replay.png").exists()
 
 
+@exhaustive
 def test_the_page_names_what_failed_and_what_was_disturbed(results, tmp_path):
     results["samples"][0]["others_busy"] = 1.5
     failed = results["samples"][-1]
@@ -157,6 +160,7 @@ def test_the_page_names_what_failed_and_what_was_disturbed(results, tmp_path):
     assert "cores before 1 of the measurements" in text
 
 
+@exhaustive
 def test_a_smoke_run_says_on_its_page_that_it_means_nothing(results, tmp_path):
     results["settings"]["quick"] = True
     report.write(results, tmp_path / "page.md")
@@ -183,6 +187,7 @@ def test_every_measurement_has_a_name_of_its_own():
     assert {measurement.key for measurement in plan.everything(quick=True)} < set(keys)
 
 
+@exhaustive
 def test_samples_are_kept_at_once_and_resumed_and_errors_tried_again(tmp_path):
     good = plan.Measurement("memory", "parking", "rejeu", "memory", {"library": "rejeu", "kind": "parking", "n": 1000})
     bad = plan.Measurement("memory", "nonsense", "rejeu", "memory", {"library": "rejeu", "kind": "nonsense", "n": 1000})
@@ -250,6 +255,7 @@ def test_operations_are_counted_through_loops_and_conditionals(function, expecte
     assert flops(function, X, **settings) == pytest.approx(expected * PRODUCT, rel=1e-3)
 
 
+@exhaustive
 def test_the_count_of_an_update_is_that_by_hand_and_what_is_elementwise():
     agent = rejeu.SAC(
         "MlpPolicy", "Pendulum-v1", batch_size=64, policy_kwargs={"net_arch": [64, 64]}, buffer_size=1000, seed=0

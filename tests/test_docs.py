@@ -19,7 +19,9 @@ from typing import NamedTuple
 import pytest
 
 import rejeu
-from rejeu import cli
+from rejeu import cli, validation
+from rejeu.algorithms import ppo, sac
+from rejeu.cli import settings
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -60,8 +62,17 @@ def commands(page):
     return [shlex.split(part, comments=True)[1:] for part in parts if part.startswith("rejeu ")]
 
 
+def table_commands(page):
+    """Returns the arguments of each ``rejeu`` command in the tables of a page."""
+    rows = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("|")]
+    spans = [span for row in rows for span in re.findall(r"`(rejeu [^`]+)`", row)]
+    return [shlex.split(span)[1:] for span in spans]
+
+
+PAGES_WITH_COMMANDS_IN_TABLES = [ROOT / "docs" / name for name in ("coming-from-rl-zoo.md", "coming-from-cleanrl.md")]
 PYTHON_PAGES = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
 COMMANDS = [(page, arguments) for page in PAGES for arguments in commands(page)]
+COMMANDS += [(page, arguments) for page in PAGES_WITH_COMMANDS_IN_TABLES for arguments in table_commands(page)]
 
 
 def name(value):
@@ -145,10 +156,16 @@ def test_blocks_are_found_in_the_pages():
     assert len(COMMANDS) > 10
 
 
+def script(name):
+    """Returns a module of the folder ``scripts``."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_figures_in_pages_are_those_of_the_data():
-    spec = importlib.util.spec_from_file_location("figures", ROOT / "scripts" / "figures.py")
-    figures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(figures)
+    figures = script("figures")
     outdated = [path for path, text in figures.rendered() if path.read_text(encoding="utf-8") != text]
     assert not outdated, "run: python scripts/figures.py"
 
@@ -157,3 +174,45 @@ def test_links_between_pages_lead_somewhere():
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\((?!https?:)([^)#\s]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_links_to_the_source_name_definitions():
+    source_links, errors = script("source_links"), []
+    for page in [*PAGES, ROOT / "CHANGELOG.md"]:
+        source_links.resolved(page.read_text(encoding="utf-8"), page.parent, page.parent, errors.append)
+    assert not errors
+
+
+def test_a_link_to_a_definition_that_does_not_exist_is_found():
+    source_links, errors = script("source_links"), []
+    link, docs = "[here](../src/rejeu/core.py#{})", ROOT / "docs"
+    assert re.fullmatch(
+        r"\[here\]\(https://.*/blob/main/src/rejeu/core.py#L\d+-L\d+\)",
+        source_links.resolved(link.format("Algorithm.update"), docs, docs, errors.append),
+    )
+    assert not errors
+    for name in ("Algoritm", "Algorithm.updates", "polyak.nothing"):
+        source_links.resolved(link.format(name), docs, docs, errors.append)
+    source_links.resolved("[here](nowhere.md)", docs, docs, errors.append)
+    code = f"```\n{link.format('nothing')}\n```\n"
+    assert source_links.resolved(code, docs, docs, errors.append) == code
+    assert len(errors) == 4
+
+
+def test_the_home_page_links_to_every_page_on_an_algorithm():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    pages = sorted(path.name for path in (ROOT / "docs" / "algorithms").glob("*.md"))
+    assert len(pages) == len(rejeu.agents.registry.BUILT_IN)
+    assert [page for page in pages if f"(algorithms/{page})" not in index] == []
+
+
+def test_the_settings_of_the_page_on_rl_zoo_exist():
+    page = (ROOT / "docs" / "coming-from-rl-zoo.md").read_text(encoding="utf-8")
+    spans = re.findall(r"`((?:rejeu train [^`]*)?--set [^`]+)`", page)
+    assert len(spans) > 8
+    for span in spans:
+        words = shlex.split(span)
+        given = settings.apply(words[words.index("--set") + 1 :], {})
+        config = ppo.Config if "clip_range" in given or "vf" in span else sac.Config
+        hindsight = {"replay_buffer_class": "HerReplayBuffer"} if "replay_buffer_kwargs" in given else {}
+        validation.build(config, given | hindsight)

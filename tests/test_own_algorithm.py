@@ -47,16 +47,6 @@ class CarriedReach(Reach):
 
 
 @pytest.fixture
-def forget():
-    """Removes what a test registers."""
-    agents, registered = dict(rejeu.AGENTS), dict(presets.registered)
-    yield
-    for target, before in ((rejeu.AGENTS, agents), (presets.registered, registered)):
-        target.clear()
-        target.update(before)
-
-
-@pytest.fixture
 def site(tmp_path):
     """A folder as pip would install the algorithm into, with its entry point."""
     folder = tmp_path / "site"
@@ -69,7 +59,7 @@ def site(tmp_path):
 
 
 @pytest.fixture
-def awac(site, forget, monkeypatch):
+def awac(site, monkeypatch):
     """The installed module, imported."""
     monkeypatch.syspath_prepend(site)
     yield importlib.import_module("awac")
@@ -220,7 +210,7 @@ def test_a_metric_may_be_a_python_number(awac):
     assert float(agent.run.metrics["constant"]) == 1.5
 
 
-def test_the_file_works_as_a_notebook_cell(forget):
+def test_the_file_works_as_a_notebook_cell():
     pytest.importorskip("IPython")
     from IPython.core.interactiveshell import InteractiveShell
 
@@ -234,7 +224,7 @@ def test_the_file_works_as_a_notebook_cell(forget):
         InteractiveShell.clear_instance()
 
 
-def test_a_class_without_source_has_a_docstring(forget):
+def test_a_class_without_source_has_a_docstring():
     namespace = {"__name__": "nowhere"}
     exec(SOURCE.read_text(), namespace)
     assert "beta: Default: 1.0." in namespace["AWAC"].__doc__

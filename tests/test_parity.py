@@ -22,7 +22,7 @@ from scipy import stats
 
 from rejeu import presets, spaces
 from rejeu.envs.make import make_vector
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 LANDERS = "LunarLander-v3", "LunarLanderContinuous-v3"
 
@@ -403,6 +403,7 @@ def test_engines_push_alike(env_id, engine):
         assert stats.ks_2samp(one[:, column], two[:, column]).pvalue > 1e-3, column
 
 
+@exhaustive
 @pytest.mark.parametrize(("policy", "episodes_each"), [(anything, 20), (landing, 8)])
 @pytest.mark.parametrize("env_id", only(LANDERS[:1], LANDERS))
 def test_landers_end_alike(env_id, policy, episodes_each):

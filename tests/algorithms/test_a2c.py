@@ -64,7 +64,8 @@ def test_three_updates_equal_numpy(name):
         state, metrics = update(state, rollout, CLOCK)
         given = by_hand.Network(state.network).everything
         assert_equal_layers(given, hand.network.everything, f"after rollout {k}", atol=1e-5)
-        for field in ("policy_loss", "value_loss", "entropy"):
+        expected["entropy_loss"] = -expected["entropy"]
+        for field in ("policy_loss", "value_loss", "entropy_loss"):
             assert float(metrics[field]) == pytest.approx(expected[field], rel=1e-4, abs=1e-5), field
         if kind == "box":
             assert float(metrics["std"]) == pytest.approx(np.exp(hand.network.log_std[0][0]).mean(), rel=1e-5)

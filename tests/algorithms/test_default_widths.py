@@ -14,6 +14,7 @@ from rejeu.callbacks import Checkpoint
 from rejeu.io import checkpoint
 from rejeu.spaces import leaves
 from tests.environments import Sampled
+from tests.tiers import exhaustive
 
 IMAGE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
 VECTOR = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -69,6 +70,7 @@ def test_widths_that_are_asked_for_are_built_on_images_too(shape):
     assert widths_of(*networks_of("DQN", IMAGE, policy_kwargs=shape)) == [5]
 
 
+@exhaustive
 def test_a_network_without_hidden_layers_learns():
     agent = rejeu.PPO("CnnPolicy", Sampled(IMAGE, DISCRETE), n_steps=10, batch_size=10, n_epochs=1, seed=0)
     before = agent.get_parameters()

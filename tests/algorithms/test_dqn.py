@@ -19,6 +19,7 @@ from rejeu.io.checkpoint import tree_to_arrays
 from rejeu.schedules import at
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
+from tests.tiers import exhaustive
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "dqn_sb3.npz"
 OBS_DIM, N_ACTIONS, BATCH = 3, 4, 8
@@ -521,6 +522,7 @@ def test_bits_are_flipped_to_the_goal_with_hindsight():
     assert bit_flipping_success(0, hindsight=True) > 0.9
 
 
+@exhaustive
 def test_bits_are_not_flipped_to_the_goal_without_hindsight():
     assert bit_flipping_success(0, hindsight=False) < 0.1
 

@@ -52,8 +52,9 @@ def test_everything_moves_and_stays_finite(kind):
     assert all(np.isfinite(array).all() for array in agent.get_parameters().values())
     row = agent.statistics()
     assert all(np.isfinite(value) for value in row.values()), row
-    keys = {"policy_loss", "value_loss", "entropy", "explained_variance", "n_updates"}
-    keys |= {"approx_kl", "clip_fraction", "learning_rate"} if kind.name == "PPO" else set()
+    keys = {"value_loss", "entropy_loss", "explained_variance", "n_updates", "learning_rate"}
+    ppo = {"loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "clip_range"}
+    keys |= ppo if "PPO" in kind.name else {"policy_loss"}
     keys |= {"std"} if kind.wrapper is None else set()
     assert {f"train/{key}" for key in keys} <= set(row)
     assert row["rollout/ep_len_mean"] == 5.0

@@ -351,8 +351,13 @@ def test_two_updates_equal_numpy(name):
         given, numbers = by_hand.Network(state.network), hand.network
         assert int(state.n_updates) == hand.n_updates
         assert_equal_layers(given.everything, numbers.everything, f"after rollout {k}", atol=3e-5)
-        for field in ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"):
+        for field in ("value_loss", "approx_kl", "clip_fraction"):
             assert float(metrics[field]) == pytest.approx(expected[field], rel=1e-3, abs=1e-5), field
+        assert float(metrics["policy_gradient_loss"]) == pytest.approx(expected["policy_loss"], rel=1e-3, abs=1e-5)
+        assert float(metrics["entropy_loss"]) == pytest.approx(-expected["entropy"], rel=1e-3, abs=1e-5)
+        assert float(metrics["clip_range"]) == pytest.approx(schedule[0])
+        total = expected["policy_loss"] + config.vf_coef * expected["value_loss"] - schedule[2] * expected["entropy"]
+        assert float(metrics["loss"]) == pytest.approx(total, rel=1e-3, abs=1e-4)
         assert float(metrics["learning_rate"]) == pytest.approx(rates[0])
         if kind == "box":
             assert float(metrics["std"]) == pytest.approx(np.exp(numbers.log_std[0][0]).mean(), rel=1e-4)

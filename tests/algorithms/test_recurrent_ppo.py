@@ -23,7 +23,7 @@ from rejeu.spaces import leaves
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters, same_parameters
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (3,), np.float32)
@@ -357,6 +357,7 @@ def test_minibatches_are_whole_environments_each_used_once_an_epoch(monkeypatch,
     assert len({tuple(epoch) for epoch in epochs}) > 1 or n_envs == 1 or len(sizes) == 1
 
 
+@exhaustive
 def test_updates_are_counted_by_minibatches_of_whole_environments():
     """3 environments of 6 steps, 1 to a minibatch, 2 epochs: 6 gradient steps, though 18 steps fill two batches of 12."""
     agent = small(InProcess([Spy(), Spy(), Spy()]), batch_size=11).learn(36)
@@ -401,6 +402,7 @@ def test_a_policy_that_remembers_solves_what_only_memory_can(kind, tmp_path):
     assert played.mean_return >= 0.8
 
 
+@exhaustive
 def test_a_policy_without_memory_does_not():
     _, evaluation = recalling(rejeu.PPO)
     assert abs(evaluation.mean_return) < 0.4  # a coin's mean of 60 has the deviation 0.13
@@ -496,6 +498,7 @@ def test_evaluation_carries_memory_and_begins_anew_with_each_episode(bold):
                 obs, _ = twin.reset()
 
 
+@exhaustive
 def test_a_shared_memory_is_one():
     one, two = small(policy_kwargs={**SMALL["policy_kwargs"], "shared_lstm": True}), small()
     assert len(one.state.network.cells) == 1
@@ -577,6 +580,7 @@ def test_a_file_keeps_all_of_it(kind, tmp_path):
         assert np.array_equal(one, other)
 
 
+@exhaustive
 def test_memory_is_begun_anew_when_training_is(agent):
     """After an evaluation on its own environment the agent goes on learning, with new episodes and rollout."""
     other = small().learn(8)

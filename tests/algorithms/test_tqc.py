@@ -14,6 +14,7 @@ import rejeu
 from rejeu.algorithms import tqc
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.core import TD_ERROR, Clock, Transition
+from tests.tiers import exhaustive
 
 OBS_DIM, ACTION_DIM, BATCH, N_CRITICS, N_QUANTILES = 3, 2, 6, 2, 5
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
@@ -216,6 +217,7 @@ def test_targets_move_by_tau_towards_the_new_critics_every_target_update_interva
     np.testing.assert_allclose(second.target_critics.head.weight, expected, atol=1e-6)
 
 
+@exhaustive
 def test_a_fixed_temperature_stays():
     update, state = make(ent_coef=0.2)
     after, metrics = update(state, random_batch(), CLOCK)

@@ -35,6 +35,7 @@ from rejeu.networks import (
     image_shape,
 )
 from rejeu.spaces import leaves
+from tests.tiers import exhaustive
 
 DOCUMENT = {
     "action_layers": (16, 32),
@@ -555,6 +556,7 @@ def test_an_agent_with_own_modules_learns_and_loads(agent, tmp_path):
 # --- in an agent ----------------------------------------------------------------------------------------------------
 
 
+@exhaustive
 @pytest.mark.parametrize("kind", ["branches", "own"])
 def test_an_agent_of_any_shape_learns(kind, tmp_path):
     settings = {"policy_kwargs": SHAPES[kind], "learning_starts": 20, "batch_size": 8, "buffer_size": 300}

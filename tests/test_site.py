@@ -1,0 +1,53 @@
+"""The documentation site builds without warnings and works without a network."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rejeu
+from rejeu import sb3
+
+ROOT = Path(__file__).parents[1]
+LOADED = re.compile(r"<(?:script|img|iframe|source)[^>]*\ssrc=\"([^\"]+)\"|<link[^>]*\shref=\"([^\"]+)\"")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Builds the site as ``scripts/docs`` does and returns its folder."""
+    for package in ("furo", "myst_nb", "sphinx_copybutton"):
+        pytest.importorskip(package)
+    folder = tmp_path_factory.mktemp("site")
+    command = (ROOT / "scripts" / "docs").read_text(encoding="utf-8").splitlines()[-1].split()
+    options = command[command.index("sphinx") + 1 : command.index("-d")]
+    command = [sys.executable, "-m", "sphinx", *options, "-d", str(folder / "doctrees"), "docs", str(folder / "html")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "html"
+
+
+@pytest.mark.exhaustive  # half a minute
+def test_the_site_builds_without_warnings(site):
+    assert (site / "index.html").exists()
+    assert (site / "searchindex.js").exists()
+
+
+@pytest.mark.exhaustive
+def test_pages_load_nothing_from_the_network(site):
+    for page in site.rglob("*.html"):
+        for script, link in LOADED.findall(page.read_text(encoding="utf-8")):
+            target = script or link
+            assert not target.startswith(("http", "//")), f"{page.name} loads {target}"
+            if not target.startswith("data:"):
+                assert (page.parent / target.split("?")[0].split("#")[0]).exists(), f"{page.name} has no {target}"
+
+
+def test_the_reference_has_every_public_name():
+    pages = [page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.rst")]
+    documented = set(re.findall(r"^\.\. auto\w+:: (rejeu\.[\w.]+)", "\n".join(pages), re.MULTILINE))
+    names = {f"rejeu.{name}" for name in [*rejeu.__all__, *sb3.__all__]} - {"rejeu.AGENTS", "rejeu.plots"}
+    assert names - documented == set()
