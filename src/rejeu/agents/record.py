@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,10 +37,18 @@ def record(agent: BaseAgent, path: Path, evaluations: Sequence[tuple[int, Evalua
         env_id="" if env is None else env.env_id,
         seed=agent.seed,
         n_envs=None if env is None else env.n_envs,
-        hyperparameters=configs.to_json(agent.config),
+        hyperparameters=configs.to_json(given_config(agent)),
         state="running" if agent.is_learning else "finished",
         steps=agent.run.step,
         seconds=agent.seconds["total"],
         episodes=Episodes(*(history[column] for column in COLUMNS)),
         evaluations=Table({name: np.array(values, np.float64) for name, values in columns.items()}),
     )
+
+
+def given_config(agent: BaseAgent) -> Any:
+    """Returns the configuration of an agent without the widths of layers that follow from its observations."""
+    config = agent.config
+    default = type(config)()
+    is_default = config.policy_kwargs == configs.with_widths(default, agent.obs_leaves).policy_kwargs
+    return dataclasses.replace(config, policy_kwargs=default.policy_kwargs) if is_default else config

@@ -3,11 +3,13 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu.agents.record import record
 from rejeu.cli import main
 from rejeu.loops.run import Episode
 from rejeu.reporting.evaluation import Evaluation
@@ -204,3 +206,9 @@ def test_page_of_an_agent_without_a_run_folder(tmp_path):
     assert "default 0.99" in text
     assert sum(data_of(text)["histograms"]["run0-episodes"]["counts"]) == 2
     assert "rejeu train" not in text  # the run is not repeated by a command
+
+
+@pytest.mark.parametrize(("given", "changed"), [({}, False), ({"net_arch": [8]}, True)])
+def test_widths_that_follow_from_the_observations_are_no_change(given, changed):
+    agent = rejeu.PPO("MlpPolicy", "CartPole-v1", policy_kwargs=given)
+    assert any("net_arch" in name for name in record(agent, Path("agent"), []).changed) is changed
