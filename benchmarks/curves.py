@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import json
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -81,11 +82,17 @@ def record(name: str) -> None:
     versions = {package: importlib.metadata.version(package) for package in ("jax", "gymnasium", "envpool")}
     data: dict[str, Any] = {"command": f"python benchmarks/curves.py record {name}", "env": env_id, "algorithm": name}
     config = validation.build(rejeu.AGENTS[name].algorithm.Config, preset.hyperparameters)
-    data |= {"versions": versions, "hyperparameters": configs.to_json(config), "seeds": SEEDS}
+    data |= {"commit": commit(), "versions": versions, "hyperparameters": configs.to_json(config), "seeds": SEEDS}
     data |= {"steps": grid.tolist(), "returns": curves}
     path = RESULTS / "curves" / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(data) + "\n", encoding="utf-8")
+
+
+def commit() -> str:
+    """Returns the commit of this checkout."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def plot(path: Path, published: list[dict[str, Any]]) -> None:
