@@ -9,7 +9,7 @@ import inspect
 import itertools
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, TypeVar
 
@@ -114,6 +114,25 @@ def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
         if key not in names:
             raise TypeError(unknown_name(key, names, f"{context}{getattr(kind, 'name', '') or kind.__name__}"))
     return kind(**given)
+
+
+def with_value(mapping: Mapping[str, Any], path: Sequence[str], value: Any, name: str) -> dict[str, Any]:
+    """Returns a copy of a mapping with one value set; a path of several keys reaches into nested mappings.
+
+    Raises:
+        TypeError: if the path reaches into something else than a mapping; the message begins with ``name``.
+
+    >>> with_value({"a": {"b": 1}}, ["a", "c"], 2, "--set a.c")
+    {'a': {'b': 1, 'c': 2}}
+    """
+    head, *rest = path
+    if not rest:
+        return {**mapping, head: value}
+    inner = mapping.get(head)
+    inner = {} if inner is None else inner
+    if not isinstance(inner, Mapping):
+        raise TypeError(f"{name}: {head}={inner!r} has no parts to set")
+    return {**mapping, head: with_value(inner, rest, value, name)}
 
 
 ELSEWHERE = {

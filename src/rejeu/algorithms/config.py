@@ -15,7 +15,8 @@ from typing import Any, ClassVar, Literal
 import optax
 
 from rejeu import normalization, schedules
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
+from rejeu.algorithms.search import SearchSpace
 from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.errors import MissingObjectError
@@ -96,6 +97,8 @@ class OffPolicyConfig:
     """Default widths of the networks."""
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
     """The same where the observation is an image."""
+    search_space: ClassVar[SearchSpace] = search.OFF_POLICY
+    """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
 
     def __post_init__(self) -> None:
         coerce(self, "learning_rate", schedules.parse, least=0)

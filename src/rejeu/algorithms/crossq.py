@@ -31,10 +31,11 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.sac import temperature
 from rejeu.algorithms.sac.continuous import LOG_STD_RANGE
 from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of, temperature_step
+from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
 from rejeu.distributions import TanhNormal
 from rejeu.networks import PolicyConfig, Widths
@@ -68,6 +69,10 @@ class Config(EntropyConfig):
     tau: ClassVar[float] = 1.0  # type: ignore[misc]
 
     name: ClassVar[str] = "CrossQ"
+    search_space: ClassVar[SearchSpace] = {
+        **{name: one for name, one in search.OFF_POLICY.items() if name != "tau"},
+        "policy_delay": Integers(1, 4),
+    }
     hidden_layers: ClassVar[Widths] = Widths(ACTOR_LAYERS, CRITIC_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
 

@@ -30,8 +30,9 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
+from rejeu.algorithms.search import SearchSpace
 from rejeu.core import (
     AVERAGED,
     TD_ERROR,
@@ -86,6 +87,7 @@ class QLearningConfig(OffPolicyConfig):
 
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
+    search_space: ClassVar[SearchSpace] = search.Q_LEARNING
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)

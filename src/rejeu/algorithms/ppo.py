@@ -33,7 +33,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu import schedules
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic import (
     ActorCritic,
     OnPolicyConfig,
@@ -47,6 +47,7 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardized,
 )
+from rejeu.algorithms.search import SearchSpace
 from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
@@ -74,6 +75,7 @@ class Config(OnPolicyConfig):
     """Stops the epochs once the KL divergence exceeds 1.5 times this value, in nats. None never stops."""
 
     name: ClassVar[str] = "PPO"
+    search_space: ClassVar[SearchSpace] = search.PPO
 
     def __post_init__(self) -> None:
         OnPolicyConfig.__post_init__(self)

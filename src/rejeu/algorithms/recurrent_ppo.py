@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers, ppo
+from rejeu.algorithms import optimizers, ppo, search
 from rejeu.algorithms.actor_critic import (
     HIDDEN_GAIN,
     ActionKind,
@@ -38,6 +38,7 @@ from rejeu.algorithms.actor_critic import (
     with_advantages,
 )
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
+from rejeu.algorithms.search import Choice, SearchSpace
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew
 from rejeu.networks import make_encoder
@@ -85,6 +86,11 @@ class Config(ppo.Config):
     takes."""
 
     name: ClassVar[str] = "RecurrentPPO"
+    search_space: ClassVar[SearchSpace] = {
+        **search.PPO,
+        "n_steps": Choice((32, 64, 128, 256)),
+        "policy_kwargs.lstm_hidden_size": Choice((16, 32, 64, 128, 256)),
+    }
 
     def __post_init__(self) -> None:
         coerce(self, "policy_kwargs", nested, kind=RecurrentConfig)

@@ -24,10 +24,11 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, with_widths
 from rejeu.algorithms.ddpg.continuous import actor_loss, explore, policy
 from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, metrics_of
+from rejeu.algorithms.search import SearchSpace
 from rejeu.core import (
     AVERAGED,
     Algorithm,
@@ -68,6 +69,7 @@ class Config(OffPolicyConfig):
     """Number of critics; the target is the minimum of their values."""
 
     name: ClassVar[str] = "TD3"
+    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, **search.ACTION_NOISE}
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
 

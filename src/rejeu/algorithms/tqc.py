@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
@@ -35,6 +35,7 @@ from rejeu.algorithms.sac.continuous import (
     temperature_and_targets,
 )
 from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of
+from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network, QNetwork
 from rejeu.prng import nth
@@ -55,6 +56,7 @@ class Config(EntropyConfig):
     """Gradient steps between two updates of the target critics."""
 
     name: ClassVar[str] = "TQC"
+    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, "top_quantiles_to_drop_per_net": Integers(0, 5)}
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rejeu.io.records import MAX_ENVS
-from rejeu.validation import number, whole
+from rejeu.validation import number, whole, with_value
 
 MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
@@ -67,7 +67,7 @@ def apply(assignments: Iterable[str], before: Mapping[str, Any], option: str = "
         if not equals or not all(path):
             example = "learning_rate=1e-3" if option == "--set" else "sigma=2"
             raise ValueError(f"{option} {assignment!r} must be name=value, such as {example}")
-        result = _put(result, path, value(text), f"{option} {name}")
+        result = with_value(result, path, value(text), f"{option} {name}")
     return result
 
 
@@ -92,14 +92,3 @@ def written(what: Any) -> str:
     [2, '8x8', True, [1, 'a'], '2']
     """
     return what if isinstance(what, str) and value(what) == what else json.dumps(what, default=str)
-
-
-def _put(mapping: Mapping[str, Any], path: list[str], new: Any, name: str) -> dict[str, Any]:
-    head, *rest = path
-    if not rest:
-        return {**mapping, head: new}
-    inner = mapping.get(head)
-    inner = {} if inner is None else inner
-    if not isinstance(inner, Mapping):
-        raise TypeError(f"{name}: {head}={inner!r} has no parts to set")
-    return {**mapping, head: _put(inner, rest, new, name)}

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from rejeu import normalization, schedules
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
+from rejeu.algorithms.search import SearchSpace
 from rejeu.networks import PolicyConfig, Widths, convolutions, split_net_arch
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
@@ -125,6 +126,8 @@ class OnPolicyConfig:
     """Default widths of policy and value."""
     hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
     """The same where the observation is an image."""
+    search_space: ClassVar[SearchSpace] = search.ON_POLICY
+    """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
 
     def __post_init__(self) -> None:
         coerce(self, ("learning_rate", "ent_coef"), schedules.parse, least=0)

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from rejeu.algorithms import search
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms.search import SearchSpace
 from rejeu.core import AVERAGED, TD_ERROR, Metrics, PyTree, copy, polyak, tau_at
 from rejeu.networks import Network, Widths
 from rejeu.schedules import Schedule
@@ -31,6 +33,7 @@ class Config(OffPolicyConfig):
     """Gradient steps between two updates of both target networks. A larger interval is more stable and slower."""
 
     name: ClassVar[str] = "DDPG"
+    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, **search.ACTION_NOISE}
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
 
