@@ -52,6 +52,8 @@ class Train(EnvironmentOptions):
     """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
     algo: Name = None
     """Algorithm; by default the preset's, else the one that fits the environment's actions."""
+    preset: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Use the preset in this file, such as the preset.json of rejeu tune, in the place of rejeu's own."""
     steps: Count = None
     """Environment steps to take, over all environments; by default the preset's, else 100000."""
     minutes: Minutes = None
@@ -84,6 +86,8 @@ class Train(EnvironmentOptions):
     """Episodes of each evaluation; by default the preset's, else 20."""
     no_report: Annotated[bool, FlagCreatePairsOff] = False
     """Write no report.html at the end."""
+    no_video: Annotated[bool, FlagCreatePairsOff] = False
+    """Record no video at the end."""
     log: Annotated[Assignments, UseAppendAction, arg(metavar="NAME ...")] = ()
     """Log to these too: json, tensorboard, wandb, mlflow, trackio. metrics.csv is always written."""
     json: Json = False
@@ -105,6 +109,8 @@ class Resume(RunOptions):
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
     no_report: Annotated[bool, FlagCreatePairsOff] = False
     """Write no report.html at the end."""
+    no_video: Annotated[bool, FlagCreatePairsOff] = False
+    """Record no video at the end."""
     json: Json = False
     """Print the result as one JSON document, and messages to standard error."""
 

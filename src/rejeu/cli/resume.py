@@ -46,6 +46,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
                 limits,
                 is_new=False,
                 has_report=not arguments.no_report,
+                has_video=not arguments.no_video,
             )
             return session.run(stop, stopwatch)
 

@@ -70,6 +70,8 @@ class Session(NamedTuple):
     """Whether the run begins here, rather than being resumed."""
     has_report: bool = True
     """Whether ``report.html`` is written at the end."""
+    has_video: bool = True
+    """Whether a video is recorded at the end."""
 
     def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
         """Trains, evaluates, plots and records a video; prints a summary, and returns the exit status and the result.
@@ -87,7 +89,8 @@ class Session(NamedTuple):
                 with leaving(f"interrupted after training; the models are saved in {folder.path}"):
                     evaluate_now(evaluate, agent)
                     self.plot_curve(evaluate)
-                    self.record_video(outputs)
+                    if self.has_video:
+                        self.record_video(outputs)
             else:
                 self.plot_curve(evaluate)
                 options = self.environment.options()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from contextlib import closing
 from itertools import chain
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu import presets, validation
-from rejeu.agents import AGENTS, find_agent
+from rejeu.agents import AGENTS, agent_of_file, find_agent
 from rejeu.algorithms import config as configs
 from rejeu.cli import environment, jsonout, run_folder, seeds, settings
 from rejeu.cli.commands import Train
@@ -21,6 +22,7 @@ from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
 from rejeu.interrupt import Interrupt
+from rejeu.io.records import shown
 from rejeu.presets import Preset
 from rejeu.reporting.logging import check_logs, require
 
@@ -40,7 +42,7 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
     run_folder.check_free(arguments.out)
     algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
-    preset = presets.find(made.env_id, algorithm)
+    preset = find_preset(arguments, made, algorithm)
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with closing(make_env(arguments, made, preset, seed)) as env:
         config = make_config(arguments, made, preset, algorithm or choose_algorithm(preset, env), env, seed, logs)
@@ -53,9 +55,37 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
             echo(header(config, made, describe_backend(env, made, preset), folder))
             limits = Limits(config.steps, config.minutes)
             session = Session(
-                agent, config, folder, made, evaluation_env, limits, is_new=True, has_report=not arguments.no_report
+                agent,
+                config,
+                folder,
+                made,
+                evaluation_env,
+                limits,
+                is_new=True,
+                has_report=not arguments.no_report,
+                has_video=not arguments.no_video,
             )
             return session.run(stop, stopwatch)
+
+
+def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:
+    """Returns the preset of ``--preset``, else that of the environment, None if there is none.
+
+    Raises:
+        ValueError: if the file's preset is for another algorithm than ``--algo`` says, or one that is not known.
+    """
+    if arguments.preset is None:
+        return presets.find(made.env_id, algorithm)
+    preset = presets.read(arguments.preset)
+    agent_of_file(preset.algorithm, arguments.preset)
+    if algorithm not in (None, preset.algorithm):
+        raise ValueError(
+            f"--algo {algorithm} differs from the algorithm of --preset {arguments.preset}, which is {preset.algorithm}; "
+            "leave out one of them"
+        )
+    if preset.env_id != made.env_id:
+        warnings.warn(f"--preset {arguments.preset} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
+    return preset
 
 
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from rejeu.presets import ball, box2d, classic_control, parking, robotics
+from rejeu.presets.files import read, write
 from rejeu.presets.preset import Preset
 from rejeu.presets.result import Result, find_result, results
 
@@ -49,4 +50,17 @@ def find(env_id: str, algorithm: str | None = None) -> Preset | None:
     return next((p for p in every() if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
 
 
-__all__ = ["ALGORITHM_FOR", "ALL", "Preset", "Result", "default", "every", "find", "find_result", "register", "results"]
+__all__ = [
+    "ALGORITHM_FOR",
+    "ALL",
+    "Preset",
+    "Result",
+    "default",
+    "every",
+    "find",
+    "find_result",
+    "read",
+    "register",
+    "results",
+    "write",
+]

@@ -1,0 +1,94 @@
+"""Presets as files, and the option ``--preset``."""
+
+import dataclasses
+import json
+
+import pytest
+
+from rejeu import cli, presets
+from rejeu.errors import CheckpointError
+
+SMALL = presets.Preset(
+    env_id="CartPole-v1",
+    algorithm="PPO",
+    hyperparameters={"n_steps": 16, "learning_rate": "lin_1e-3", "policy_kwargs": {"net_arch": [8]}},
+    n_envs=2,
+    total_steps=64,
+    evaluate_every=32,
+    evaluate_episodes=2,
+    backend="gymnasium",
+    source="a test",
+)
+
+
+def test_what_is_written_is_read(tmp_path):
+    assert presets.read(presets.write(SMALL, tmp_path / "a.json")) == SMALL
+    for preset in presets.ALL:
+        found = presets.read(presets.write(preset, tmp_path / "b.json"))
+        assert json.dumps(dict(found.hyperparameters)) == json.dumps(dict(preset.hyperparameters))
+
+
+def test_a_preset_of_more_than_json_is_not_written(tmp_path):
+    own = dataclasses.replace(SMALL, hyperparameters={"learning_rate": lambda progress: progress})
+    with pytest.raises(TypeError, match="hyperparameters that a file cannot hold"):
+        presets.write(own, tmp_path / "a.json")
+    assert not (tmp_path / "a.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "it is not valid JSON"),
+        ("[]", "expected `object`"),
+        ("{}", "missing required field"),
+        ({"n_envs": 0}, "n_envs=0: expected `int` >= 1"),
+        ({"n_envs": 10**9}, "expected `int` <= 4096"),
+        ({"backend": "os.system"}, "backend='os.system'"),
+        ({"hyperparameters": []}, "expected `object`"),
+        ("x" * 2**21, "more than 1,048,576 bytes"),
+    ],
+)
+def test_a_file_that_is_no_preset_is_one_line(tmp_path, content, message):
+    path = tmp_path / "preset.json"
+    if isinstance(content, dict):
+        fields = {**vars(SMALL), "hyperparameters": dict(SMALL.hyperparameters), **content}
+        content = json.dumps(fields)
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(CheckpointError, match=r"preset\.json is no preset: .*") as error:
+        presets.read(path)
+    assert message in str(error.value)
+
+
+def test_train_takes_the_preset_of_a_file(tmp_path, capsys):
+    path = presets.write(SMALL, tmp_path / "preset.json")
+    out = tmp_path / "run"
+    command = ["train", "CartPole-v1", "--preset", str(path), "--seed", "0", "--out", str(out)]
+    assert cli.main([*command, "--set", "gamma=0.9", "--no-video", "--no-report", "--checkpoint-minutes", "0"]) == 0
+    config = json.loads((out / "config.json").read_text(encoding="utf-8"))
+    assert (config["algorithm"], config["n_envs"], config["steps"]) == ("PPO", 2, 64)
+    assert (config["hyperparameters"]["n_steps"], config["hyperparameters"]["gamma"]) == (16, 0.9)
+    assert not (out / "video.mp4").exists()
+    assert (out / "evaluations.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--algo", "DQN"], "--algo DQN differs from the algorithm of --preset"),
+        (["--preset", "missing.json"], "there is no preset file missing.json; rejeu tune writes one"),
+    ],
+)
+def test_mistakes_with_presets_are_one_line(tmp_path, capsys, options, message):
+    path = presets.write(SMALL, tmp_path / "preset.json")
+    given = [] if "--preset" in options else ["--preset", str(path)]
+    assert cli.main(["train", "CartPole-v1", *given, *options, "--out", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_preset_of_another_environment_is_used_with_a_warning(tmp_path, capsys):
+    path = presets.write(dataclasses.replace(SMALL, env_id="Acrobot-v1", algorithm="PPO"), tmp_path / "preset.json")
+    command = ["train", "CartPole-v1", "--preset", str(path), "--out", str(tmp_path / "run"), "--steps", "32"]
+    assert cli.main([*command, "--no-video", "--no-report"]) == 0
+    assert "was made for Acrobot-v1" in capsys.readouterr().err
