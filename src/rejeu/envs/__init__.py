@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from rejeu.envs.functional import registry
+
 if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv, make_vector
 
@@ -17,6 +19,8 @@ if "rejeu/CartPoleNoVelocity-v0" not in gym.registry:
         max_episode_steps=500,
         reward_threshold=475.0,
     )
+
+registry.register_with_gymnasium()
 
 __all__ = ["VectorEnv", "make_vector"]
 

@@ -209,6 +209,8 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
     if limit is None and env.spec.id.startswith("parking-"):  # which ends its episodes itself, after so many seconds
         config = env.unwrapped.config  # type: ignore[union-attr]
         limit = round(config["duration"] * config["policy_frequency"])
+    elif limit is None and isinstance(own := getattr(env.unwrapped, "max_episode_steps", None), int):
+        limit = own
     return Description(env.spec.id, limit, env.spec.reward_threshold)
 
 

@@ -16,6 +16,9 @@ from rejeu.envs import seeds
 from rejeu.envs.adapters import adapter_of
 from rejeu.envs.base import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
+from rejeu.envs.functional import registry as functional
+from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.registry import maker, register
@@ -23,8 +26,8 @@ from rejeu.envs.seeds import Seed
 from rejeu.envs.workers.pool import TIMEOUT, check_options
 from rejeu.envs.workers.vector import InWorkers
 
-Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async"]
-BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async")
+Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async", "jax"]
+BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async", "jax")
 ENVPOOL_FROM = 4
 """Smallest number of environments for which ``backend="auto"`` prefers EnvPool."""
 
@@ -54,11 +57,13 @@ def make_vector(
     """Returns a vector environment of ``n_envs`` environments.
 
     Args:
-        env: an id; a Gymnasium environment (then ``n_envs`` must be 1); a function that makes one; or a vector
-            environment of Gymnasium's or Stable-Baselines3's kind, whose automatic resets are undone.
+        env: an id; a Gymnasium environment (then ``n_envs`` must be 1); a function that makes one; an environment in JAX
+            (:class:`rejeu.envs.functional.FunctionalEnv`); or a vector environment of Gymnasium's or Stable-Baselines3's
+            kind, whose automatic resets are undone.
         n_envs: how many; ignored for vector environments.
         backend: ``"envpool"`` (C++ threads), ``"gymnasium"`` (in this process), ``"gymnasium-async"`` (one worker process
-            each), or ``"auto"`` (see :func:`auto_backend`). The attribute ``backend`` of the result tells which.
+            each), ``"jax"`` (compiled, for ids that begin with ``jax/``), or ``"auto"`` (see :func:`auto_backend`). The
+            attribute ``backend`` of the result tells which.
         seed: seeds the environments at their first reset: a number, from which environment i takes the i-th after it, or a
             sequence of one number for each environment. An agent that trains in them begins with its own seed instead of a
             number, and keeps a sequence. None draws one.
@@ -112,6 +117,8 @@ def _made(
         return adapter(env, seed)
     if isinstance(env, gym.vector.VectorEnv):
         return GymnasiumVector(env, seed)
+    if isinstance(env, FunctionalEnv):
+        return JaxVector(env, n_envs, seed)
     if isinstance(env, gym.Env):
         if n_envs != 1:
             raise ValueError(
@@ -148,6 +155,9 @@ def _of_id(
             raise ValueError(f"the envpool backend takes no environment arguments, got {env_kwargs}; use 'gymnasium'")
         check_envpool_knows(env)
         return EnvPool(env, n_envs, seed)
+    if backend == "jax":
+        threshold = functional.REGISTRY[env].reward_threshold if functional.is_functional(env) else None
+        return JaxVector(functional.make(env, **env_kwargs), n_envs, seed, env_id=env, reward_threshold=threshold)
     return make_vector(
         maker(env, **env_kwargs),
         n_envs,
@@ -161,12 +171,15 @@ def _of_id(
 def auto_backend(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] = MappingProxyType({})) -> Backend:
     """Returns the backend that ``"auto"`` stands for. It does not depend on the speed of the machine.
 
-    ``"envpool"`` if EnvPool is installed and has the environment, no arguments are given, and there are at least four
-    environments or Gymnasium does not have it; else ``"gymnasium"``. Worker processes are used only on request.
+    ``"jax"`` if it is an environment in JAX; ``"envpool"`` if EnvPool is installed and has the environment, no arguments are
+    given, and there are at least four environments or Gymnasium does not have it; else ``"gymnasium"``. Worker processes are
+    used only on request.
 
     >>> auto_backend("Pendulum-v1", 1), auto_backend("Pendulum-v1", 8, {"g": 9.81})
     ('gymnasium', 'gymnasium')
     """
+    if functional.is_functional(env_id):
+        return "jax"
     if env_kwargs or (n_envs < ENVPOOL_FROM and register(env_id)):
         return "gymnasium"
     return "envpool" if envpool_knows(env_id) else "gymnasium"

@@ -1,0 +1,122 @@
+"""Environments in JAX by id.
+
+>>> make("jax/Pendulum-v1", g=9.81).g
+9.81
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium as gym
+
+if TYPE_CHECKING:
+    from rejeu.envs.functional.drawing import Drawing
+    from rejeu.envs.functional.protocol import FunctionalEnv
+
+MODULE = "rejeu.envs.functional"
+MakeDrawing = Callable[["FunctionalEnv", str], "Drawing"]
+"""Returns the drawing of an environment for a render mode, ``"rgb_array"`` or ``"human"``."""
+
+
+class Entry(NamedTuple):
+    """A registered environment."""
+
+    kind: str | Callable[..., FunctionalEnv]
+    """Its class, or module and name of one of rejeu's, which is imported when it is made."""
+    max_episode_steps: int | None = None
+    """The time limit with default arguments, if it only truncates: Gymnasium's wrapper then applies it. None if the
+    environment has its own."""
+    reward_threshold: float | None = None
+    """The return at which it counts as solved, None if there is none."""
+    drawing: str | MakeDrawing | None = None
+    """The function that returns its drawing, or one of rejeu's by module and name; None if it cannot be drawn."""
+
+
+REGISTRY: dict[str, Entry] = {
+    "jax/CartPole-v1": Entry("cart_pole:CartPole", 500, 475.0, "drawing:cart_pole"),
+    "jax/Pendulum-v1": Entry("pendulum:Pendulum", 200, None, "drawing:pendulum"),
+}
+"""The environments by id."""
+
+
+def register(
+    env_id: str,
+    kind: Callable[..., FunctionalEnv],
+    *,
+    max_episode_steps: int | None = None,
+    reward_threshold: float | None = None,
+    drawing: MakeDrawing | None = None,
+) -> None:
+    """Registers an environment under an id, also with Gymnasium.
+
+    Args:
+        env_id: begins with ``jax/`` and ends with a version, such as ``jax/Walk-v0``.
+        kind: the class, or a function that returns an environment; called with the arguments of :func:`make`.
+        max_episode_steps: the time limit with default arguments. ``kind`` must then have this argument.
+        reward_threshold: the return at which it counts as solved, None if there is none.
+        drawing: a function that returns its drawing, given the environment and the render mode; None if it has none.
+
+    Raises:
+        ValueError: if the id does not begin with ``jax/``, or belongs to another environment.
+    """
+    if not env_id.startswith("jax/"):
+        raise ValueError(f"env_id={env_id!r} must begin with 'jax/', such as jax/Walk-v0")
+    entry = Entry(kind, max_episode_steps, reward_threshold, drawing)
+    if REGISTRY.get(env_id, entry) != entry:
+        raise ValueError(f"{env_id} is registered already; choose another name or version")
+    REGISTRY[env_id] = entry
+    register_with_gymnasium()
+
+
+def register_with_gymnasium() -> None:
+    """Registers with Gymnasium what is not registered yet."""
+    for env_id, entry in REGISTRY.items():
+        if env_id not in gym.registry:
+            gym.register(
+                env_id,
+                f"{MODULE}.gym_env:GymnasiumEnv",
+                max_episode_steps=entry.max_episode_steps,
+                reward_threshold=entry.reward_threshold,
+                kwargs={"env": env_id},
+            )
+
+
+def is_functional(env_id: object) -> bool:
+    """Returns whether an environment in JAX has this id."""
+    return env_id in REGISTRY
+
+
+def make(env_id: str, **kwargs: Any) -> FunctionalEnv:
+    """Returns the environment with this id; ``kwargs`` are its parameters.
+
+    Raises:
+        ValueError: if there is none, with the nearest.
+    """
+    if env_id not in REGISTRY:
+        near = difflib.get_close_matches(env_id, REGISTRY, n=2, cutoff=0.4)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(REGISTRY)}"
+        raise ValueError(f"no environment in JAX is called {env_id!r}; {hint}")
+    kind = _imported(REGISTRY[env_id].kind)
+    return kind(**kwargs)
+
+
+def without_limit(env_id: str) -> dict[str, None]:
+    """Returns the arguments that make an environment without the limit that Gymnasium's wrapper applies."""
+    return {"max_episode_steps": None} if env_id in REGISTRY and REGISTRY[env_id].max_episode_steps else {}
+
+
+def drawing_of(env_id: str) -> MakeDrawing | None:
+    """Returns the function that returns an environment's drawing, None if it has none."""
+    return _imported(REGISTRY[env_id].drawing) if env_id in REGISTRY else None
+
+
+def _imported(value: Any) -> Any:
+    """Returns the object that one of our own strings names, and other values unchanged."""
+    if not isinstance(value, str):
+        return value
+    module, _, name = value.partition(":")
+    return getattr(importlib.import_module(f"{MODULE}.{module}"), name)

@@ -1,0 +1,252 @@
+"""Many environments in JAX at once: as pure functions for training programs, and as a vector environment for the host.
+
+Each environment has its own stream of random numbers. Environment ``i`` of ``reset_all(env, key, n)`` takes the stream
+``fold_in(key, i)``, so its episodes do not depend on ``n`` or on the other environments.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu import prng
+from rejeu.envs.base import Step, VectorEnv, success_of
+from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
+from rejeu.envs.goals import GoalFunctions
+from rejeu.envs.seeds import Seed
+from rejeu.spaces import cast, leaves
+
+
+class VectorState(eqx.Module):
+    """The state of ``n`` environments."""
+
+    keys: Array
+    """The stream of random numbers of each environment, ``uint32 (n, 2)``."""
+    counts: Array
+    """How many keys were taken from each stream, ``int32 (n,)``."""
+    env: Any
+    """States of the environments, a pytree of arrays ``(n, ...)``."""
+    obs: Any
+    """Their observations, a pytree of arrays ``(n, ...)``."""
+
+
+def streams(key: Array, n: int) -> Array:
+    """Returns the streams of ``n`` environments, ``uint32 (n, 2)``, from a typed PRNG key."""
+    data = jax.random.key_data(key)
+    return jax.vmap(lambda i: jax.random.key_data(prng.nth(data, i)))(jnp.arange(n, dtype=jnp.uint32))
+
+
+def reset_all(env: FunctionalEnv, key: Array, n: int) -> VectorState:
+    """Returns the state of ``n`` environments at the start of their first episodes. ``n`` must be static.
+
+    >>> from rejeu.envs.functional import make
+    >>> reset_all(make("jax/CartPole-v1"), jax.random.key(0), 3).obs.shape
+    (3, 4)
+    """
+    return reset_streams(env, streams(key, n))
+
+
+def reset_streams(env: FunctionalEnv, keys: Array) -> VectorState:
+    """Returns the state of one environment for each stream ``uint32 (n, 2)``; see :func:`streams`."""
+    counts = jnp.zeros(len(keys), jnp.int32)
+    state, obs = jax.vmap(env.reset)(_next_keys(keys, counts))
+    return VectorState(keys, counts + 1, state, obs)
+
+
+def step_all(
+    env: FunctionalEnv, vstate: VectorState, action: Array
+) -> tuple[VectorState, Any, Array, Array, Array, Array | None]:
+    """Steps every environment; resets none.
+
+    Args:
+        env: the environment.
+        vstate: the state. Environments whose episode has ended must have been reset.
+        action: in the environment's own range, ``(n, ...)``.
+
+    Returns:
+        The next state, the true successors, the rewards ``float (n,)``, ``terminated`` and ``truncated`` ``bool (n,)``, and
+        whether the successors are successes, ``bool (n,)``; None if the environment does not define success.
+    """
+    keys = _next_keys(vstate.keys, vstate.counts)
+    state, obs, reward, terminated, truncated = jax.vmap(env.step)(keys, vstate.env, action)
+    after = VectorState(vstate.keys, vstate.counts + 1, state, obs)
+    return after, obs, reward, terminated, truncated, jax.vmap(env.success)(state)
+
+
+def reset_done(env: FunctionalEnv, vstate: VectorState, done: Array) -> tuple[VectorState, Any]:
+    """Starts new episodes where ``done``, ``bool (n,)``; returns the state and the observations of all environments."""
+
+    def fresh(vstate: VectorState) -> VectorState:
+        state, obs = jax.vmap(env.reset)(_next_keys(vstate.keys, vstate.counts))
+        return select(done, VectorState(vstate.keys, vstate.counts + 1, state, obs), vstate)
+
+    vstate = jax.lax.cond(done.any(), fresh, lambda vstate: vstate, vstate)
+    return vstate, vstate.obs
+
+
+def select(which: Array, new: Any, old: Any) -> Any:
+    """Returns the rows of ``new`` where ``which``, ``bool (n,)``, else those of ``old``, for pytrees of ``(n, ...)``."""
+    return jax.tree.map(lambda a, b: jnp.where(jnp.expand_dims(which, range(1, a.ndim)), a, b), new, old)
+
+
+def _next_keys(keys: Array, counts: Array) -> Array:
+    return jax.vmap(prng.nth)(keys, counts)
+
+
+@eqx.filter_jit
+def _reset_streams(env: FunctionalEnv, keys: Array) -> VectorState:
+    return reset_streams(env, keys)
+
+
+@eqx.filter_jit
+def _step(env: FunctionalEnv, vstate: VectorState, action: Any, active: Any) -> Any:
+    after, _, reward, terminated, truncated, success = step_all(env, vstate, action)
+    if active is not None:
+        after = select(active, after, vstate)
+        reward = jnp.where(active, reward, jnp.zeros_like(reward))
+        terminated, truncated = terminated & active, truncated & active
+    return after, (after.obs, reward, terminated, truncated, success)
+
+
+@eqx.filter_jit
+def _reset_done(env: FunctionalEnv, vstate: VectorState, done: Any) -> VectorState:
+    return reset_done(env, vstate, done)[0]
+
+
+class JaxVector(VectorEnv):
+    """Environments in JAX behind the interface of a vector environment, for loops and evaluation on the host.
+
+    Args:
+        env: the environment.
+        n_envs: how many.
+        seed: of the first reset. A number ``seed`` stands for ``reset_all(env, jax.random.key(seed), n_envs)``. With a
+            sequence, environment i behaves as a single one with the i-th seed. None draws one.
+        env_id: the id, by default the name of the class.
+        reward_threshold: the return at which the environment counts as solved, None if there is none.
+
+    Raises:
+        ValueError: if ``n_envs`` is no positive whole number.
+
+    >>> from rejeu.envs.functional import make
+    >>> vector = JaxVector(make("jax/Pendulum-v1"), n_envs=4, seed=0)
+    >>> obs = vector.reset()
+    >>> vector.step(np.zeros((4, 1), np.float32)).reward.shape
+    (4,)
+    """
+
+    backend = "jax"
+
+    def __init__(
+        self,
+        env: FunctionalEnv,
+        n_envs: int = 1,
+        seed: Seed = None,
+        *,
+        env_id: str | None = None,
+        reward_threshold: float | None = None,
+    ) -> None:
+        if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
+            raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
+        self.env = env
+        self.n_envs = n_envs
+        self.env_id = type(env).__name__ if env_id is None else env_id
+        self.observation_space = env.observation_space
+        self.action_space = env.action_space
+        self.max_episode_steps = env.max_episode_steps
+        self.reward_threshold = reward_threshold
+        self.state: VectorState | None = None
+        """The state of the environments; None before the first reset."""
+        self._leaves = leaves(self.observation_space)
+        self._seed = seed
+
+    def reset(self, seed: Seed = None) -> Any:
+        seed = self._seed if seed is None else seed
+        self._seed = None
+        if seed is None and self.state is not None:
+            return self.reset_done(np.ones(self.n_envs, bool))
+        self.state = _reset_streams(self.env, streams_of(seed, self.n_envs))
+        return self._observe()
+
+    def _step_all(self, action: np.ndarray) -> Step:
+        return self._step_some(action, None)
+
+    def _step_some(self, action: np.ndarray, active: np.ndarray | None) -> Step:
+        action = np.asarray(action, self._action_dtype)
+        self.state, results = _step(self.env, self._running(), action, active)
+        obs, reward, terminated, truncated, success = jax.device_get(results)
+        obs = self._obs = cast(self.observation_space, self._leaves, obs)
+        return Step(obs, np.asarray(reward, np.float32), terminated, truncated, success)
+
+    def reset_done(self, done: np.ndarray) -> Any:
+        self.state = _reset_done(self.env, self._running(), np.asarray(done, bool))
+        return self._observe()
+
+    def success(self, step: Step, env: int) -> float:
+        return success_of({} if step.info is None else {"is_success": step.info[env]})
+
+    def goals(self) -> GoalFunctions | None:
+        return goal_functions(self.env)
+
+    def snapshot(self) -> list[np.ndarray] | None:
+        return None if self.state is None else [np.asarray(leaf) for leaf in jax.tree.leaves(self.state)]
+
+    def restore(self, saved: Any, obs: Any) -> list[int]:
+        template = jax.eval_shape(lambda: reset_all(self.env, jax.random.key(0), self.n_envs))
+        expected, tree = jax.tree.flatten(template)
+        if not isinstance(saved, list) or len(saved) != len(expected):
+            raise ValueError(f"the snapshot is not of {self.n_envs} environments {self.env_id}")
+        for array, leaf in zip(saved, expected, strict=True):
+            if not isinstance(array, np.ndarray) or array.shape != leaf.shape or array.dtype != leaf.dtype:
+                raise ValueError(f"the snapshot is not of {self.n_envs} environments {self.env_id}")
+        self.state = jax.tree.unflatten(tree, [jnp.asarray(array) for array in saved])
+        self._obs, self._seed = obs, None
+        return []
+
+    def state_of(self, i: int) -> Any:
+        """Returns the state of environment ``i`` as NumPy arrays, None before the first reset."""
+        return None if self.state is None else jax.tree.map(lambda leaf: np.asarray(leaf[i]), self.state.env)
+
+    def close(self) -> None:
+        """Does nothing: there is nothing to close."""
+
+    @property
+    def _action_dtype(self) -> Any:
+        """The dtype in which actions are passed to the environments, with at most 32 bits."""
+        return jax.dtypes.canonicalize_dtype(self.action_space.dtype)
+
+    def _running(self) -> VectorState:
+        if self.state is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        return self.state
+
+    def _observe(self) -> Any:
+        self._obs = cast(self.observation_space, self._leaves, jax.device_get(self._running().obs))
+        return self._obs
+
+
+def streams_of(seed: Seed, n: int) -> Array:
+    """Returns the streams of ``n`` environments for a seed; see :class:`JaxVector`."""
+    if seed is None or isinstance(seed, int):
+        number = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        return streams(jax.random.key(number), n)
+    return jnp.concatenate([streams(jax.random.key(one), 1) for one in seed])
+
+
+def goal_functions(env: FunctionalEnv) -> GoalFunctions | None:
+    """Returns the goal functions of an environment for the host, which take and return NumPy arrays; None without goals."""
+    if not isinstance(env, GoalEnv):
+        return None
+    reward = jax.jit(env.compute_reward)
+    terminated = jax.jit(env.compute_terminated)
+    goal = env.observation_space["achieved_goal"]  # type: ignore[index]
+    is_judged = jax.eval_shape(env.compute_terminated, goal.sample(), goal.sample()) is not None
+    return GoalFunctions(
+        lambda achieved, desired: np.asarray(reward(achieved, desired), np.float32),
+        (lambda achieved, desired: np.asarray(terminated(achieved, desired), bool)) if is_judged else None,
+    )
