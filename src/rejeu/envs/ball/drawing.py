@@ -57,7 +57,7 @@ class BallDrawing:
         try:
             import pygame
         except ImportError:
-            raise MissingExtra("drawing the ball", "pygame", "parking") from None
+            raise MissingExtra("drawing the ball", "pygame-ce", "play") from None
         self.pygame: Any = pygame
         self.dimension = dimension
         self.fps = fps
