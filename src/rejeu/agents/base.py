@@ -26,6 +26,7 @@ from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops import finite
+from rejeu.loops.device.driver import Stops
 from rejeu.loops.learner import Learner
 from rejeu.loops.packing import PackedState
 from rejeu.loops.run import Progress, Run, initial_run
@@ -99,6 +100,11 @@ class BaseAgent(ABC):
     """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
+    on_device: bool | None = None
+    """Whether ``learn`` trains in one program on the device: True requires it, False uses the loop of the host. None uses the
+    device where the environments are JAX environments and the settings allow it; see ``docs/device.md``."""
+    stops: Stops | None = None
+    """During a ``learn`` on the device: where the program returns to the host. None with the loop of the host."""
 
     def __init__(
         self,

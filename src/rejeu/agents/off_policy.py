@@ -25,6 +25,7 @@ from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
+from rejeu.loops.device import loops as device_loops
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
 
@@ -127,6 +128,8 @@ class OffPolicyAgent(Agent):
         return step + self.config.learning_starts
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+        if self.stops is not None:
+            return device_loops.off_policy(self.run, self.learner, self.config, n_steps, progress, self.stops)
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu import schedules, xla
+from rejeu.agents import device
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.agents.model_files import WRONG, brief
 from rejeu.algorithms import config as configs
@@ -122,6 +123,7 @@ def train(
     agent.interrupted, agent.interrupted_by = False, None
     run.success_threshold = agent.success_threshold
     agent.failed_writes.forget_written()
+    agent.stops = device.stops_of(agent, call, callbacks)
     with ExitStack() as stack:
         stack.callback(agent.failed_writes.warn)
         outputs = open_outputs(agent, sinks, tb_log_name, stack)
@@ -242,8 +244,8 @@ def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: S
         row = statistics_row(agent) | agent.logger.take()
         for output in outputs:
             output.write(agent.num_timesteps, row)
-    if turn.episodes:
-        note_training_return(agent, len(turn.episodes))
+    if ended := device.episodes_to_judge(agent, call, turn):
+        note_training_return(agent, ended)
 
 
 def warn_without_noise(agent: BaseAgent) -> None:

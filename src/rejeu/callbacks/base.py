@@ -25,6 +25,8 @@ class TrainingCallback(ABC):
 
     runs_last: ClassVar[bool] = False
     """Whether it is called after all others. A checkpoint is, so that it contains what they did."""
+    every_step: ClassVar[bool] = False
+    """Whether it must be called after every step, so that an agent in a JAX environment trains with the loop of the host."""
 
     def before_training(self, agent: Any) -> None:  # noqa: B027 - optional
         """Called by ``learn`` before the first step; ``agent.training_call`` has its limits."""
@@ -46,6 +48,14 @@ class Stateful(Protocol):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
+
+
+@runtime_checkable
+class Periodic(Protocol):
+    """A callback that does something at an interval of environment steps."""
+
+    every: int | None
+    """The interval; None for another one."""
 
 
 class RunFolder(Protocol):

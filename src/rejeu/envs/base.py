@@ -150,9 +150,8 @@ class VectorEnv(ABC):
         Where the environment does not say so itself, an episode succeeds whose return is at least ``threshold``, or the
         environment's own reward threshold if that is None; NaN where there is neither.
         """
-        own = self.success(step, env)
         threshold = self.reward_threshold if threshold is None else threshold
-        return own if threshold is None or not math.isnan(own) else float(episode_return >= threshold)
+        return success_by(self.success(step, env), episode_return, threshold)
 
     @abstractmethod
     def goals(self) -> GoalFunctions | None:
@@ -212,6 +211,15 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
     elif limit is None and isinstance(own := getattr(env.unwrapped, "max_episode_steps", None), int):
         limit = own
     return Description(env.spec.id, limit, env.spec.reward_threshold)
+
+
+def success_by(own: float, episode_return: float, threshold: float | None) -> float:
+    """Returns whether an episode succeeded: what the environment says, ``own``, or by its return if that is NaN.
+
+    >>> success_by(0.0, 500.0, 475.0), success_by(math.nan, 500.0, 475.0), success_by(math.nan, 500.0, None)
+    (0.0, 1.0, nan)
+    """
+    return own if threshold is None or not math.isnan(own) else float(episode_return >= threshold)
 
 
 def success_of(info: dict[str, Any]) -> float:

@@ -69,6 +69,8 @@ class BaseCallback(TrainingCallback):
     model: Agent
     """The agent."""
 
+    every_step: ClassVar[bool] = True
+
     carried: ClassVar[tuple[str, ...]] = ("n_calls",)
     """Names of the attributes that a checkpoint contains: numbers, strings, lists, dicts and arrays. Subclasses with further
     state extend them."""

@@ -1,0 +1,89 @@
+"""Whether an agent trains on the device, and where the program must return to the host."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rejeu.agents.base import BaseAgent
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.buffers.device import STRATEGIES
+from rejeu.buffers.hindsight import HerReplayBuffer
+from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.callbacks.base import Periodic, TrainingCallback
+from rejeu.envs.functional.vector import JaxVector
+from rejeu.loops.device.driver import MAX_TURNS, Stops
+from rejeu.loops.run import Progress
+from rejeu.loops.training_call import TrainingCall
+
+
+def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[Any]) -> Stops | None:
+    """Returns where the program returns to the host in a ``learn``, None if the agent trains with the loop of the host.
+
+    Raises:
+        ValueError: if ``agent.on_device`` is True and that is not possible, with the reason.
+    """
+    if agent.on_device is False:
+        return None
+    reason = reason_against(agent, callbacks)
+    if reason is None:
+        every = tuple(sorted({one.every for one in callbacks if isinstance(one, Periodic) and one.every is not None}))
+        return Stops(every, at_episodes=call.n_episodes is not None)
+    if agent.on_device:
+        raise ValueError(
+            f"on_device=True is not possible: {reason}; leave it at None to train with the loop of the host"
+        )
+    if isinstance(agent.run.env, JaxVector):
+        warnings.warn(
+            f"{agent.run.env.env_id} trains with the loop of the host, which is slower than one on the device: {reason}; "
+            "set agent.on_device = False to say that this is intended",
+            UserWarning,
+            stacklevel=5,
+        )
+    return None
+
+
+def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
+    """Returns why an agent cannot train on the device, None if it can."""
+    run, config = agent.run, agent.config
+    if not isinstance(run.env, JaxVector):
+        return f"the backend of {run.env.env_id} is {run.env.backend!r}, not 'jax'"
+    for callback in callbacks:
+        if isinstance(callback, TrainingCallback) and callback.every_step:
+            return f"the callback {type(callback).__name__} must be called after every step"
+    return reason_against_replay(run.replay, config) if isinstance(config, OffPolicyConfig) else "it is on-policy"
+
+
+def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
+    """Returns why a replay buffer cannot be on the device, None if it can."""
+    strategy = None if config.hindsight is None else config.hindsight.goal_selection_strategy
+    if type(buffer) not in (ReplayBuffer, HerReplayBuffer):
+        return f"the replay buffer {type(buffer).__name__} is your own"
+    if strategy is not None and strategy not in STRATEGIES:
+        return "goal_selection_strategy is a function of your own"
+    if config.priorities is not None:
+        return "prioritized replay exists on the host only"
+    if config.frame_stack is not None:
+        return "frame_stack exists on the host only"
+    if buffer.ring.rows < 3:
+        return f"buffer_size={config.buffer_size} leaves {buffer.ring.rows} rows for each environment, at least 3 are needed"
+    return None
+
+
+def episodes_to_judge(agent: BaseAgent, call: TrainingCall, turn: Progress) -> int:
+    """Returns the number of newest episodes whose returns decide now whether the weights are the best so far.
+
+    On the host these are the episodes that have just ended. On the device the weights are looked at once in ``MAX_TURNS``
+    turns and at the end of ``learn``, since chunks end elsewhere at times that depend on the speed of the machine.
+    """
+    if agent.stops is None:
+        return len(turn.episodes)
+    period, n_envs = MAX_TURNS * agent.n_envs, agent.n_envs
+    is_last = call.last_step is not None and turn.step >= call.last_step
+    if turn.step // period == (turn.step - n_envs) // period and not is_last:
+        return 0
+    before = (turn.step // period - (0 if is_last else 1)) * period
+    return int(np.count_nonzero(agent.history["step"] > before))

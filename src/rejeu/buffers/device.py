@@ -1,0 +1,361 @@
+"""The replay buffer as arrays on the device and pure functions, for training programs that contain the environments.
+
+The layout is that of :class:`rejeu.buffers.ring.Ring`, and so is the meaning of every row. Instead of counters in every row,
+hindsight uses the number of the row's episode and two tables of when episodes began and ended, because an episode that ends
+then writes one number instead of one into each of its rows.
+
+Batches are those that :class:`~rejeu.buffers.uniform.ReplayBuffer` and :class:`~rejeu.buffers.hindsight.HerReplayBuffer`
+return for the same content and the same random numbers, bit for bit. Only the sums of n-step returns may differ in their
+last bit, because the host adds them up in 64 bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
+from rejeu.buffers.uniform import bootstrap_discount
+from rejeu.core import PyTree, Transition
+
+RUNNING = np.iinfo(np.int32).max
+"""The end of an episode that has not ended."""
+STRATEGIES = ("future", "final", "episode", "random")
+"""The goal strategies of hindsight that exist here."""
+
+GoalFunction = Callable[[Array, Array], Array]
+"""A traceable function of achieved and desired goals ``(n, ...)`` that returns ``(n,)``."""
+
+
+class DeviceRing(NamedTuple):
+    """The rows of all environments, those of an environment together; and counters of environments."""
+
+    obs: list[Array]
+    """Leaves of the observations, ``(n_envs * rows, ...)`` each."""
+    action: Array
+    reward: Array
+    kind: Array
+    """``STEP``, ``TERMINATED`` or ``LAST``, ``uint8``."""
+    episode: Array
+    """Number of the row's episode in its environment, ``int32``; empty without hindsight."""
+    begins: Array
+    """Absolute time of the first row of episode ``i`` at place ``i % rows``, ``int32``; empty without hindsight."""
+    ends: Array
+    """Likewise of the last row, ``RUNNING`` before it is known."""
+    head: Array
+    """Absolute time of each environment's newest row, ``int32 (n_envs,)``."""
+    n_begun: Array
+    """Number of episodes that each environment has begun, ``int32 (n_envs,)``."""
+
+
+class DeviceRows(NamedTuple):
+    """Rows that were drawn, ``int32 (n,)`` each."""
+
+    env: Array
+    time: Array
+    position: Array
+
+
+@dataclass(frozen=True)
+class DeviceReplay:
+    """How batches are drawn from a :class:`DeviceRing`: pure functions of it. Hashable."""
+
+    rows: int
+    """Rows of each environment, at least 3."""
+    n_envs: int
+    obs_structure: Any
+    gamma: float
+    batch_size: int
+    n_steps: int = 1
+    each_reward: bool = False
+    """Whether transitions of several steps have :attr:`Transition.rewards`."""
+    strategy: str | None = None
+    """The goal strategy, None without hindsight."""
+    n_sampled_goal: int = 4
+    achieved: int = 0
+    """Index of the leaf of the achieved goal."""
+    desired: int = 0
+
+    def positions(self, env: Array, time: Array) -> Array:
+        """Returns the positions of rows given by environment and absolute time."""
+        return env * self.rows + time % self.rows
+
+    def add(
+        self, ring: DeviceRing, action: Array, reward: Array, terminated: Array, next_obs: PyTree, kept: Array
+    ) -> DeviceRing:
+        """Returns the ring after one step of the environments where ``kept``; see :meth:`Ring.add`."""
+        envs = jnp.arange(self.n_envs)
+        index = jnp.where(kept, self.positions(envs, ring.head), len(ring.kind))
+        kind = jnp.where(terminated, TERMINATED, STEP).astype(jnp.uint8)
+        ring = ring._replace(
+            action=put(ring.action, index, action),
+            reward=put(ring.reward, index, reward),
+            kind=put(ring.kind, index, kind),
+        )
+        return self._advance(ring, next_obs, kept)
+
+    def begin(self, ring: DeviceRing, obs: PyTree, which: Array) -> DeviceRing:
+        """Returns the ring after episodes began with ``obs`` in the environments ``which``; see :meth:`Ring.begin`.
+
+        These environments must have begun an episode before, which ends.
+        """
+        envs = jnp.arange(self.n_envs)
+        index = jnp.where(which, self.positions(envs, ring.head), len(ring.kind))
+        ring = ring._replace(kind=put(ring.kind, index, jnp.full(self.n_envs, LAST, jnp.uint8)))
+        if self.strategy is not None:
+            outside = len(ring.ends)
+            old = jnp.where(which, self.positions(envs, ring.n_begun - 1), outside)
+            new = jnp.where(which, self.positions(envs, ring.n_begun), outside)
+            ends = put(put(ring.ends, old, ring.head), new, jnp.full(self.n_envs, RUNNING, jnp.int32))
+            ring = ring._replace(ends=ends, begins=put(ring.begins, new, ring.head + 1))
+        ring = ring._replace(n_begun=ring.n_begun + which.astype(jnp.int32))
+        return self._advance(ring, obs, which)
+
+    def _advance(self, ring: DeviceRing, obs: PyTree, which: Array) -> DeviceRing:
+        """Returns the ring with a further row for the observations of the environments ``which``."""
+        envs = jnp.arange(self.n_envs)
+        head = ring.head + which.astype(jnp.int32)
+        index = jnp.where(which, self.positions(envs, head), len(ring.kind))
+        stores = [
+            put(store, index, leaf.astype(store.dtype))
+            for store, leaf in zip(ring.obs, jax.tree.leaves(obs), strict=True)
+        ]
+        kind = put(ring.kind, index, jnp.full(self.n_envs, STEP, jnp.uint8))
+        episode = put(ring.episode, index, ring.n_begun - 1) if self.strategy is not None else ring.episode
+        return ring._replace(obs=stores, kind=kind, episode=episode, head=head)
+
+    def oldest(self, ring: DeviceRing) -> Array:
+        """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
+        return jnp.maximum(ring.head - self.rows + 1, 0)
+
+    def draw_rows(self, ring: DeviceRing, key: Array, n: int) -> DeviceRows:
+        """Returns ``n`` steps drawn uniformly, with replacement; rows that are ``LAST`` are drawn again.
+
+        The i-th of them to be drawn again takes the i-th number of the next key.
+        """
+        first = self._rows_of(ring, jax.random.bits(jax.random.fold_in(key, 0), (n,), jnp.uint32))
+
+        def again(carry: tuple[Array, DeviceRows, Array]) -> tuple[Array, DeviceRows, Array]:
+            i, rows, is_last = carry
+            place = jnp.cumsum(is_last) - 1
+            bits = jax.random.bits(jax.random.fold_in(key, i), (n,), jnp.uint32)[place]
+            rows = jax.tree.map(lambda new, old: jnp.where(is_last, new, old), self._rows_of(ring, bits), rows)
+            return i + 1, rows, ring.kind[rows.position] == LAST
+
+        begin = (jnp.uint32(1), first, ring.kind[first.position] == LAST)
+        return jax.lax.while_loop(lambda carry: carry[2].any(), again, begin)[1]
+
+    def _rows_of(self, ring: DeviceRing, bits: Array) -> DeviceRows:
+        """Returns the rows, of any kind except the newest ones, that random bits ``uint32 (n,)`` stand for."""
+        oldest = self.oldest(ring)
+        if self.n_envs == 1:
+            env = jnp.zeros(bits.shape, jnp.int32)
+            time = oldest[0] + below(bits, ring.head[0] - oldest[0])
+        else:
+            ends = jnp.cumsum(ring.head - oldest)
+            ticket = below(bits, ends[-1])
+            method = "compare_all" if self.n_envs <= 64 else "scan"
+            env = jnp.searchsorted(ends, ticket, side="right", method=method).astype(jnp.int32)
+            time = ring.head[env] - (ends[env] - ticket)
+        return DeviceRows(env, time, self.positions(env, time))
+
+    def draw(
+        self, ring: DeviceRing, key: Array, reward: GoalFunction | None = None, terminated: GoalFunction | None = None
+    ) -> Transition:
+        """Returns a batch of transitions.
+
+        Args:
+            ring: the rows. Some environment must have taken a step.
+            key: of the random numbers.
+            reward: the reward of achieved and desired goals, for hindsight.
+            terminated: whether they end the episode; None if relabeled steps keep their own flags.
+        """
+        rows_key, goals_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
+        rows = self.draw_rows(ring, rows_key, self.batch_size)
+        if self.strategy is None:
+            return self.batch(ring, rows)
+        assert reward is not None
+        n = self.n_relabeled
+        goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
+        return self.relabeled(ring, rows, ring.obs[self.achieved][goal_rows], reward, terminated)
+
+    @property
+    def n_relabeled(self) -> int:
+        """The number of transitions of a batch that get a new goal: the first of it."""
+        return int(self.batch_size * self.n_sampled_goal / (self.n_sampled_goal + 1))
+
+    def batch(self, ring: DeviceRing, rows: DeviceRows) -> Transition:
+        """Returns the transitions of ``rows``; see :class:`rejeu.buffers.uniform.ReplayBuffer`."""
+        obs, action = [store[rows.position] for store in ring.obs], ring.action[rows.position]
+        rewards = None
+        if self.n_steps == 1:
+            steps: Any = 1
+            reward, discount = ring.reward[rows.position], self._discounts(ring.kind[rows.position] == TERMINATED, 1)
+        else:
+            position, valid, terminal = self._window(ring, rows)
+            rewards = jnp.where(valid, ring.reward[position], jnp.float32(0))
+            steps = valid.sum(axis=1)
+            reward, rewards = self._sums(rewards)
+            discount = self._discounts(terminal.any(axis=1), steps)
+        next_obs = [store[self.positions(rows.env, rows.time + steps)] for store in ring.obs]
+        tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
+        return Transition(tree(obs), action, reward, tree(next_obs), discount, None, rewards)
+
+    def relabeled(
+        self, ring: DeviceRing, rows: DeviceRows, goal: Array, reward: GoalFunction, terminated: GoalFunction | None
+    ) -> Transition:
+        """Returns the transitions of ``rows``, the first of them with new goals ``(n_relabeled, ...)``.
+
+        See :class:`rejeu.buffers.hindsight.HerReplayBuffer`.
+        """
+        n = len(goal)
+        obs, action = [store[rows.position] for store in ring.obs], ring.action[rows.position]
+        rewards = None
+        if self.n_steps == 1:
+            steps: Any = 1
+            rewarded, ends = ring.reward[rows.position], ring.kind[rows.position] == TERMINATED
+            if n:
+                reached = ring.obs[self.achieved][self.positions(rows.env[:n], rows.time[:n] + 1)]
+                rewarded = rewarded.at[:n].set(reward(reached, goal).astype(jnp.float32))
+                if terminated is not None:
+                    ends = ends.at[:n].set(terminated(reached, goal).astype(bool))
+            discount = self._discounts(ends, 1)
+        else:
+            each, valid, terminal = self._relabeled_window(ring, rows, goal, reward, terminated)
+            steps = valid.sum(axis=1)
+            rewarded, rewards = self._sums(each)
+            discount = self._discounts(terminal.any(axis=1), steps)
+        next_obs = [store[self.positions(rows.env, rows.time + steps)] for store in ring.obs]
+        for leaves in (obs, next_obs):
+            leaves[self.desired] = leaves[self.desired].at[:n].set(goal)
+        tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
+        return Transition(tree(obs), action, rewarded, tree(next_obs), discount, None, rewards)
+
+    def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
+        """Returns the positions of the rows whose achieved goals become the new goals of ``rows``, by the strategy."""
+        n = len(rows.time)
+        if self.strategy == "random":
+            other = self.draw_rows(ring, key, n)
+            return self.positions(other.env, other.time + 1)
+        place = self.positions(rows.env, ring.episode[rows.position])
+        time, last = rows.time, jnp.minimum(ring.ends[place], ring.head[rows.env])
+        if self.strategy == "final":
+            return self.positions(rows.env, last)
+        if self.strategy == "episode":
+            time = jnp.maximum(ring.begins[place], self.oldest(ring)[rows.env])
+        ahead = below(jax.random.bits(jax.random.fold_in(key, 0), (n,), jnp.uint32), last - time)
+        return self.positions(rows.env, time + 1 + ahead)
+
+    def _window(self, ring: DeviceRing, rows: DeviceRows) -> tuple[Array, Array, Array]:
+        """Returns the steps that n-step returns sum: positions, which of them count and which are terminal, ``(batch, n)``."""
+        times = rows.time[:, None] + jnp.arange(self.n_steps)[None]
+        position = self.positions(rows.env[:, None], times)
+        kind = ring.kind[position]
+        is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
+        continues = jnp.cumprod(is_step & (kind != TERMINATED), axis=1).astype(bool)
+        valid = is_step.at[:, 1:].set(is_step[:, 1:] & continues[:, :-1])
+        return position, valid, (kind == TERMINATED) & valid
+
+    def _relabeled_window(
+        self, ring: DeviceRing, rows: DeviceRows, goal: Array, reward: GoalFunction, terminated: GoalFunction | None
+    ) -> tuple[Array, Array, Array]:
+        """Returns rewards, which steps count and which are terminal ``(batch, n)``, with the new goals."""
+        n, k = len(goal), self.n_steps
+        position, valid, terminal = self._window(ring, rows)
+        rewards = ring.reward[position]
+        if n:
+            following = self.positions(rows.env[:n, None], rows.time[:n, None] + 1 + jnp.arange(k)[None])
+            reached = ring.obs[self.achieved][following].reshape(n * k, *goal.shape[1:])
+            goals = jnp.repeat(goal, k, axis=0)
+            rewards = rewards.at[:n].set(reward(reached, goals).astype(jnp.float32).reshape(n, k))
+            if terminated is not None:
+                ends = terminated(reached, goals).astype(bool).reshape(n, k) & valid[:n]
+                before = jnp.cumsum(ends, axis=1)[:, :-1] > 0
+                valid = valid.at[:n, 1:].set(valid[:n, 1:] & ~before)
+                terminal = terminal.at[:n].set(ends) & valid
+        return jnp.where(valid, rewards, jnp.float32(0)), valid, terminal
+
+    def _sums(self, rewards: Array) -> tuple[Array, Array | None]:
+        """Returns the discounted sums of rewards ``(batch, n)``, and the discounted rewards where they are asked for."""
+        powers = jnp.asarray((self.gamma ** np.arange(self.n_steps)).astype(np.float32))
+        discounted = rewards * powers[None]
+        return discounted.sum(axis=1), discounted if self.each_reward else None
+
+    def _discounts(self, terminated: Array, steps: Any) -> Array:
+        """Returns ``gamma^steps``, and 0 where the MDP terminated."""
+        table = bootstrap_discount(self.gamma, np.arange(self.n_steps + 1), np.zeros(self.n_steps + 1, bool))
+        return jnp.where(terminated, jnp.float32(0), jnp.asarray(table)[steps])
+
+
+def put(store: Array, index: Array, values: Array) -> Array:
+    """Returns ``store`` with ``values`` ``(n, ...)`` at the positions ``index`` ``(n,)``; positions outside are ignored."""
+    if len(index) > 1:
+        return store.at[index].set(values, mode="drop", unique_indices=True)
+    # A slice of one row, which XLA on a CPU writes faster than it scatters.
+    place = jnp.minimum(index[0], len(store) - 1)
+    before = jax.lax.dynamic_slice_in_dim(store, place, 1)
+    row = jnp.where(index[0] < len(store), values, before)
+    return jax.lax.dynamic_update_slice_in_dim(store, row, place, 0)
+
+
+def below(bits: Array, n: Array) -> Array:
+    """Returns ``floor(n * bits / 2^32)``, ``int32``: a whole number in [0, n) from random bits ``uint32``.
+
+    It equals ``int(u * n)`` of the 64-bit number ``u = bits / 2^32``, as the replay buffers of the host draw.
+
+    >>> below(jnp.uint32(2**31), jnp.int32(7)).tolist()
+    3
+    """
+    n = jnp.asarray(n).astype(jnp.uint32)
+    low, high, n_low, n_high = bits & 0xFFFF, bits >> 16, n & 0xFFFF, n >> 16
+    low_high, high_low = low * n_high, high * n_low
+    middle = ((low * n_low) >> 16) + (low_high & 0xFFFF) + (high_low & 0xFFFF)
+    return (high * n_high + (low_high >> 16) + (high_low >> 16) + (middle >> 16)).astype(jnp.int32)
+
+
+def uploaded(replay: DeviceReplay, ring: Ring) -> DeviceRing:
+    """Returns the content of a ring of the host, in which every environment has begun an episode."""
+    n = ring.rows * ring.n_envs if replay.strategy is not None else 0
+    episode, begins, ends = (np.zeros(n, np.int32) for _ in range(3))
+    n_begun = np.ones(ring.n_envs, np.int32)
+    for env in range(ring.n_envs if replay.strategy is not None else 0):
+        times = np.arange(ring.oldest()[env], ring.head[env] + 1)
+        index = ring.index(np.full(len(times), env), times)
+        since_start, until_end = episode_counters(ring.kind[index])
+        numbers = np.cumsum(since_start == 0) - 1
+        numbers[0] = 0
+        closed = (until_end > 0) | (ring.kind[index] == LAST)
+        places = env * ring.rows + numbers % ring.rows
+        episode[index] = numbers
+        begins[places] = times - since_start
+        ends[places] = np.where(closed, times + until_end, RUNNING)
+        n_begun[env] = numbers[-1] + 1
+    return DeviceRing(
+        [jnp.array(store) for store in ring.obs],
+        jnp.array(ring.action),
+        jnp.array(ring.reward),
+        jnp.array(ring.kind),
+        jnp.array(episode),
+        jnp.array(begins),
+        jnp.array(ends),
+        jnp.asarray(ring.head, jnp.int32),
+        jnp.array(n_begun),
+    )
+
+
+def written(replay: DeviceReplay, ring: DeviceRing, first: Array, size: int) -> dict[str, Any]:
+    """Returns ``size`` rows of each environment from the times ``first`` on, as :meth:`Ring.write` takes them."""
+    times = first[:, None] + jnp.arange(size)[None]
+    index = replay.positions(jnp.arange(replay.n_envs)[:, None], times)
+    return {
+        "obs": [store[index] for store in ring.obs],
+        "action": ring.action[index],
+        "reward": ring.reward[index],
+        "kind": ring.kind[index],
+    }

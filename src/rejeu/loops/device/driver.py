@@ -1,0 +1,174 @@
+"""Training on the device, chunk by chunk: what a chunk is asked for, and what the host does between two of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from rejeu.core import PyTree
+from rejeu.loops.checks import check_state
+from rejeu.loops.device.turns import NO_LIMIT, Limits
+from rejeu.loops.learner import Learner
+from rejeu.loops.run import Progress, Run
+from rejeu.loops.timing import Timer
+
+SECONDS = 0.2
+"""Wall time of a chunk that is aimed at: progress bar, callbacks and Ctrl-C wait for its end."""
+MAX_TURNS = 1000
+"""Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
+LOG_SIZE = 2**18
+"""Entries of a chunk's log of episodes at most: turns times environments."""
+ALL = 2**31 - 1
+
+
+class Stops(NamedTuple):
+    """Where chunks must end, so that what happens between them does not depend on the speed of the machine."""
+
+    every: tuple[int, ...] = ()
+    """Chunks end where the number of environment steps crosses a multiple of one of these."""
+    at_episodes: bool = False
+    """Chunks end with every turn in which an episode ends."""
+
+
+class Machine(Protocol):
+    """A compiled program with its arguments on the device. Mutable."""
+
+    capacity: int
+    """Turns of a chunk at most."""
+
+    def push(self, runs: Sequence[Run], progress: float) -> None:
+        """Puts the runs onto the device."""
+
+    def call(self, limits: Limits) -> None:
+        """Takes a chunk of turns."""
+
+    def fault(self, which: int) -> bool:
+        """Returns whether the last chunk left something that is not finite in a run."""
+
+    def pull(self, which: int, run: Run, n_turns: int, last: int | None) -> Progress:
+        """Puts what the last chunk did into a run, and returns it."""
+
+    def raise_fault(self, run: Run, limits: Limits) -> None:
+        """Raises the error of the chunk that would follow; the run is as it was before, and is put before the fault."""
+
+
+def train(
+    machine: Machine,
+    runs: Sequence[Run],
+    learner: Learner,
+    n_steps: int | None,
+    progress: Callable[[int], float],
+    stops: Stops,
+    begin: Callable[[Run], None],
+) -> Iterator[list[Progress]]:
+    """Trains runs of equal settings for exactly ``n_steps`` environment steps each; yields after every chunk.
+
+    Args:
+        machine: the program.
+        runs: mutated; consistent whenever the generator has yielded.
+        learner: the algorithm.
+        n_steps: over all environments of a run; None: until the caller stops.
+        progress: returns the progress of schedules after a number of steps.
+        stops: where chunks must end.
+        begin: starts episodes in the environments of a run.
+
+    Raises:
+        BadEnvironmentError: if a reward or an observation is not finite.
+        NonFiniteError: if the state is not finite when training begins.
+        NonFiniteUpdate: if an update leaves numbers that are not finite.
+    """
+    n_envs, first = runs[0].env.n_envs, runs[0].step
+    last = None if n_steps is None else first + n_steps
+    for run in runs:
+        check_state(run, learner)
+    timers = [Timer(run.seconds) for run in runs]
+    pace = Pace(machine.capacity)
+    known: list[Any] = []
+    while last is None or runs[0].step < last:
+        for timer in timers:
+            timer.lap()
+        for run in runs:
+            if run.obs is None or run.env.must_reset:
+                begin(run)
+        if not known or any(now is not then for now, then in zip(held(runs), known, strict=True)):
+            machine.push(runs, progress(runs[0].step - first))
+        for timer in timers:
+            timer.lap("replay")
+        step = runs[0].step
+        n_turns = min(pace.turns, turns_left(step, n_envs, last, stops))
+        limits = Limits(
+            np.int32(n_turns),
+            np.uint32(NO_LIMIT if last is None else last),
+            schedule(progress, step - first, n_turns, n_envs, machine.capacity, last, first),
+            np.int32(ALL),
+        )
+        began = time.perf_counter()
+        machine.call(limits)
+        for i, run in enumerate(runs):
+            if machine.fault(i):
+                machine.raise_fault(run, limits)
+        turns = []
+        for i, (run, timer) in enumerate(zip(runs, timers, strict=True)):
+            timer.lap("update")
+            turns.append(machine.pull(i, run, n_turns, last))
+            timer.lap("replay")
+        pace.note(n_turns, time.perf_counter() - began)
+        known = held(runs)
+        yield turns
+
+
+def held(runs: Sequence[Run]) -> list[Any]:
+    """Returns the objects of the runs that others may replace between chunks."""
+    return [one for run in runs for one in (run.state, run.obs, run.action, run.replay, run.env)]
+
+
+def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
+    """Returns the number of turns from ``step`` to the next stop, or to the last step if that is nearer.
+
+    >>> turns_left(90, 4, None, Stops((100,))), turns_left(100, 4, 103, Stops((100,)))
+    (3, 1)
+    """
+    marks = [(step // every + 1) * every for every in (*stops.every, MAX_TURNS * n_envs)]
+    nearest = min(marks if last is None else [*marks, last])
+    return -(-(nearest - step) // n_envs)
+
+
+def schedule(
+    progress: Callable[[int], float], taken: int, n_turns: int, n_envs: int, capacity: int, last: int | None, first: int
+) -> np.ndarray:
+    """Returns the progress after 0 to ``n_turns`` turns, ``float32 (capacity + 1,)``, padded."""
+    most = ALL if last is None else last - first
+    values = [progress(min(taken + i * n_envs, most)) for i in range(n_turns + 1)]
+    return np.pad(np.array(values, np.float32), (0, capacity - n_turns), mode="edge")
+
+
+class Pace:
+    """How many turns a chunk has, so that it takes about ``SECONDS``. Mutable."""
+
+    def __init__(self, capacity: int) -> None:
+        self.turns = min(8, capacity)
+        self._capacity = capacity
+        self._is_first = True
+
+    def note(self, n_turns: int, seconds: float) -> None:
+        """Takes into account that so many turns took so long; the first chunk also compiles."""
+        if self._is_first:
+            self._is_first = False
+            return
+        wanted = int(n_turns * SECONDS / max(seconds, 1e-6))
+        self.turns = min(max(wanted, 1), 8 * self.turns, self._capacity)
+
+
+def capacity_of(n_envs: int) -> int:
+    """Returns the turns of a chunk at most, for that number of environments."""
+    return max(min(MAX_TURNS, LOG_SIZE // n_envs), 1)
+
+
+def copies(tree: PyTree) -> PyTree:
+    """Returns copies of arrays on the host."""
+    import jax
+
+    return jax.tree.map(np.array, jax.device_get(tree))
