@@ -522,7 +522,7 @@ def test_large_finite_observations_are_fine():
 
 @settings(max_examples=40)
 @given(
-    st.lists(st.integers(1, 700), min_size=1, max_size=3),
+    st.lists(st.sampled_from([1, 700]), min_size=1, max_size=2),  # every combination of sizes is compiled
     st.integers(0, 699),
     st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 3e38, -3e38, 1e-45]),
 )

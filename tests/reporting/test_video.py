@@ -372,6 +372,7 @@ def test_show_videos_works_without_ipython(tmp_path, monkeypatch):
     assert shown._repr_html_() == shown.data
 
 
+@pytest.mark.exhaustive
 def test_an_environment_of_envpool_is_filmed_though_its_package_was_not_imported(tmp_path):
     pytest.importorskip("highway_env")
     script = """if True:
