@@ -82,6 +82,33 @@ def test_final_score_by_evaluation(runs):
     assert "last evaluation" in comparison.definition
 
 
+def test_last_evaluation_counts_though_the_last_episode_ended_before_it(tmp_path):
+    folder = write_run(tmp_path / "run")
+    lines = (folder / "episodes.csv").read_text(encoding="utf-8").splitlines()
+    (folder / "episodes.csv").write_text("\n".join([*lines[:-3], ""]), encoding="utf-8")
+    rows = ["step,seconds,success_rate,mean_return", "500,5,nan,1", "1000,10,nan,2", ""]
+    (folder / "evaluations.csv").write_text("\n".join(rows), encoding="utf-8")
+    for axis, end in (("steps", 1000), ("time", 10)):
+        (group,) = compare(folder, x=axis, score="evaluation", samples=10).groups
+        assert (group.score[0], group.x[-1]) == (2.0, end)
+
+
+def test_run_without_an_evaluation_before_the_end_of_the_shortest_is_left_out(tmp_path):
+    write_run(tmp_path / "late")
+    write_run(tmp_path / "short", seed=1, steps=500)
+    comparison = compare(tmp_path, score="evaluation", samples=10)
+    assert [run.name for run in comparison.groups[0].runs] == ["short"]
+    assert "late has no evaluation within what is compared and is left out" in comparison.notes
+
+
+def test_time_that_was_set_back_is_sorted(tmp_path):
+    folder = write_run(tmp_path / "run", steps=40)
+    rows = ["step,env,return,length,success,seconds", "10,0,1,10,,3", "20,0,2,10,,1", "30,0,3,10,,2", "40,0,4,10,,10"]
+    (folder / "episodes.csv").write_text("\n".join([*rows, ""]), encoding="utf-8")
+    (group,) = compare(folder, x="time", samples=10).groups
+    assert group.curve[0, [11, 21, 31, 100]].tolist() == [2, 3, 1, 4]
+
+
 def test_groups_by_the_settings_that_differ(tmp_path):
     for i, gamma in enumerate((0.9, 0.9, 0.99)):
         write_run(tmp_path / str(i), seed=i, hyperparameters={"gamma": gamma, "tau": 1.0})

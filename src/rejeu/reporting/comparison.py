@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -294,9 +295,12 @@ def compare(
     curves = [Curve.of(run, x, score) for run in found]
     notes += [one.problem for one in curves if one.problem]
     curves = [one for one in curves if not one.problem]
+    cut_to_shortest(curves, x, notes)
+    late = [one for one in curves if one.evaluation is not None and one.evaluation[0][0] > one.end]
+    notes += [f"{one.run.name} has no evaluation within what is compared and is left out" for one in late]
+    curves = [one for one in curves if one not in late]
     if not curves:
         raise ValueError(f"there is nothing to compare; {'; '.join(notes)[:500] or 'no run was given'}")
-    cut_to_shortest(curves, x, notes)
     kind, labels = group_labels([one.run for one in curves], by)
     for one, label in zip(curves, labels, strict=True):
         one.label = label
@@ -319,6 +323,7 @@ class Curve:
         self.env = env_label(run)
         self.label = ""
         self.end = float(x[-1]) if len(x) else 0.0
+        """Where the curve ends: the steps, or the time, that all runs of the environment have."""
         self.evaluation: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
@@ -334,7 +339,12 @@ class Curve:
         x, y = x[known], y[known]
         if not len(x) or x[-1] <= 0:
             return cls(run, x[:0], y[:0], f"{name} has no episode yet and is left out")
+        if (np.diff(x) < 0).any():  # time that was set back
+            order = np.argsort(x, kind="stable")
+            x, y = x[order], y[order]
         curve = cls(run, x, y)
+        whole = run.steps if axis == "steps" else run.seconds
+        curve.end = max(curve.end, whole if math.isfinite(whole) else 0.0)  # the last episode ends before the run does
         if score == "evaluation":
             table = run.evaluations
             when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
@@ -364,7 +374,7 @@ class Curve:
         """Returns the final score."""
         if self.evaluation is not None:
             when, value = self.evaluation
-            return float(value[max(int(np.searchsorted(when, self.end, "right")) - 1, 0)])
+            return float(value[int(np.searchsorted(when, self.end, "right")) - 1])
         return float(self.mean_between(np.array([(1 - FINAL) * self.end]), np.array([self.end]))[0])
 
 
