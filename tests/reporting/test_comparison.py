@@ -158,6 +158,25 @@ def test_several_environments_are_not_averaged_unless_normalized(tmp_path):
         compare(tmp_path, normalize={"A-v0": (0.0, 2.0)})
 
 
+def test_groups_of_different_environments_are_not_compared(tmp_path):
+    for algorithm, envs in (("DQN", "AB"), ("PPO", "AC"), ("A2C", "AB")):
+        for env in envs:
+            for seed in range(5):
+                write_run(tmp_path / f"{algorithm}{env}{seed}", algorithm, f"{env}-v0", seed, 1.0 + seed)
+    comparison = compare(tmp_path, "algorithm", normalize="range", samples=20)
+    assert {(group.label, group.env_id) for group in comparison.groups} == {
+        ("DQN", "A-v0, B-v0"),
+        ("PPO", "A-v0, C-v0"),
+        ("A2C", "A-v0, B-v0"),
+    }
+    (improvement,) = comparison.improvements
+    assert {improvement.label, improvement.other} == {"A2C", "DQN"}
+    assert improvement.env_id == "A-v0, B-v0"
+    assert comparison.notes == (
+        "the groups are of different environments; only groups of the same environments are compared",
+    )
+
+
 def test_runs_without_episodes_are_left_out(runs):
     folder = write_run(runs / "crashed", seed=9)
     (folder / "episodes.csv").unlink()

@@ -466,9 +466,15 @@ def summarize(
     notes: list[str],
 ) -> Comparison:
     """Returns the comparison of prepared curves; ``mixes`` averages over environments."""
+    envs: dict[str, set[str]] = {}
+    for one in curves:
+        envs.setdefault(one.label, set()).add(one.env)
+    mixes = mixes and by != "env"
     keyed: dict[tuple[str, str], list[Curve]] = {}
     for one in curves:
-        keyed.setdefault(("" if mixes and by != "env" else one.env, one.label), []).append(one)
+        keyed.setdefault((", ".join(sorted(envs[one.label])) if mixes else one.env, one.label), []).append(one)
+    if len({env for env, _ in keyed}) > 1 and mixes:
+        notes.append("the groups are of different environments; only groups of the same environments are compared")
     rng = np.random.default_rng(seed)
     groups = []
     finals = {key: strata([(one.env, one.final()) for one in members]) for key, members in keyed.items()}
@@ -478,11 +484,9 @@ def summarize(
         level = min(float(statistics.mean(one)) for one in peers) if threshold is None else threshold
         everything = np.concatenate([one for scores in peers for one in scores])
         levels = np.linspace(everything.min(), everything.max(), N_LEVELS)
-        groups.append(
-            make_group(key, keyed[key], finals[key], draws[key], levels, level, statistic, mixes and by != "env")
-        )
+        groups.append(make_group(key, keyed[key], finals[key], draws[key], levels, level, statistic, mixes))
     pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
-    improvements = [compared(*pair, finals, draws) for pair in pairs if len({len(finals[one]) for one in pair}) == 1]
+    improvements = [compared(*pair, finals, draws) for pair in pairs]
     single = [group.label for group in groups if len(group.runs) == 1]
     if single:
         notes.append(
@@ -525,7 +529,7 @@ def make_group(
         middle = function(curves)
     return Group(
         label=key[1],
-        env_id=key[0] or ", ".join(sorted({one.env for one in members})),
+        env_id=key[0],
         runs=tuple(one.run for one in members),
         scores=scores,
         run_scores=tuple(one.final() for one in members),
