@@ -1,12 +1,14 @@
 """Runs of Stable-Baselines3 and TensorBoard; the recorded files are those of real runs (golden/record_monitor.py)."""
 
 import csv
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rejeu.reporting import run_list
+from rejeu.reporting.comparison import compare
 from rejeu.reporting.foreign import read_monitor
 
 RECORDED = Path(__file__).parents[1] / "golden" / "sb3_monitor"
@@ -54,6 +56,15 @@ def test_tensorboard_files():
     run = run_list.read(RECORDED / "tb" / "PPO_1")
     assert (run.format, run.algorithm, run.seed, run.steps) == ("tensorboard", "PPO", 1, 768)
     assert np.isfinite(run.metrics.column("rollout/ep_rew_mean")).all()
+    (group,) = compare(run, x="time", samples=10).groups
+    assert group.x[-1] == run.seconds > 0
+
+
+def test_tensorboard_files_without_the_package_are_left_out(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboard.backend.event_processing.event_accumulator", None)
+    runs, notes = run_list.read_all([ZOO, RECORDED / "tb"])
+    assert [run.format for run in runs] == ["monitor"]
+    assert "PPO_1 is left out: reading TensorBoard files needs" in notes[0]
 
 
 def test_damaged_tensorboard_file(tmp_path):

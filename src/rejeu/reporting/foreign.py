@@ -151,7 +151,7 @@ def read_tensorboard(folder: Path) -> Run:
             column.update((event.step, (event.value, event.wall_time)) for event in events.Scalars(tag))
     metrics = ordered(table_of(values)) if values else EMPTY
     algorithm, env_id, number = named(folder)
-    seconds = metrics.column("time/seconds")
+    seconds = metrics.column("time/time_elapsed")
     return Run(
         path=folder.resolve(),
         name=shown(folder.name, MAX_NAME),
@@ -177,5 +177,5 @@ def table_of(values: Mapping[str, Mapping[int, tuple[float, float]]]) -> Table:
         for step, (value, time) in column.items():
             columns[name][row[step]] = value
             wall[row[step]] = time
-    columns.setdefault("time/seconds", wall - np.nanmin(wall))
+    columns.setdefault("time/time_elapsed", wall - np.nanmin(wall))
     return Table(columns)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
+from rejeu.errors import MissingExtra
 from rejeu.io.records import shown
 from rejeu.reporting import foreign
-from rejeu.reporting.runs import CONFIG, EPISODES, METRICS, Run, is_file, read_run
+from rejeu.reporting.runs import CONFIG, EPISODES, MAX_NAME, METRICS, Run, is_file, read_run
 
 MAX_DEPTH = 4
 """Levels of folders that are searched for runs."""
@@ -71,15 +74,25 @@ def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list
                 notes.append(run)
                 continue
             runs.append(run)
-            notes += [f"{run.name}: {note}" for note in run.notes if "damaged" in note]
+    runs = distinct(runs)
+    notes += [f"{run.name}: {note}" for run in runs for note in run.notes if "damaged" in note]
     return runs, notes
+
+
+def distinct(runs: list[Run]) -> list[Run]:
+    """Returns the runs; those of the same name, such as ``seed_0``, get the name of the folder above in front of it."""
+    counts = Counter(run.name for run in runs)
+    return [
+        replace(run, name=shown(f"{run.path.parent.name}/{run.name}", MAX_NAME)) if counts[run.name] > 1 else run
+        for run in runs
+    ]
 
 
 def read_or_note(path: Path | Run) -> Run | str:
     """Returns a run as comparisons need it, or a note if it cannot be read."""
     try:
         return path if isinstance(path, Run) else read(path, table_only=True)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MissingExtra) as error:
         return shown(f"{path} is left out: {error}", 300)
 
 
