@@ -39,6 +39,8 @@ def test_compare_as_json(runs, capsys):
     [
         (["--reference", "CartPole-v1=1"], "--reference 'CartPole-v1=1' must be ENV=LOW,HIGH"),
         (["--by", "seed"], "--by"),
+        (["--threshold", "nan"], "--threshold=nan must be a finite number"),
+        (["--reference", "CartPole-v1=5,inf"], "must be two returns, the lower first"),
         (["--out", "a.pdf"], "'a.pdf' must end in md, csv, json, png, html, or be a folder"),
     ],
 )

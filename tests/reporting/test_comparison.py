@@ -121,6 +121,35 @@ def test_groups_by_the_settings_that_differ(tmp_path):
     assert "1 of 2 groups have one run" in comparison.notes[0]
 
 
+def test_settings_whose_labels_begin_alike_are_different_groups(tmp_path):
+    for i, last in enumerate((0.1, 0.2)):
+        noise = {"noise": "normal", "mean": [0.0] * 100, "sigma": [0.0] * 100 + [last]}
+        write_run(tmp_path / str(i), seed=i, hyperparameters={"action_noise": noise}, env_kwargs={"x": [0] * 90 + [i]})
+    comparison = compare(tmp_path, "setting", samples=10)
+    assert len({group.label for group in comparison.groups}) == 2
+    assert len({group.env_id for group in comparison.groups}) == 2
+    assert max(len(group.label) for group in comparison.groups) < 220
+
+
+def test_groups_that_mix_settings_get_a_note(tmp_path):
+    for i, gamma in enumerate((0.9, 0.99)):
+        write_run(tmp_path / f"dqn{i}", seed=i, hyperparameters={"gamma": gamma})
+        write_run(tmp_path / f"ppo{i}", "PPO", seed=i)
+    assert compare(tmp_path, samples=10).notes == (
+        "DQN: the runs of this group differ in their settings; --by setting separates them",
+        "2 of 2 groups have fewer than 5 runs, so that their intervals are too narrow",
+    )
+
+
+def test_runs_of_the_same_name_get_that_of_the_folder_above(tmp_path):
+    for parent in ("a", "b"):
+        write_run(tmp_path / parent / "seed_0")
+    (tmp_path / "b" / "seed_0" / "episodes.csv").unlink()
+    comparison = compare(tmp_path, samples=10)
+    assert "b/seed_0 has no episode yet and is left out" in comparison.notes
+    assert comparison.groups[0].runs[0].name == "a/seed_0"
+
+
 def test_different_budgets_are_cut_to_the_shortest(tmp_path):
     write_run(tmp_path / "a", seed=0)
     write_run(tmp_path / "b", seed=1, steps=500)
@@ -191,7 +220,12 @@ def test_run_in_progress_is_compared_by_its_means(tmp_path):
     folder = write_run(tmp_path / "run")
     (folder / "episodes.csv").unlink()
     (folder / "metrics.csv").write_text("step,rollout/ep_rew_mean,time/seconds\n500,3,1\n1000,5,2\n", encoding="utf-8")
-    assert compare(folder, samples=10).groups[0].score[0] == 5.0
+    comparison = compare(folder, samples=10)
+    assert comparison.groups[0].score[0] == 5.0
+    assert (
+        comparison.notes[0]
+        == "1 of 1 runs have no episodes on disk; the logged means of their latest episodes are used"
+    )
 
 
 def test_outputs(runs, tmp_path):
@@ -241,7 +275,20 @@ def test_page(runs):
     assert len(text) < 6_000_000
 
 
-@pytest.mark.parametrize("arguments", [{"by": "seed"}, {"x": "epochs"}, {"score": "best"}, {"statistic": "mode"}])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"by": "seed"},
+        {"x": "epochs"},
+        {"score": "best"},
+        {"statistic": "mode"},
+        {"samples": 0},
+        {"seed": -1},
+        {"threshold": math.nan},
+        {"normalize": {"CartPole-v1": 3}},
+        {"normalize": {"CartPole-v1": (0, "x")}},
+    ],
+)
 def test_invalid_arguments(runs, arguments):
     with pytest.raises(ValueError, match="must be"):
         compare(runs, **arguments)

@@ -41,7 +41,7 @@ def check_values(arguments: Any) -> None:
             number(option, value, above=0)
         elif key == "checkpoint_minutes":
             number(option, value, least=0)
-        elif key == "success_threshold":
+        elif key in ("success_threshold", "threshold"):
             number(option, value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import math
@@ -12,11 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from rejeu import validation
 from rejeu.io import atomic
 from rejeu.io.records import shown
 from rejeu.reporting import statistics
 from rejeu.reporting.run_list import read_all
-from rejeu.reporting.runs import Run, flat, text
+from rejeu.reporting.runs import Run, flat
 from rejeu.reporting.tabular import (
     cell,
     csv_text,
@@ -44,6 +46,10 @@ SMOOTHING = 0.05
 """Width of the moving mean of a curve, as a share of what is compared."""
 FINAL = 0.1
 """Share of training, at its end, whose episodes make the final score."""
+FEW = 4
+"""Number of runs up to which a note says that bootstrap intervals are too narrow."""
+MAX_LABEL = 200
+"""Characters of a label that are shown."""
 FORMATS = ("md", "csv", "json", "png", "html")
 
 
@@ -287,6 +293,9 @@ def compare(
     """
     if by not in (None, "algorithm", "setting", "env") or x not in ("steps", "time"):
         raise ValueError(f"by={by!r} must be 'algorithm', 'setting' or 'env', and x={x!r} 'steps' or 'time'")
+    if threshold is not None:
+        threshold = validation.number("threshold", threshold)
+    samples, seed = validation.whole("samples", samples, 1), validation.whole("seed", seed, 0)
     if score not in ("training", "evaluation") or statistic not in statistics.STATISTICS:
         raise ValueError(
             f"score={score!r} must be 'training' or 'evaluation', and statistic={statistic!r} 'iqm', 'mean' or 'median'"
@@ -304,6 +313,7 @@ def compare(
     kind, labels = group_labels([one.run for one in curves], by)
     for one, label in zip(curves, labels, strict=True):
         one.label = label
+    notes += warnings_of(curves)
     envs = sorted({one.env for one in curves})
     if normalize is not None:
         scale(curves, normalize)
@@ -313,6 +323,24 @@ def compare(
             "normalize them (--normalize range, or --reference ENV=LOW,HIGH) to average"
         )
     return summarize(curves, kind, x, score, statistic, normalize is not None, threshold, samples, seed, notes)
+
+
+def warnings_of(curves: Sequence[Curve]) -> list[str]:
+    """Returns a note about groups that mix settings, and one about runs whose episodes are not known."""
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for one in curves:
+        groups.setdefault((one.label, one.env), []).append(one.run)
+    mixed = [label for (label, _), runs in groups.items() if len({*settings(runs)}) > 1]
+    notes = [
+        f"{shown(label, 100)}: the runs of this group differ in their settings; --by setting separates them"
+        for label in dict.fromkeys(mixed)
+    ]
+    means = sum(not len(one.run.episodes) for one in curves)
+    if means:
+        notes.append(
+            f"{means} of {len(curves)} runs have no episodes on disk; the logged means of their latest episodes are used"
+        )
+    return notes
 
 
 class Curve:
@@ -409,20 +437,35 @@ def group_labels(runs: Sequence[Run], by: By | None) -> tuple[By, list[str]]:
 def settings(runs: Sequence[Run]) -> list[str]:
     """Returns for each run the algorithm and the settings in which the runs differ."""
     values = [dict(flat(run.hyperparameters)) | {"n_envs": run.n_envs} for run in runs]
-    written = [{name: text(value) for name, value in one.items()} for one in values]
+    written = [{name: whole_text(value) for name, value in one.items()} for one in values]
     names = sorted({name for one in written for name in one})
     differing = [name for name in names if len({one.get(name, "") for one in written}) > 1]
     labels = []
     for run, one in zip(runs, written, strict=True):
         parts = [run.algorithm or run.path.parent.name, *(f"{name}={one[name]}" for name in differing if name in one)]
-        labels.append(shown(", ".join(parts), 200))
+        labels.append(shortened(", ".join(parts)))
     return labels
 
 
 def env_label(run: Run) -> str:
     """Returns the environment of a run with its keyword arguments."""
-    kwargs = ", ".join(f"{name}={text(value)}" for name, value in sorted(run.env_kwargs.items()))
-    return shown(f"{run.env_id}({kwargs})" if kwargs else run.env_id, 200)
+    kwargs = ", ".join(f"{name}={whole_text(value)}" for name, value in sorted(run.env_kwargs.items()))
+    return shortened(f"{run.env_id}({kwargs})" if kwargs else run.env_id)
+
+
+def whole_text(value: Any) -> str:
+    """Returns a value of a configuration as text, empty for None."""
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def shortened(label: str) -> str:
+    """Returns a label; a long one is cut, with a digest that keeps it apart from others that begin alike."""
+    if len(label) <= MAX_LABEL:
+        return shown(label, MAX_LABEL)
+    digest = hashlib.blake2b(label.encode("utf-8", "backslashreplace"), digest_size=4).hexdigest()
+    return f"{shown(label, MAX_LABEL)} #{digest}"
 
 
 def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, float]]) -> None:
@@ -440,17 +483,30 @@ def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, fl
                 raise ValueError(
                     f"normalize has no reference returns for {one.env!r}; add {{{one.env!r}: (low, high)}}"
                 )
-            low, high = normalize[one.env]
+            low, high = references(one.env, normalize[one.env])
         elif normalize == "range":
             low, high = min(finals[one.env]), max(finals[one.env])
         else:
             raise ValueError(f"normalize={normalize!r} must be 'range' or a mapping of environments to (low, high)")
-        if isinstance(normalize, Mapping) and not high > low:
-            raise ValueError(f"normalize[{one.env!r}]={(low, high)} must be two returns, the lower first")
         span = (high - low) or 1.0
         one.y = (one.y - low) / span
         if one.evaluation is not None:
             one.evaluation = one.evaluation[0], (one.evaluation[1] - low) / span
+
+
+def references(env: str, pair: Any) -> tuple[float, float]:
+    """Returns the two reference returns of an environment.
+
+    Raises:
+        ValueError: if they are not two finite numbers, the lower first.
+    """
+    try:
+        low, high = map(float, pair)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(f"normalize[{env!r}]={pair!r} must be two returns, the lower first")
+    return low, high
 
 
 def summarize(
@@ -487,11 +543,12 @@ def summarize(
         groups.append(make_group(key, keyed[key], finals[key], draws[key], levels, level, statistic, mixes))
     pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
     improvements = [compared(*pair, finals, draws) for pair in pairs]
-    single = [group.label for group in groups if len(group.runs) == 1]
-    if single:
-        notes.append(
-            f"{len(single)} of {len(groups)} groups have one run, so that their intervals say nothing about luck"
-        )
+    for few, effect in ((1, "say nothing about luck"), (FEW, "are too narrow")):
+        short = sum(len(group.runs) <= few for group in groups)
+        if short:
+            runs = "one run" if few == 1 else f"fewer than {few + 1} runs"
+            notes.append(f"{short} of {len(groups)} groups have {runs}, so that their intervals {effect}")
+            break
     return Comparison(tuple(groups), tuple(improvements), by, axis, score, statistic, tuple(notes))
 
 
