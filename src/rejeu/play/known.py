@@ -54,6 +54,8 @@ KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
     },
 }
 """Actions and descriptions of the keys, by id."""
+KNOWN |= {f"jax/{env_id}": KNOWN[env_id] for env_id in [*KNOWN] if env_id.startswith(("Cart", "Mountain", "Pendulum"))}
+KNOWN |= {"jax/Parking-v0": KNOWN["parking-v0"]}
 
 
 def full_name(name: str) -> str:

@@ -31,7 +31,7 @@ from rejeu.validation import number, whole
 
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
-PLAYBACK_FPS = {"parking-v0": 15.0}
+PLAYBACK_FPS = {"parking-v0": 15.0, "jax/Parking-v0": 15.0}
 """Frames per second of environments whose ``render_fps`` is too slow for a video."""
 RECORDER = "gymnasium.wrappers.rendering:RecordVideo"
 """Entry point of the wrapper that records training episodes."""

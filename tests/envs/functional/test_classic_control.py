@@ -19,8 +19,8 @@ each_case = pytest.mark.parametrize("case", CASES, ids=[case.env_id for case in 
 def test_steps_equal_gymnasiums_in_double_precision(case: Case):
     found = difference(case, 4_000, x64=True)
     assert found.n_terminated == 0
-    assert found.state < 1e-12
-    assert found.reward < 1e-9  # Gymnasium's Pendulum squares the float32 action
+    assert found.state < case.rounding
+    assert found.reward < 1e-12
     assert found.obs < 1e-6  # Gymnasium rounds observations to float32
 
 

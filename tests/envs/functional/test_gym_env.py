@@ -12,6 +12,7 @@ from rejeu.envs.checker import findings
 from rejeu.envs.functional import make
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.functional.registry import REGISTRY
+from rejeu.reporting.video import display_for_pygame
 
 IDS = [*REGISTRY]
 
@@ -31,10 +32,11 @@ def test_the_registered_limit_is_the_environments_own(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_it_draws_itself(env_id):
-    with gym.make(env_id, render_mode="rgb_array") as env:
+    pytest.importorskip("pygame")
+    with gym.make(env_id, render_mode="rgb_array") as env, display_for_pygame():
         env.reset(seed=0)
         first = env.render()
-        for _ in range(5):
+        for _ in range(20):
             env.step(env.action_space.sample())
         later = env.render()
     assert first.dtype == np.uint8

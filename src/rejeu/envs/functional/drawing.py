@@ -9,6 +9,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs import classic_control
 
+from rejeu.envs.functional.parking import ROW_DISTANCE, spot
+from rejeu.envs.registry import make_env
+
 
 class Scene(NamedTuple):
     """What there is to draw."""
@@ -61,3 +64,46 @@ def cart_pole(env: Any, render_mode: str) -> Drawing:
 def pendulum(env: Any, render_mode: str) -> Drawing:
     """Returns the drawing of Pendulum."""
     return Original(classic_control.PendulumEnv(render_mode=render_mode))
+
+
+def mountain_car(env: Any, render_mode: str) -> Drawing:
+    """Returns the drawing of both MountainCars."""
+    return Original(classic_control.MountainCarEnv(render_mode=render_mode, goal_velocity=env.goal_velocity))
+
+
+def acrobot(env: Any, render_mode: str) -> Drawing:
+    """Returns the drawing of Acrobot."""
+    return Original(classic_control.AcrobotEnv(render_mode=render_mode))
+
+
+class ParkingLot(Drawing):
+    """highway-env's ``parking-v0``, which draws our states."""
+
+    fps = 5.0
+
+    def __init__(self, render_mode: str) -> None:
+        """Makes the environment.
+
+        Raises:
+            MissingExtra: if highway-env is not installed.
+        """
+        self.env: Any = make_env("parking-v0", render_mode=render_mode).unwrapped
+
+    def draw(self, scene: Scene) -> np.ndarray | None:
+        state, vehicle = scene.states[-1], self.env.vehicle
+        vehicle.position, vehicle.heading = state.position.astype(np.float64), float(state.heading)
+        vehicle.speed, vehicle.crashed = float(state.speed), bool(state.crashed)
+        x, side = spot(state.goal)
+        vehicle.goal.position = np.array([float(x), ROW_DISTANCE * float(side)])
+        vehicle.goal.heading = float(side) * np.pi / 2
+        if scene.action is not None:
+            vehicle.action = self.env.action_type.get_action(np.asarray(scene.action, np.float64))
+        return self.env.render()
+
+    def close(self) -> None:
+        self.env.close()
+
+
+def parking(env: Any, render_mode: str) -> Drawing:
+    """Returns the drawing of Parking."""
+    return ParkingLot(render_mode)

@@ -39,6 +39,10 @@ class Entry(NamedTuple):
 REGISTRY: dict[str, Entry] = {
     "jax/CartPole-v1": Entry("cart_pole:CartPole", 500, 475.0, "drawing:cart_pole"),
     "jax/Pendulum-v1": Entry("pendulum:Pendulum", 200, None, "drawing:pendulum"),
+    "jax/MountainCar-v0": Entry("mountain_car:MountainCar", 200, -110.0, "drawing:mountain_car"),
+    "jax/MountainCarContinuous-v0": Entry("mountain_car:MountainCarContinuous", 999, 90.0, "drawing:mountain_car"),
+    "jax/Acrobot-v1": Entry("acrobot:Acrobot", 500, -100.0, "drawing:acrobot"),
+    "jax/Parking-v0": Entry("parking:Parking", 500, None, "drawing:parking"),
 }
 """The environments by id."""
 
