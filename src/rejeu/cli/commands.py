@@ -96,13 +96,15 @@ class Train(EnvironmentOptions):
 
 @dataclass(frozen=True)
 class Resume(RunOptions):
-    """Resumes a run that was stopped, or that crashed, from its newest checkpoint.
+    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a study of rejeu tune.
 
     Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
     """
 
     run: RunPath
     """Its folder."""
+    workers: Count = None
+    """Of a study: trials at once; by default half as many as there are cores."""
     steps: Count = None
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
     minutes: Minutes = None
@@ -111,6 +113,57 @@ class Resume(RunOptions):
     """Write no report.html at the end."""
     no_video: Annotated[bool, FlagCreatePairsOff] = False
     """Record no video at the end."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
+
+
+@dataclass(frozen=True)
+class Tune(EnvironmentOptions):
+    """Searches hyperparameters with Optuna, and compares the best ones with the default on fresh seeds.
+
+    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu tune Pendulum-v1 --algo SAC --trials 30
+    """
+
+    env: EnvironmentId
+    """Id of an environment, as for rejeu train."""
+    algo: Name = None
+    """Algorithm; by default that of the preset."""
+    trials: Annotated[int, arg(metavar="N")] = 30
+    """How many trials; of a study that exists, how many in all."""
+    steps: Count = None
+    """Environment steps of a trial; by default the preset's, else 100000."""
+    envs: Count = None
+    """Environments stepped at once; by default the preset's, else 1."""
+    backend: Name = None
+    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto."""
+    preset: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """What trials start from and the winner is compared with; by default rejeu's preset, else the algorithm's defaults."""
+    assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
+    """Hyperparameters to set instead of searching them, as for rejeu train."""
+    search: Annotated[Assignments, UseAppendAction, arg(metavar="NAME=LOW..HIGH ...")] = ()
+    """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 batch_size=[64,128] tau=log:0.001..0.1"""
+    only: Annotated[Assignments, UseAppendAction, arg(metavar="NAME ...")] = ()
+    """Search these hyperparameters and no others."""
+    trial_seeds: Annotated[int, arg(metavar="K")] = 1
+    """Seeds of each trial, trained at once, whose evaluations are averaged."""
+    final_seeds: Annotated[int, arg(metavar="K")] = 5
+    """Fresh seeds on which the winner is compared with the default; 0 for no comparison."""
+    pruner: Literal["median", "halving", "none"] = "median"
+    """Stop trials that are below the median of the others, or by successive halving, or none."""
+    measure: Literal["return", "success"] = "return"
+    """Maximize the mean return of the last evaluation, or its success rate."""
+    evaluate_every: Count = None
+    """Environment steps between two evaluations; by default a tenth of --steps."""
+    evaluate_episodes: Count = None
+    """Episodes of each evaluation; by default the preset's, else 20."""
+    checkpoint_minutes: Annotated[float, arg(metavar="M", help_behavior_hint="(default: 5)")] = 5.0
+    """Minutes between two checkpoints of a training; 0 for none."""
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Determines what is sampled and the seeds of all trainings."""
+    workers: Count = None
+    """Trials at once; by default half as many as there are cores."""
+    out: Folder = None
+    """Study folder; an existing one is continued or joined. By default a new one under runs."""
     json: Json = False
     """Print the result as one JSON document, and messages to standard error."""
 
@@ -337,6 +390,7 @@ class Status:
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
+    "tune": Tune,
     "resume": Resume,
     "evaluate": Evaluate,
     "record": Record,

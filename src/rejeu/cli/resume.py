@@ -7,17 +7,20 @@ from contextlib import closing
 from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
-from rejeu.cli import jsonout, run_folder
+from rejeu.cli import jsonout, run_folder, tune
 from rejeu.cli.commands import Resume
 from rejeu.cli.output import echo
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
+from rejeu.tuning.study import StudyFolder
 
 
 def run(arguments: Resume) -> int:
     """Trains and returns the exit status, as ``rejeu train`` does."""
+    if StudyFolder(arguments.run).plan.is_file():
+        return jsonout.run(tune.resume, arguments)
     return jsonout.run(resume, arguments)
 
 

@@ -22,6 +22,10 @@ INTEGERS = {
     "seed": (0, 2**32 - 1),
     "seeds": (1, 1000),
     "jobs": (1, 1000),
+    "trials": (1, 100_000),
+    "trial_seeds": (1, 1000),
+    "final_seeds": (0, 1000),
+    "workers": (1, 1000),
 }
 """The smallest and the largest value of options that are whole numbers, in all commands."""
 

@@ -1,0 +1,163 @@
+"""The winner against the default: both are trained on fresh seeds that the study did not use, and compared."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from filelock import Timeout
+
+from rejeu import presets, validation
+from rejeu.agents import AGENTS
+from rejeu.interrupt import Interrupt
+from rejeu.presets import Preset
+from rejeu.reporting import statistics
+from rejeu.reporting.comparison import Comparison, compare
+from rejeu.reporting.runs import read_run
+from rejeu.tuning.search import IDLE, POLL
+from rejeu.tuning.study import Outcome, Study, hold
+from rejeu.tuning.training import Command, Training
+
+DEFAULT = "default"
+SAMPLES = 10_000
+"""Bootstrap samples of the difference."""
+
+Verdict = Literal["better", "worse", "no difference found", "the default itself", "not compared"]
+
+
+@dataclass(frozen=True)
+class Final:
+    """The result of the comparison."""
+
+    verdict: Verdict
+    difference: tuple[float, float, float] | None
+    """Interquartile mean of the winner's returns minus that of the default's, and its 95 % interval."""
+    comparison: Comparison | None
+    failed: tuple[str, ...]
+    """Trainings that failed, with the reason."""
+
+    def __str__(self) -> str:
+        if self.verdict == "not compared":
+            return "the winner was not compared with the default" + (f": {self.failed[0]}" if self.failed else "")
+        if self.verdict == "the default itself":
+            return "the best trial has the hyperparameters of the default; there is nothing to compare"
+        assert self.difference is not None
+        value, low, high = self.difference
+        text = f"by {value:,.4g} in IQM return (95 % interval {low:,.4g} to {high:,.4g})"
+        if self.verdict == "no difference found":
+            return f"on fresh seeds the winner is not shown to be better than the default: they differ {text}"
+        return f"on fresh seeds the winner is {self.verdict} than the default {text}"
+
+
+def winner_name(best: Outcome) -> str:
+    """Returns the name of the winner's folder and group."""
+    return f"trial_{best.index:04d}"
+
+
+def is_default(study: Study, winner: Preset) -> bool:
+    """Returns whether a preset has the hyperparameters of the default."""
+    config = AGENTS[study.plan.algorithm].algorithm.Config
+    own = (validation.build(config, values) for values in (winner.hyperparameters, study.plan.default))
+    return next(own) == next(own)
+
+
+def trainings(study: Study, best: Outcome) -> list[Training]:
+    """Returns all trainings of the comparison, in pairs; their presets are written."""
+    named = {
+        winner_name(best): study.preset_of(best, f"trial {best.index}"),
+        DEFAULT: study.plan.preset(study.plan.default, "the default"),
+    }
+    for name, preset in named.items():
+        presets.write(preset, study.folder.final / name / "preset.json")
+    return [
+        Training(study.folder.final / name / f"seed_{seed}", seed, study.folder.final / name / "preset.json")
+        for seed in study.plan.fresh_seeds()
+        for name in named
+    ]
+
+
+def train(
+    study: Study, best: Outcome, command: Command, workers: int, stop: Interrupt, watch: Callable[[str], object]
+) -> list[str]:
+    """Trains winner and default on the fresh seeds, as many as ``workers`` at once; returns the failures.
+
+    Trainings that other processes hold are waited for; finished ones are not repeated.
+    """
+    waiting, running, failed = trainings(study, best), list[tuple[Training, Any]](), list[str]()
+    n, was_stopped, next_look = len(waiting), False, 0.0
+    try:
+        while True:
+            if stop.requested and not was_stopped:
+                was_stopped = True
+                for training, _ in running:
+                    training.stop()
+            while not stop.requested and waiting and len(running) < workers and time.monotonic() >= next_look:
+                training = waiting.pop(0)
+                try:
+                    lock = hold(training.path.with_name(f"{training.path.name}.lock"))
+                except Timeout:
+                    waiting.append(training)
+                    next_look = time.monotonic() + IDLE
+                    continue
+                running.append((training, lock))
+                training.start(command, study.plan.checkpoint_minutes)
+            for training, lock in list(running):
+                if not training.has_ended():
+                    continue
+                running.remove((training, lock))
+                lock.release()
+                if training.status == 0:
+                    training.drop_checkpoints()
+                elif not was_stopped:
+                    failed.append(f"{training.path.parent.name}, seed {training.seed}: {training.last_line()}")
+                watch(f"final comparison: {n - len(waiting) - len(running)} of {n} trainings have ended")
+            if not running and (stop.requested or not waiting):
+                return failed
+            time.sleep(POLL)
+    finally:
+        for training, lock in running:
+            training.kill()
+            lock.release()
+
+
+def result(study: Study, best: Outcome, failed: list[str]) -> Final:
+    """Returns the comparison of the trainings that are there."""
+    if is_default(study, study.preset_of(best, "")):
+        return Final("the default itself", None, None, ())
+    runs = {name: finished(study.folder.final / name) for name in (winner_name(best), DEFAULT)}
+    labels = {winner_name(best): f"winner (trial {best.index})", DEFAULT: DEFAULT}
+    if not all(runs.values()):
+        return Final("not compared", None, None, tuple(failed))
+    labeled = [dataclasses.replace(run, algorithm=labels[name]) for name, found in runs.items() for run in found]
+    comparison = compare(labeled, "algorithm", score="evaluation", seed=study.plan.seed)
+    by_label = {group.label: group.scores for group in comparison.groups}
+    winner, default = (by_label[labels[name]] for name in runs)
+    value, low, high = difference(winner, default, study.plan.seed)
+    verdict: Verdict = "better" if low > 0 else "worse" if high < 0 else "no difference found"
+    return Final(verdict, (value, low, high), comparison, tuple(failed))
+
+
+def finished(folder: Path) -> list[Any]:
+    """Returns the finished runs in a folder."""
+    found = [read_run(path) for path in sorted(folder.glob("seed_*")) if (path / "config.json").is_file()]
+    return [run for run in found if run.state == "finished"]
+
+
+def difference(one: statistics.Scores, other: statistics.Scores, seed: int) -> tuple[float, float, float]:
+    """Returns the difference of the interquartile means of two groups, and its 95 % bootstrap interval.
+
+    >>> difference([np.array([2.0, 2.0])], [np.array([1.0, 1.0])], 0)
+    (1.0, 1.0, 1.0)
+    """
+    rng = np.random.default_rng(seed)
+    values = []
+    for scores in (one, other):
+        samples = statistics.resampled(scores, statistics.draw(scores, SAMPLES, rng))
+        values.append((statistics.iqm(scores), statistics.iqm(samples)))
+    low, high = statistics.interval(values[0][1] - values[1][1])
+    return float(values[0][0] - values[1][0]), float(low), float(high)

@@ -1,0 +1,285 @@
+"""What a study searches: environment, algorithm, search space and limits, as ``study.json`` in the study folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from rejeu import presets, validation
+from rejeu.agents import AGENTS, agent_of_file, find_agent
+from rejeu.algorithms import config as configs
+from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
+from rejeu.errors import CheckpointError
+from rejeu.io import atomic
+from rejeu.io.records import EnvCount, Malformed, Positive, Seed, convert, parse_json
+from rejeu.presets import Preset
+from rejeu.tuning import space as spaces
+
+MAX_BYTES = 2**20
+"""Upper limit on the size of a ``study.json``."""
+MAX_TRIALS = 100_000
+EVALUATIONS = 10
+"""Evaluations of a trial, unless their interval is given."""
+SAMPLING, TRIALS, FINAL = range(3)
+"""Streams of random numbers: of the sampler, of the seeds of trials, of the seeds of the final comparison."""
+
+Pruner = Literal["median", "halving", "none"]
+Measure = Literal["return", "success"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The settings of a study. Everything that a repetition needs, except for the number of workers."""
+
+    env_id: Annotated[str, Meta(pattern=r"^[\w./:-]{1,200}$")]
+    """Id of the environment."""
+    env_argument: str = ""
+    """How it was named on the command line; never imported because a file says so."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the environment."""
+    wrappers: tuple[str, ...] = ()
+    """Names of its wrappers, innermost first."""
+    algorithm: str
+    default: dict[str, Any]
+    """Hyperparameters that the winner is compared with: of rejeu's preset, or empty for the algorithm's defaults."""
+    fixed: dict[str, Any]
+    """Hyperparameters of every trial, before those that are searched: ``default`` with what the user set."""
+    space: dict[str, dict[str, Any]]
+    """Where the others are searched; see :func:`rejeu.tuning.space.to_json`."""
+    steps: Positive
+    """Environment steps of a trial."""
+    n_envs: EnvCount
+    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async)$")]
+    evaluate_every: Positive
+    evaluate_episodes: Annotated[int, Meta(ge=1, le=10_000)]
+    trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)]
+    trial_seeds: Annotated[int, Meta(ge=1, le=1000)]
+    """Seeds of each trial, whose evaluations are averaged."""
+    final_seeds: Annotated[int, Meta(ge=0, le=1000)]
+    """Fresh seeds on which the winner is compared with the default; 0 for no comparison."""
+    seed: Seed
+    """Determines what is sampled and the seeds of all trainings."""
+    pruner: Pruner
+    measure: Measure
+    """What is maximized: the mean return of the last evaluation, or its success rate."""
+    checkpoint_minutes: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
+
+    @property
+    def search_space(self) -> dict[str, Dimension]:
+        """Where hyperparameters are searched, by name."""
+        return {name: spaces.from_json(name, one) for name, one in self.space.items()}
+
+    @property
+    def column(self) -> str:
+        """The column of ``evaluations.csv`` that is maximized."""
+        return {"return": "mean_return", "success": "success_rate"}[self.measure]
+
+    def sampler_seed(self, index: int) -> int:
+        """Returns the seed with which the parameters of a trial are sampled."""
+        return self._numbers(1, SAMPLING, index)[0]
+
+    def seeds(self, index: int) -> list[int]:
+        """Returns the seeds of the trainings of a trial. They are even."""
+        return [number & ~1 for number in self._numbers(self.trial_seeds, TRIALS, index)]
+
+    def fresh_seeds(self) -> list[int]:
+        """Returns the seeds of the final comparison. They are odd, so that no trial has one of them."""
+        return [number | 1 for number in self._numbers(self.final_seeds, FINAL)]
+
+    def _numbers(self, n: int, *key: int) -> list[int]:
+        return np.random.SeedSequence([self.seed, *key]).generate_state(max(n, 1)).tolist()[:n]
+
+    def preset(self, hyperparameters: Mapping[str, Any], source: str) -> Preset:
+        """Returns a preset with these hyperparameters and what all trainings of the study have in common."""
+        return Preset(
+            env_id=self.env_id,
+            algorithm=self.algorithm,
+            hyperparameters=hyperparameters,
+            n_envs=self.n_envs,
+            total_steps=self.steps,
+            evaluate_every=self.evaluate_every,
+            evaluate_episodes=self.evaluate_episodes,
+            backend=self.backend,
+            source=source,
+        )
+
+
+def make(
+    env_id: str,
+    algorithm: str | None = None,
+    *,
+    env_argument: str = "",
+    env_kwargs: Mapping[str, Any] | None = None,
+    wrappers: tuple[str, ...] = (),
+    preset: Preset | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    search: SearchSpace | None = None,
+    only: tuple[str, ...] = (),
+    trials: int = 30,
+    steps: int | None = None,
+    n_envs: int | None = None,
+    backend: str | None = None,
+    evaluate_every: int | None = None,
+    evaluate_episodes: int | None = None,
+    trial_seeds: int = 1,
+    final_seeds: int = 5,
+    seed: int = 0,
+    pruner: Pruner = "median",
+    measure: Measure = "return",
+    checkpoint_minutes: float = 5.0,
+) -> Plan:
+    """Returns the plan of a study, completed by the preset or the defaults, after all checks that need no training.
+
+    Args:
+        env_id: of the environment.
+        algorithm: its name; None for that of the preset.
+        env_argument: how the environment was named on the command line.
+        env_kwargs: keyword arguments of the environment.
+        wrappers: names of its wrappers.
+        preset: what trials start from and the winner is compared with; None: rejeu's own, else the algorithm's defaults.
+        fixed: hyperparameters that are set instead of searched.
+        search: dimensions that replace those of the algorithm, or are added to them.
+        only: names of the hyperparameters that are searched; empty for all of the space.
+        trials: number of trials.
+        steps: environment steps of a trial; None for the preset's, else 100,000.
+        n_envs: environments stepped at once; None for the preset's, else 1.
+        backend: of the environments; None for the preset's, else ``"auto"``.
+        evaluate_every: environment steps between two evaluations; None for a tenth of ``steps``.
+        evaluate_episodes: episodes of each evaluation; None for the preset's, else 20.
+        trial_seeds: seeds of each trial.
+        final_seeds: seeds of the final comparison.
+        seed: of the study.
+        pruner: ``"median"``, ``"halving"`` or ``"none"``.
+        measure: ``"return"`` or ``"success"``.
+        checkpoint_minutes: minutes between two checkpoints of a training; 0 for none.
+
+    Raises:
+        ValueError: for an unknown algorithm, an empty space, or a value out of range.
+        TypeError: for a hyperparameter that the algorithm does not have, with the nearest one.
+    """
+    given = presets.find(env_id, None if algorithm is None else find_agent(algorithm).algorithm.Config.name)
+    base = preset or given
+    if base is None and algorithm is None:
+        raise ValueError(f"{env_id} has no preset; name the algorithm to tune, such as --algo PPO")
+    name = base.algorithm if base is not None else find_agent(str(algorithm)).algorithm.Config.name
+    base = base or presets.default(env_id, name)
+    fixed = {key: configs.value_to_json(value) for key, value in (fixed or {}).items()}
+    values = {**base.hyperparameters, **fixed}
+    space = choose_space(name, values, fixed, search or {}, only)
+    total = validation.whole("steps", steps or base.total_steps, least=1)
+    plan = Plan(
+        env_id=env_id,
+        env_argument=env_argument or env_id,
+        env_kwargs=dict(env_kwargs or {}),
+        wrappers=wrappers,
+        algorithm=name,
+        default=dict(base.hyperparameters),
+        fixed=values,
+        space={key: spaces.to_json(one) for key, one in space.items()},
+        steps=total,
+        n_envs=n_envs or base.n_envs,
+        backend=backend or ("auto" if env_kwargs or wrappers else base.backend),
+        evaluate_every=evaluate_every or max(total // EVALUATIONS, 1),
+        evaluate_episodes=evaluate_episodes or base.evaluate_episodes,
+        trials=trials,
+        trial_seeds=trial_seeds,
+        final_seeds=final_seeds,
+        seed=seed,
+        pruner=pruner,
+        measure=measure,
+        checkpoint_minutes=checkpoint_minutes,
+    )
+    try:
+        return convert(json.loads(text(plan)), Plan)
+    except CheckpointError as error:
+        raise ValueError(str(error)) from None
+    except TypeError as error:
+        raise TypeError(f"a study takes only hyperparameters that JSON can express: {error}") from None
+
+
+def choose_space(
+    algorithm: str,
+    values: Mapping[str, Any],
+    fixed: Mapping[str, Any],
+    search: SearchSpace,
+    only: tuple[str, ...],
+) -> dict[str, Dimension]:
+    """Returns the search space of a study, in which every extreme value is known to be valid.
+
+    Raises:
+        ValueError: if nothing is left to search, or a value is out of range.
+        TypeError: for a name that the algorithm does not have.
+    """
+    config_class = AGENTS[algorithm].algorithm.Config
+    own: dict[str, Dimension] = dict(getattr(config_class, "search_space", {}))
+    if getattr(validation.build(config_class, values), "hindsight", None) is not None:
+        own |= HINDSIGHT
+    own = {name: one for name, one in own.items() if not is_set(fixed, name)} | dict(search)
+    for name in only:
+        if name not in own:
+            raise ValueError(validation.unknown_name(name, own, f"the search space of {algorithm}"))
+    own = {name: one for name, one in own.items() if not only or name in only}
+    for name, dimension in own.items():
+        for value in dimension.ends():
+            validation.build(config_class, spaces.applied(values, {name: value}))
+    if not own:
+        raise ValueError(f"there is nothing to search for {algorithm}; give a range, such as learning_rate=1e-4..1e-2")
+    return own
+
+
+def is_set(fixed: Mapping[str, Any], name: str) -> bool:
+    """Returns whether the user set the hyperparameter of a dotted name."""
+    head, _, rest = name.partition(".")
+    inner = fixed.get(head)
+    return head in fixed and (not rest or not isinstance(inner, Mapping) or is_set(inner, rest))
+
+
+def text(plan: Plan) -> str:
+    """Returns a plan as JSON."""
+    return json.dumps(dataclasses.asdict(plan), indent=2, allow_nan=False) + "\n"
+
+
+def write(plan: Plan, path: Path) -> None:
+    """Writes ``study.json``."""
+    with atomic.replacing(path) as file:
+        file.write(text(plan).encode())
+
+
+def read(path: Path) -> Plan:
+    """Returns what :func:`write` wrote; the file is untrusted.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        CheckpointError: if it is damaged, or names an algorithm that is not registered.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} is no study folder: it holds no {path.name}")
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
+        plan = convert(parse_json(data), Plan)
+        config_class = agent_of_file(plan.algorithm, path).algorithm.Config
+        for name, dimension in plan.search_space.items():
+            for value in dimension.ends():
+                validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
+        return plan
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from None
+
+
+def difference(plan: Plan, other: Plan) -> str:
+    """Returns the first setting in which two plans differ and which a study cannot change, as text; empty if none does."""
+    for one in dataclasses.fields(Plan):
+        ours, theirs = getattr(plan, one.name), getattr(other, one.name)
+        if one.name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != theirs:
+            return f"{one.name} is {str(ours)[:100]} there, not {str(theirs)[:100]}"
+    return ""
