@@ -2,12 +2,14 @@
 
 import json
 import os
+import shlex
 import sys
 
 import numpy as np
 import pytest
 from filelock import FileLock
 
+from rejeu.cli import settings
 from rejeu.reporting.runs import read_run
 
 CONFIG = {
@@ -66,8 +68,26 @@ def test_changed_hyperparameters_and_command(folder):
     assert run.changed == {"gamma": (0.9, 0.99), "policy_kwargs.net_arch": ([64, 64], None)}
     assert run.command == (
         "rejeu train CartPole-v1 --algo DQN --steps 100 --seed 3 --envs 2 --backend gymnasium --evaluate-every 50 "
-        "--evaluate-episodes 5 --env-kwargs sutton_barto_reward=true --set gamma=0.9 'policy_kwargs.net_arch=[64, 64]'"
-    )
+        "--evaluate-episodes 5 --env-kwargs sutton_barto_reward=true --set gamma=0.9 batch_size=32 "
+        "'policy_kwargs.net_arch=[64, 64]'"
+    )  # the default batch_size too, since the preset has another
+
+
+def test_command_has_wrappers_nulls_and_long_values(folder):
+    noise = {"noise": "normal", "mean": [0.0] * 100, "sigma": [0.1] * 100}
+    content = {
+        **CONFIG,
+        "env": "Walk-v0",
+        "env_argument": "my_env:Walk-v0",
+        "wrappers": ["my_env:Shaped", "a b"],
+        "hyperparameters": {"target_kl": 0.5, "max_grad_norm": None, "action_noise": noise},
+    }
+    (folder / "config.json").write_text(json.dumps(content), encoding="utf-8")
+    words = shlex.split(read_run(folder).command)
+    assert words[:3] == ["rejeu", "train", "my_env:Walk-v0"]
+    assert [words[i + 1] for i, word in enumerate(words) if word == "--wrapper"] == ["my_env:Shaped", "a b"]
+    given = settings.apply(words[words.index("--set") + 1 :], {})
+    assert (given["max_grad_norm"], given["action_noise"]) == (None, noise)
 
 
 def test_interrupted_and_crashed_run(folder):

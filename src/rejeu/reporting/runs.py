@@ -16,11 +16,13 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 from filelock import FileLock, Timeout
 
+from rejeu import presets
 from rejeu.io.records import Malformed, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
 
@@ -41,6 +43,8 @@ MAX_WARNINGS_BYTES = 2**16
 MAX_VIDEOS = 1000
 MAX_NAME = 200
 """Upper limit on the length of a name or an id, in characters."""
+MAX_WORD = 10_000
+"""Upper limit on the length of a word of the command that repeats a run, in characters."""
 MAX_STEP = 2**53
 """Upper limit on environment steps; larger numbers are damage."""
 RECENT = 60.0
@@ -142,9 +146,16 @@ class Run:
             words += [] if value is None else [f"--{name.replace('_', '-')}", text(value)]
         if self.env_kwargs:
             words += ["--env-kwargs", *(f"{name}={text(value)}" for name, value in self.env_kwargs.items())]
-        if self.changed:
-            words += ["--set", *(f"{name}={text(value)}" for name, (value, _) in self.changed.items())]
-        return shlex.join(shown(word, 1000) for word in words)
+        for wrapper in config.get("wrappers") if isinstance(config.get("wrappers"), list) else ():
+            words += ["--wrapper", text(wrapper)]
+        preset = presets.find(self.env_id, self.algorithm)
+        usual = default_hyperparameters(self.algorithm, preset.hyperparameters if preset else {})
+        taken = dict(flat(usual))  # by rejeu train if nothing is set
+        values = dict(flat(self.hyperparameters))
+        names = [name for name in values if name in self.changed or values[name] != taken.get(name, values[name])]
+        if names:
+            words += ["--set", *(f"{name}={assigned(values[name])}" for name in names)]
+        return shlex.join(shown(word, MAX_WORD) for word in words)
 
 
 def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
@@ -346,13 +357,13 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def default_hyperparameters(algorithm: str) -> dict[str, Any]:
-    """Returns the defaults of one of rejeu's algorithms as JSON values; empty for another."""
+def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """Returns ``given`` and the defaults of one of rejeu's algorithms as JSON values; empty for another."""
     from rejeu.algorithms import a2c, config, crossq, ddpg, dqn, maskable_ppo, ppo, qrdqn, recurrent_ppo, sac, td3, tqc
 
     modules: tuple[Any, ...] = (a2c, crossq, ddpg, dqn, maskable_ppo, ppo, qrdqn, recurrent_ppo, sac, td3, tqc)
     kinds = {module.Config.name: module.Config for module in modules}
-    return config.to_json(kinds[algorithm]()) if algorithm in kinds else {}
+    return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -362,6 +373,11 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield from flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
+
+
+def assigned(value: Any) -> str:
+    """Returns a value as ``--set`` takes it."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def text(value: Any) -> str:
