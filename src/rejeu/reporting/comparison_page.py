@@ -5,9 +5,8 @@ from __future__ import annotations
 from html import escape
 from typing import Any
 
-import numpy as np
-
 from rejeu.reporting.plots.comparison import NAMES
+from rejeu.reporting.report.curves import plain
 from rejeu.reporting.tabular import improvement_row, number
 from rejeu.reporting.text import counted
 
@@ -78,11 +77,6 @@ def chart(kind: str, groups: list[Any], labels: list[str], comparison: Any) -> d
         return {**own, "x_range": None if low == high else [low, high], "series": series}
     x_title = {"steps": "environment steps", "time": "seconds of training"}[comparison.axis]
     return {"x": x_title, "y": f"return, {NAMES[comparison.statistic]}", "series": series}
-
-
-def plain(values: np.ndarray) -> list[float | None]:
-    """Returns numbers for JSON with six digits; None for those that are not finite."""
-    return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
 def run_rows(comparison: Any) -> list[list[str]]:

@@ -91,6 +91,9 @@ def test_axis_and_legend_can_be_switched(browser, report):
         shown = page.locator(".chart").first.locator(".trace").count()
         page.locator(".legend button").first.click()
         assert page.locator(".chart").first.locator(".trace").count() < shown
+        page.locator(".legend button").first.press("Enter")
+        assert page.locator(".chart").first.locator(".trace").count() == shown
+        assert page.evaluate("document.activeElement === document.querySelector('.legend button')")
         assert opened.messages == []
 
 

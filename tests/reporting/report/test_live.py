@@ -2,7 +2,10 @@
 
 import http.client
 import json
+import socket
+import struct
 import threading
+import time
 
 import pytest
 
@@ -55,6 +58,29 @@ def test_data_is_sent_when_the_run_has_changed(server, tmp_path):
     second = json.loads(get(server, f"/data.json?version={first['version']}")[1])
     assert second["version"] != first["version"]
     assert "222.00" in second["parts"]["run0-evaluations"]
+
+
+def test_folder_that_is_renamed_is_one_line_for_the_page(server, tmp_path, capsys):
+    version = json.loads(get(server, "/data.json?version=none")[1])["version"]
+    (tmp_path / "run").rename(tmp_path / "gone")
+    status, content = get(server, f"/data.json?version={version}")
+    assert (status, content.count(b"\n")) == (503, 0)
+    assert b"there is no run folder" in content
+    (tmp_path / "gone").rename(tmp_path / "run")
+    assert get(server, f"/data.json?version={version}")[0] == 204
+    assert capsys.readouterr().err == ""
+
+
+def test_page_that_is_closed_while_it_is_sent_prints_nothing(server, capsys, monkeypatch):
+    monkeypatch.setattr(page, "render", lambda *_, **__: "x" * 50_000_000)
+    for _ in range(3):
+        with socket.create_connection(("127.0.0.1", server.server_port)) as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset when closed
+            client.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
+            client.recv(10)
+    assert get(server, "/nothing")[0] == 404
+    time.sleep(0.2)
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1"])

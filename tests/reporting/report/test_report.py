@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import rejeu
 from rejeu.agents.record import record
 from rejeu.cli import main
+from rejeu.errors import MissingExtra
 from rejeu.loops.run import Episode
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.report import curves, page, write_report
@@ -173,6 +175,21 @@ def test_moving_average_and_its_interval():
     np.testing.assert_array_equal(curve.step, [0, 1, 2, 3, 5])
 
 
+def test_interval_of_a_single_episode_is_unknown_and_large_returns_keep_their_deviation():
+    values = 1e9 + np.array([0.0, 1.0, 0.0, 1.0])
+    curve = curves.smooth(Episodes(np.arange(4.0), *[np.zeros(4)] * 5), values)
+    assert np.isnan(curve.low[0])
+    np.testing.assert_allclose(
+        (curve.high - curve.mean)[2], 1.959964 * np.std([0, 1, 0], ddof=1) / np.sqrt(3), rtol=1e-5
+    )
+
+
+def test_episodes_behind_a_bar_have_their_exact_steps():
+    histogram = curves.histogram(np.array([0.5]), {"episode": np.array([1.0]), "step": np.array([12_345_678.0])})
+    (row,) = [row for rows in histogram["rows"] for row in rows]
+    assert row == [1, 12_345_678]
+
+
 def test_command_writes_where_asked(tmp_path, capsys):
     folder = write(tmp_path / "run")
     assert main(["report", str(folder), "--out", str(tmp_path / "page.html")]) == 0
@@ -212,3 +229,11 @@ def test_page_of_an_agent_without_a_run_folder(tmp_path):
 def test_widths_that_follow_from_the_observations_are_no_change(given, changed):
     agent = rejeu.PPO("MlpPolicy", "CartPole-v1", policy_kwargs=given)
     assert any("net_arch" in name for name in record(agent, Path("agent"), []).changed) is changed
+
+
+def test_missing_jinja2_is_named(tmp_path, monkeypatch):
+    page.environment.cache_clear()
+    for name in ("jinja2", "markupsafe"):  # neither is there without the extra
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingExtra, match=r"jinja2.*rejeu\[report\]"):
+        page.render("report.html", {})

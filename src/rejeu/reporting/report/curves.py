@@ -47,12 +47,15 @@ class Binned(NamedTuple):
 
 
 def plain(values: Iterable[float] | np.ndarray) -> list[float | None]:
-    """Returns numbers for JSON: rounded, with None for those that are not finite.
+    """Returns numbers for JSON: rounded unless they are whole, with None for those that are not finite.
 
-    >>> plain([1.23456789, float("nan")])
-    [1.23457, None]
+    >>> plain([1.23456789, 12345678.0, float("nan")])
+    [1.23457, 12345678.0, None]
     """
-    return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in np.asarray(values).tolist()]
+    return [
+        None if not math.isfinite(value) else value if float(value).is_integer() else float(f"{value:.{DIGITS}g}")
+        for value in np.asarray(values).tolist()
+    ]
 
 
 def usable(values: np.ndarray) -> np.ndarray:
@@ -83,33 +86,22 @@ def smooth(episodes: Episodes, values: np.ndarray, is_rate: bool = False) -> Bin
     step, seconds, values = episodes.step[known], episodes.seconds[known], values[known]
     window = window_of(len(values))
     if len(values) <= MAX_DOTS:
-        count = np.minimum(np.arange(1, len(values) + 1), window).astype(float)
-        mean, square = (moving_sum(part, window) / count for part in (values, values**2))
-        at: Any = thinned(len(values))
-        parts = (step, seconds, mean, np.maximum(square - mean**2, 0.0), count)
-        step, seconds, mean, variance, count = (part[at] for part in parts)
-        spread = None
+        at = thinned(len(values))
+        rows = [values[max(i + 1 - window, 0) : i + 1] for i in at]
+        step, seconds, spread = step[at], seconds[at], None
     else:
         edges = np.linspace(0, len(values), MAX_POINTS + 1).astype(int)
         rows = [values[start:end] for start, end in pairwise(edges)]
-        count = np.diff(edges).astype(float)
-        mean, variance = (np.array([function(row) for row in rows]) for function in (np.mean, np.var))
         low, high = np.array([np.quantile(row, (0.05, 0.95)) for row in rows]).T
         step, seconds, spread = step[edges[1:] - 1], seconds[edges[1:] - 1], (low, high)
+    mean, variance, count = (np.array([function(row) for row in rows], float) for function in (np.mean, np.var, len))
     low, high = wilson(mean, count) if is_rate else normal(mean, variance, count)
     return Binned(step, seconds / 60, mean, low, high, spread)
 
 
-def moving_sum(values: np.ndarray, window: int) -> np.ndarray:
-    """Returns the sum of each value and up to ``window - 1`` values before it."""
-    sums = np.cumsum(values)
-    sums[window:] -= sums[:-window].copy()
-    return sums
-
-
 def normal(mean: np.ndarray, variance: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends of the interval of a mean, from the normal distribution."""
-    half = NORMAL * np.sqrt(variance / np.maximum(count - 1, 1))
+    """Returns the ends of the interval of a mean, from the normal distribution; NaN for a single value."""
+    half = NORMAL * np.sqrt(variance / np.where(count > 1, count - 1, np.nan))
     return mean - half, mean + half
 
 

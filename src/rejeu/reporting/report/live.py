@@ -81,6 +81,14 @@ def handler(live: Live, hosts: Callable[[], set[str]]) -> type[BaseHTTPRequestHa
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            try:
+                self._reply()
+            except ConnectionError:  # the page was closed while it was sent
+                self.close_connection = True
+            except OSError as error:  # the run folder is gone
+                self._answer(503, str(error).encode(), "text/plain; charset=utf-8")
+
+        def _reply(self) -> None:
             address = urlsplit(self.path)
             if self.headers.get("Host") not in hosts():  # another site's name that leads here
                 self._answer(403, b"unknown host", "text/plain")

@@ -31,6 +31,7 @@ def render(template: str, data: Any, *, live: bool = False, **context: Any) -> s
         MissingExtra: if plotly or jinja2 is not installed.
         ValueError: if the data contains NaN or an infinity.
     """
+    page = environment().get_template(template)  # first, so that a missing jinja2 is named
     from markupsafe import Markup
 
     nonce = secrets.token_urlsafe(18)
@@ -40,19 +41,15 @@ def render(template: str, data: Any, *, live: bool = False, **context: Any) -> s
         f"connect-src {network}; base-uri 'none'; form-action 'none'"
     )
     own = {name: Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js")}
-    return (
-        environment()
-        .get_template(template)
-        .render(
-            nonce=nonce,
-            policy=policy,
-            data=data,
-            live=live,
-            style=own["page.css"],
-            script=own["page.js"],
-            plotly=Markup(plotly_script()),
-            **context,
-        )
+    return page.render(
+        nonce=nonce,
+        policy=policy,
+        data=data,
+        live=live,
+        style=own["page.css"],
+        script=own["page.js"],
+        plotly=Markup(plotly_script()),
+        **context,
     )
 
 

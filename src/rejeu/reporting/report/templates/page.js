@@ -97,6 +97,7 @@
   function legend(element, chart, key) {
     const box = one(".legend", element.parentElement);
     if (!box) return;
+    const focused = [...box.children].indexOf(document.activeElement);
     box.replaceChildren();
     chart.series.forEach((series, number) => {
       if (!series.name) return;
@@ -114,9 +115,11 @@
       });
       box.append(button);
     });
+    box.children[focused]?.focus(); // of the keyboard, which was on the button before
   }
 
-  const short = (value) => (value == null ? "–" : value.toLocaleString("en-US", { maximumSignificantDigits: 6 }).replace("-", "−"));
+  const digits = (value) => (Number.isInteger(value) ? {} : { maximumSignificantDigits: 6 });
+  const short = (value) => (value == null ? "–" : value.toLocaleString("en-US", digits(value)).replace("-", "−"));
   const rangeOf = (h, i) => `${short(i === 0 ? h.least : h.edges[i])} to ${short(i === h.counts.length - 1 ? h.most : h.edges[i + 1])}`;
 
   function drawHistogram(element) {
