@@ -57,11 +57,23 @@ def test_runs_lists_every_run(runs, capsys, monkeypatch):
     assert cli.main(["runs", str(runs)]) == 0
     printed = capsys.readouterr().out
     assert printed.count("finished") == 7
-    assert "21.00 (step 1,000)" in printed
+    assert "21.00" in printed
     assert cli.main(["runs", str(runs), "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert sorted(Path(row["run"]).name for row in content["runs"]) == sorted(path.name for path in runs.iterdir())
     assert content["unreadable"] == []
+
+
+def test_runs_are_whole_lines_in_a_pipe(runs, capsys):
+    write_run(runs / ("long" * 30), steps=1000)
+    config = runs / "PPO_0" / "config.json"
+    config.write_text(config.read_text(encoding="utf-8").replace("1000", "5000"), encoding="utf-8")
+    (runs / "DQN_0" / "evaluations.csv").unlink()
+    assert cli.main(["runs", str(runs)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("long" * 30 in line and "finished" in line for line in lines) == 1
+    assert any("PPO_0" in line and "1,000 (20%)" in line and "interrupted" in line for line in lines)
+    assert any("DQN_0" in line and " in training" in line for line in lines)
 
 
 def test_runs_in_an_empty_folder(tmp_path, capsys):

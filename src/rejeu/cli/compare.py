@@ -6,9 +6,10 @@ import webbrowser
 from collections.abc import Iterable
 from pathlib import Path
 
+from rejeu.cli import tables
 from rejeu.cli.commands import Compare
 from rejeu.cli.jsonout import emit
-from rejeu.reporting.comparison import Comparison, compare
+from rejeu.reporting.comparison import Comparison, Group, compare
 from rejeu.reporting.tabular import improvement_row, number
 
 
@@ -58,25 +59,31 @@ def references(words: Iterable[str]) -> dict[str, tuple[float, float]]:
     return found
 
 
+def row_of(group: Group) -> list[str]:
+    """Returns the cells of a group."""
+    value, low, high = map(number, group.score)
+    reached = f"{number(group.reached[1])} ({group.reached[0]} of {len(group.runs)})"
+    cells = [group.label, group.env_id, str(len(group.runs)), value, f"{low} to {high}"]
+    return [*cells, number(group.mean), number(group.median), reached]
+
+
 def show(comparison: Comparison) -> None:
     """Prints the tables and the notes."""
-    from rich import box
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
+    head = [
+        "group",
+        "environment",
+        "runs",
+        "IQM",
+        "95 % interval",
+        "mean",
+        "median",
+        f"{comparison.axis} to\nthreshold",
+    ]
+    tables.show(head, map(row_of, comparison.groups), 2)
     console = Console(highlight=False)
-    table = Table(box=box.SIMPLE)
-    for name in ("group", "environment"):
-        table.add_column(name, overflow="fold")
-    for name in ("runs", "IQM", "95 % interval", "mean", "median", f"{comparison.axis} to threshold"):
-        table.add_column(name, justify="right")
-    for group in comparison.groups:
-        value, low, high = map(number, group.score)
-        reached = f"{number(group.reached[1])} ({group.reached[0]} of {len(group.runs)})"
-        cells = [group.label, group.env_id, str(len(group.runs)), value, f"{low} to {high}"]
-        table.add_row(*map(escape, [*cells, number(group.mean), number(group.median), reached]))
-    console.print(table)
     console.print(comparison.definition, soft_wrap=True)
     levels = {group.env_id: number(group.reached[2]) for group in comparison.groups}
     console.print(

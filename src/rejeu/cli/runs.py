@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rejeu.cli import tables
 from rejeu.cli.commands import Runs
 from rejeu.cli.jsonout import emit
-from rejeu.cli.status import best_text, describe, steps_text
+from rejeu.cli.status import describe
 from rejeu.io.records import shown
 from rejeu.reporting import run_list
 
@@ -29,30 +34,24 @@ def run(arguments: Runs) -> int:
     return 0
 
 
-def show(rows: list[dict]) -> None:
+def show(rows: Sequence[Mapping[str, Any]]) -> None:
     """Prints the table."""
-    from rich import box
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
+    head = ["run", "environment", "algorithm", "state", "steps", "best result"]
+    names = ("run", "env", "algorithm", "state")
+    tables.show(head, ([*(row[name] for name in names), steps_of(row), best_of(row)] for row in rows), 3)
 
-    table = Table(box=box.SIMPLE)
-    for name in ("run", "environment", "algorithm"):
-        table.add_column(name, overflow="fold")
-    for name in ("seed", "state", "steps", "best evaluation", "training return"):
-        table.add_column(name, justify="left" if name == "state" else "right")
-    for row in rows:
-        seed = "-" if row["seed"] is None else str(row["seed"])
-        last = "-" if row["mean_return"] != row["mean_return"] else f"{row['mean_return']:,.2f}"
-        cells = [
-            row["run"],
-            row["env"],
-            row["algorithm"],
-            seed,
-            row["state"],
-            steps_text(row),
-            best_text(row["best"]),
-            last,
-        ]
-        table.add_row(*map(escape, cells))
-    Console(highlight=False).print(table)
+
+def steps_of(row: Mapping[str, Any]) -> str:
+    """Returns the steps done, with their share of those asked for, unless all are done."""
+    done, asked = row["steps"], row["steps_asked"]
+    return f"{done:,} ({done / asked:.0%})" if asked and done < asked else f"{done:,}"
+
+
+def best_of(row: Mapping[str, Any]) -> str:
+    """Returns the best evaluation; of a run without one the mean return of the last training episodes."""
+    best = row["best"]
+    if best is None:
+        return "-" if math.isnan(row["mean_return"]) else f"{row['mean_return']:,.2f} in training"
+    return f"{best['mean_return']:,.2f}" + (
+        "" if math.isnan(best["success_rate"]) else f", {best['success_rate']:.0%} success"
+    )
