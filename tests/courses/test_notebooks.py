@@ -140,7 +140,11 @@ def test_notebooks_have_the_cells_of_the_text():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["de", "x"], "LANGUAGE 'de' must be one of en, fr"), (["en"], "rejeu course needs FOLDER")],
+    [
+        (["de", "x"], "LANGUAGE 'de' must be one of en, fr"),
+        (["en"], "rejeu course needs FOLDER"),
+        (["en", __file__], "is a file, expected a folder"),
+    ],
 )
 def test_invalid_arguments_give_one_line(arguments, message, capsys):
     assert main(["course", *arguments]) == 2

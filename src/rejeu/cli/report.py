@@ -17,17 +17,23 @@ from rejeu.reporting.report import write_report
 from rejeu.reporting.report.live import make_server
 from rejeu.validation import whole
 
+SUFFIXES = (".html", ".htm")
+
 
 def run(arguments: Report) -> int:
     """Writes the page, or serves it until Ctrl-C, and returns the exit status.
 
     Raises:
-        ValueError: for ``--out`` with ``--live``.
+        ValueError: for ``--out`` or ``--replay`` with ``--live``, or for a file that is no page.
     """
     if arguments.live:
         if arguments.out is not None:
             raise ValueError("--live serves the page and writes no file; leave out --out, or --live")
+        if arguments.replay is not None:
+            raise ValueError("--replay plays the trained agent; leave out --replay, or --live")
         return follow(arguments.runs, arguments.open)
+    if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
     for path in arguments.runs if arguments.replay is not None else ():
         replay(path, arguments)
     path = write_report(arguments.runs, arguments.out)

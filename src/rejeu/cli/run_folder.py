@@ -21,6 +21,7 @@ from rejeu.errors import CheckpointError
 from rejeu.io import atomic, checkpoint
 from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json
 from rejeu.reporting.logging import LOGS
+from rejeu.reporting.runs import newest_inside
 
 LogName = Annotated[str, Meta(pattern=f"^({'|'.join(LOGS)})$")]
 MAX_CONFIG_BYTES = 2**20
@@ -228,16 +229,6 @@ def find_model(run: Path, which: Which) -> Path:
             f"{run} holds no {model.name}; is it a run folder? --which {other} takes the other model"
         )
     return model
-
-
-def newest_inside(folder: Path) -> str:
-    """Returns the part of a message that names the newest run in a folder of runs; empty if there is none."""
-    runs = [path.parent for path in folder.glob("*/config.json")] if folder.is_dir() else []
-    if not runs:
-        return ""
-    return (
-        f"; the newest of the {len(runs)} in it is {max(runs, key=lambda run: (run / 'config.json').stat().st_mtime)}"
-    )
 
 
 def environment_of(model: Path, given: RunOptions) -> Environment:

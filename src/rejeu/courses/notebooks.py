@@ -123,6 +123,8 @@ def write(language: Language, folder: Path) -> Iterator[tuple[Path, bool]]:
     Raises:
         OSError: if a file cannot be written.
     """
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"{folder} is a file, expected a folder")
     for source in sources():
         stem = source.name.removesuffix(".py")
         folders: dict[Version, Path] = {"exercise": folder, "solution": folder / "solutions"}

@@ -170,10 +170,12 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise FileNotFoundError(f"there is no run folder {shown(folder, 300)}")
+        is_something = folder.exists()
+        said = f"{shown(folder, 300)} is no folder" if is_something else f"there is no run folder {shown(folder, 300)}"
+        raise FileNotFoundError(said)
     folder = folder.resolve()
     if not any((folder / name).is_file() for name in (CONFIG, EPISODES, METRICS, EVALUATIONS)):
-        raise FileNotFoundError(f"{shown(folder, 300)} is no run folder: it holds no {CONFIG}")
+        raise FileNotFoundError(f"{shown(folder, 300)} is no run folder: it holds no {CONFIG}{newest_inside(folder)}")
     config, notes = read_config(folder / CONFIG)
     metrics, evaluations = (ordered(read_table(folder / name)) for name in (METRICS, EVALUATIONS))
     metrics = statistics_rows(metrics)
@@ -219,6 +221,14 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
         models=models,
         notes=tuple(notes),
     )
+
+
+def newest_inside(folder: Path) -> str:
+    """Returns the part of a message that names the newest run in a folder of runs; empty if there is none."""
+    runs = [path.parent for path in folder.glob(f"*/{CONFIG}")] if folder.is_dir() else []
+    if not runs:
+        return ""
+    return f"; the newest of the {len(runs)} in it is {max(runs, key=lambda run: (run / CONFIG).stat().st_mtime)}"
 
 
 def statistics_rows(table: Table) -> Table:

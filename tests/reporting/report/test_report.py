@@ -203,12 +203,21 @@ def test_command_writes_where_asked(tmp_path, capsys):
         (["report"], "rejeu report needs RUN"),
         (["report", "nowhere"], "there is no run folder nowhere"),
         (["report", ".", "--live", "--out", "x.html"], "--live serves the page"),
+        (["report", ".", "--live", "--replay", "3"], "leave out --replay, or --live"),
+        (["report", ".", "--out", "x.pdf"], "--out x.pdf must end in .html or .htm"),
+        (["report", "seeds"], "is no run folder: it holds no config.json; the newest of the 1 in it is"),
+        (["report", "file"], "file is no folder"),
+        (["status", "seeds"], "the newest of the 1 in it is"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tmp_path)
+    write(Path("seeds") / "seed_0", videos=False)
+    Path("file").write_text("", encoding="utf-8")
     assert main(argv) == 2
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
 
 
 def test_page_of_an_agent_without_a_run_folder(tmp_path):
