@@ -54,7 +54,11 @@ def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
     for callback in callbacks:
         if isinstance(callback, TrainingCallback) and callback.every_step:
             return f"the callback {type(callback).__name__} must be called after every step"
-    return reason_against_replay(run.replay, config) if isinstance(config, OffPolicyConfig) else "it is on-policy"
+    if isinstance(config, OffPolicyConfig):
+        return reason_against_replay(run.replay, config)
+    if agent.takes_masks:
+        return "action masks exist on the host only"
+    return None if config.n_episodes is None else "rollouts of n_episodes whole episodes exist on the host only"
 
 
 def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:

@@ -5,21 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
+from tests.jax_environments import Breaks, Reach
 from tests.loops.device.same_draws import use_same_draws
 from tests.sharing import shared_learners
 
 SMALL = {"buffer_size": 200, "learning_starts": 20, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
 
 
-def make(kind: Any, env_id: str, n_envs: int = 1, **settings: Any) -> Any:
+def make(kind: Any, env: Any, n_envs: int = 1, **settings: Any) -> Any:
     """Returns a small agent in environments in JAX."""
+    vector = rejeu.make_vector(env, n_envs)
+    policy = "MultiInputPolicy" if isinstance(vector.observation_space, gym.spaces.Dict) else "MlpPolicy"
     with shared_learners():
-        return kind("MlpPolicy", rejeu.make_vector(env_id, n_envs), **{**SMALL, **settings})
+        return kind(policy, vector, **{**SMALL, **settings})
 
 
 def learn_on_host(agent: Any, n_steps: int) -> None:
@@ -77,6 +81,37 @@ def test_continuous_actions_equal_the_loop_of_the_host(kind: Any, settings: dict
     device.learn(101)
     learn_on_host(host, 101)
     assert_same_runs(device, host, 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "stops", "n_steps"),
+    [
+        ("future", True, 1),
+        pytest.param("final", False, 3, marks=pytest.mark.exhaustive),
+        pytest.param("episode", False, 1, marks=pytest.mark.exhaustive),
+        pytest.param("random", True, 2, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_hindsight_equals_the_loop_of_the_host(strategy: str, stops: bool, n_steps: int) -> None:
+    settings = {"replay_buffer_class": "HerReplayBuffer", "n_steps": n_steps, "buffer_size": 60}
+    settings["replay_buffer_kwargs"] = {"goal_selection_strategy": strategy}
+    device, host = (make(rejeu.DDPG, Reach(stops=stops), 2, action_noise=0.3, **settings) for _ in range(2))
+    device.learn(160)
+    assert device.stops is not None
+    learn_on_host(host, 160)
+    assert_same_runs(device, host, 1e-4)
+    assert {episode.success for episode in device.history.episodes} == ({0.0, 1.0} if stops else {0.0})
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_an_environment_that_returns_nan_is_reported_as_on_the_host(what: str) -> None:
+    device, host = (make(rejeu.DQN, Breaks(what=what)) for _ in range(2))
+    with pytest.raises(rejeu.BadEnvironmentError) as raised:
+        device.learn(40)
+    with pytest.raises(rejeu.BadEnvironmentError) as expected:
+        learn_on_host(host, 40)
+    assert str(raised.value) == str(expected.value)
+    assert device.run.step == 24
 
 
 def test_results_do_not_depend_on_where_chunks_end() -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.core import PyTree
 from rejeu.loops.checks import check_state
+from rejeu.loops.device.machine import Machine
 from rejeu.loops.device.turns import NO_LIMIT, Limits
 from rejeu.loops.learner import Learner
 from rejeu.loops.run import Progress, Run
@@ -31,28 +31,6 @@ class Stops(NamedTuple):
     """Chunks end where the number of environment steps crosses a multiple of one of these."""
     at_episodes: bool = False
     """Chunks end with every turn in which an episode ends."""
-
-
-class Machine(Protocol):
-    """A compiled program with its arguments on the device. Mutable."""
-
-    capacity: int
-    """Turns of a chunk at most."""
-
-    def push(self, runs: Sequence[Run], progress: float) -> None:
-        """Puts the runs onto the device."""
-
-    def call(self, limits: Limits) -> None:
-        """Takes a chunk of turns."""
-
-    def fault(self, which: int) -> bool:
-        """Returns whether the last chunk left something that is not finite in a run."""
-
-    def pull(self, which: int, run: Run, n_turns: int, last: int | None) -> Progress:
-        """Puts what the last chunk did into a run, and returns it."""
-
-    def raise_fault(self, run: Run, limits: Limits) -> None:
-        """Raises the error of the chunk that would follow; the run is as it was before, and is put before the fault."""
 
 
 def train(
@@ -104,6 +82,8 @@ def train(
             np.uint32(NO_LIMIT if last is None else last),
             schedule(progress, step - first, n_turns, n_envs, machine.capacity, last, first),
             np.int32(ALL),
+            np.uint32(runs[0].learn_from),
+            np.bool_(machine.uses_part(runs[0], n_turns, last)),
         )
         began = time.perf_counter()
         machine.call(limits)
@@ -113,7 +93,7 @@ def train(
         turns = []
         for i, (run, timer) in enumerate(zip(runs, timers, strict=True)):
             timer.lap("update")
-            turns.append(machine.pull(i, run, n_turns, last))
+            turns.append(machine.pull(i, run))
             timer.lap("replay")
         pace.note(n_turns, time.perf_counter() - began)
         known = held(runs)
@@ -165,10 +145,3 @@ class Pace:
 def capacity_of(n_envs: int) -> int:
     """Returns the turns of a chunk at most, for that number of environments."""
     return max(min(MAX_TURNS, LOG_SIZE // n_envs), 1)
-
-
-def copies(tree: PyTree) -> PyTree:
-    """Returns copies of arrays on the host."""
-    import jax
-
-    return jax.tree.map(np.array, jax.device_get(tree))

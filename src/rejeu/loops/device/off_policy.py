@@ -16,11 +16,24 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers.device import DeviceReplay, DeviceRing
-from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Transition
+from rejeu.core import Algorithm, Clock, Explorer, Metrics, PyTree, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
-from rejeu.loops import nonfinite
 from rejeu.loops.device.actions import random_action
-from rejeu.loops.device.turns import Limits, Log, Outcome, Players, empty_log, kept_steps, play
+from rejeu.loops.device.turns import (
+    Learned,
+    Limits,
+    Outcome,
+    Players,
+    Report,
+    begun,
+    kept_steps,
+    learn,
+    no_outcome,
+    nothing_learned,
+    play,
+    report_of,
+)
+from rejeu.loops.device.variants import Variants
 from rejeu.loops.packing import Packing
 from rejeu.prng import nth
 
@@ -29,7 +42,7 @@ DRAWS = 2**32 - 1
 
 
 class Counts(NamedTuple):
-    """Counters of a run, equal for all seeds unless updates depend on episodes."""
+    """Counters of a run, equal for all seeds."""
 
     step: Array
     """Environment steps, ``uint32[]``."""
@@ -37,12 +50,10 @@ class Counts(NamedTuple):
     """See :attr:`rejeu.loops.run.Run.owed`, ``int32[]``."""
     since_update: Array
     """Environment steps since the last update, ``int32[]``."""
-    n_updates: Array
-    """Gradient steps in this chunk, ``int32[]``."""
 
 
 class Carry(NamedTuple):
-    """What the turns of a chunk pass on, apart from the replay buffer."""
+    """What a chunk passes on, apart from the replay buffer."""
 
     state: PyTree
     """The algorithm's state, packed between chunks."""
@@ -56,29 +67,16 @@ class Carry(NamedTuple):
     counts: Counts
     in_a_row: Array
     """How many of the newest gradient steps were not finite, ``int32[]``."""
-
-
-class Report(NamedTuple):
-    """What a chunk says of its turns."""
-
-    metrics: Metrics
-    """Of the newest gradient step, ``float32[]`` each; 0 before the first."""
-    n_bad: Array
-    """Gradient steps whose metrics, or with ``skips`` whose state, were not finite, ``int32[]``."""
-    is_finite: Array
-    """Whether the state is finite after the chunk, ``bool[]``."""
-    outcome: Outcome
-    """Of the newest turn."""
-    log: Log
+    hyper: dict[str, Array]
+    """Hyperparameters that differ between runs; see :class:`Variants`."""
 
 
 class Loop(NamedTuple):
-    """What the turns of a chunk pass on."""
+    """What the turns of a chunk pass on. The states in ``carry`` and ``learned`` are the same."""
 
     carry: Carry
     ring: DeviceRing
-    metrics: Metrics
-    n_bad: Array
+    learned: Learned
     outcome: Outcome
 
 
@@ -98,80 +96,68 @@ class OffPolicyProgram:
     """Whether updates that leave NaN are undone."""
     stops_at_episode: bool
     """Whether a chunk ends with the first turn in which an episode ends."""
+    variants: Variants | None = None
+    """What makes the algorithm of runs whose hyperparameters differ."""
+
+    def chunk(
+        self, env: FunctionalEnv, carry: Carry, ring: DeviceRing, limits: Limits
+    ) -> tuple[Carry, DeviceRing, Report]:
+        """Returns carry, replay buffer and report after a number of turns."""
+        program = self if self.variants is None else self.variants.applied(self, carry.hyper)
+        no_log, first_episode = carry.players.log, carry.players.episode
+        state = program.packing.unpack(carry.state)
+        carry = carry._replace(state=None, players=begun(carry.players, program.capacity))
+
+        def update(state: PyTree, ring: DeviceRing, key: Array) -> tuple[PyTree, Metrics]:
+            clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
+            return program.algorithm.update(state, draw(program.replay, env, ring, nth(key, jnp.uint32(0))), clock)
+
+        learned = nothing_learned(update, state, carry.in_a_row, ring, carry.key)
+        loop = Loop(carry, ring, learned, no_outcome(carry.players))
+
+        def continues(loop: tuple[Array, Loop]) -> Array:
+            more = loop[0] < limits.n_turns
+            return more & (loop[1].carry.players.episode == first_episode) if program.stops_at_episode else more
+
+        def one(loop: tuple[Array, Loop]) -> tuple[Array, Loop]:
+            return loop[0] + 1, turn(program, env, loop[1], limits, loop[0])
+
+        _, loop = jax.lax.while_loop(continues, one, (jnp.int32(0), loop))
+        report = report_of(loop.learned, loop.carry.players, loop.outcome)
+        carry = loop.carry._replace(
+            state=program.packing.pack(loop.learned.state),
+            players=loop.carry.players._replace(log=no_log),
+            in_a_row=loop.learned.in_a_row,
+        )
+        return carry, loop.ring, report
 
 
-def chunk(
-    program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, ring: DeviceRing, learn_from: Array, limits: Limits
-) -> tuple[Carry, DeviceRing, Report]:
-    """Returns carry, replay buffer and report after a number of turns."""
-    first_episode = carry.players.episode
-    no_log = carry.players.log
-    players = carry.players._replace(log=empty_log(program.capacity, program.replay.n_envs), bad=jnp.bool(False))
-    state = program.packing.unpack(carry.state)
-    counts = carry.counts._replace(n_updates=jnp.int32(0))
-    carry = carry._replace(state=state, players=players, counts=counts)
-    loop = Loop(carry, ring, no_metrics(program, env, carry, ring), jnp.int32(0), no_outcome(players))
-
-    def continues(loop: tuple[Array, Loop]) -> Array:
-        more = loop[0] < limits.n_turns
-        return more & (loop[1].carry.players.episode == first_episode) if program.stops_at_episode else more
-
-    def one(loop: tuple[Array, Loop]) -> tuple[Array, Loop]:
-        return loop[0] + 1, turn(program, env, loop[1], learn_from, limits, loop[0])
-
-    _, loop = jax.lax.while_loop(continues, one, (jnp.int32(0), loop))
-    carry = loop.carry
-    report = Report(
-        loop.metrics,
-        loop.n_bad,
-        nonfinite.check(jax.tree.leaves(carry.state), {}),
-        loop.outcome,
-        carry.players.log,
-    )
-    carry = carry._replace(state=program.packing.pack(carry.state), players=carry.players._replace(log=no_log))
-    return carry, loop.ring, report
-
-
-def no_outcome(players: Players) -> Outcome:
-    """Returns the outcome before the first turn of a chunk."""
-    n_envs = len(players.ended)
-    never = jnp.zeros(n_envs, bool)
-    return Outcome(players.obs, jnp.zeros(n_envs, jnp.float32), never, never, never)
-
-
-def no_metrics(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, ring: DeviceRing) -> Metrics:
-    """Returns the metrics before the first gradient step: 0 each."""
-    clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
-
-    def update(state: PyTree, ring: DeviceRing, key: Array) -> Metrics:
-        batch = draw(program.replay, env, ring, jax.random.fold_in(draws(key, clock.step), 0))
-        return program.algorithm.update(state, batch, clock)[1]
-
-    found = jax.eval_shape(update, carry.state, ring, carry.key)
-    return {name: jnp.float32(0) for name in found if name != TD_ERROR}
-
-
-def turn(
-    program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, learn_from: Array, limits: Limits, i: Array
-) -> Loop:
+def turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
     """Returns what the ``i``-th turn of a chunk passes on."""
     config, algorithm, replay, carry = program.config, program.algorithm, program.replay, loop.carry
     kept = kept_steps(carry.counts.step, limits.last, replay.n_envs)
     players, outcome = play(env, carry.players, carry.action, kept, config.gamma, i)
     ring = replay.add(loop.ring, carry.action, outcome.reward, outcome.terminated, outcome.obs, kept)
     ring = replay.begin(ring, players.obs, players.ended)
-    state = carry.state
+    learned = loop.learned
     if algorithm.observe is not None:
-        state = algorithm.observe(state, players.obs, players.running_return)
+        learned = learned._replace(state=algorithm.observe(learned.state, players.obs, players.running_return))
     n_ended = (players.episode - carry.players.episode).astype(jnp.int32)
-    n_updates, counts = due(config, carry.counts, jnp.sum(kept, dtype=jnp.int32), n_ended, learn_from)
+    n, counts = due(config, carry.counts, jnp.sum(kept, dtype=jnp.int32), n_ended, limits.learn_from)
     clock = Clock(counts.step, players.episode, limits.progress[i + 1])
-    carry = carry._replace(state=state, players=players, counts=counts)
+    carry = carry._replace(players=players, counts=counts)
+    root = draws(carry.key, clock.step)
+
+    def one(u: Array, learned: Learned) -> Learned:
+        batch = draw(replay, env, ring, jax.random.fold_in(root, u + 1))
+        return learn(algorithm, learned, batch, clock, program.skips)
+
     if config.overlap:
-        carry = choose(program, env, carry, clock)
-    loop = Loop(carry, ring, loop.metrics, loop.n_bad, outcome)
-    loop = updates(program, env, loop, clock, jnp.minimum(n_updates, limits.most_updates))
-    return loop if config.overlap else loop._replace(carry=choose(program, env, loop.carry, clock))
+        carry = choose(program, env, carry, learned.state, clock)
+    learned = jax.lax.fori_loop(0, jnp.minimum(n, limits.most_updates), one, learned)
+    if not config.overlap:
+        carry = choose(program, env, carry, learned.state, clock)
+    return Loop(carry, ring, learned, outcome)
 
 
 def draws(key: Array, step: Array) -> Array:
@@ -179,12 +165,12 @@ def draws(key: Array, step: Array) -> Array:
     return jax.random.fold_in(nth(key, jnp.uint32(DRAWS)), step)
 
 
-def choose(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, clock: Clock) -> Carry:
+def choose(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, state: PyTree, clock: Clock) -> Carry:
     """Returns the carry with the actions of the next turn; see :func:`rejeu.loops.off_policy.choose`."""
     players = carry.players
 
     def explored() -> tuple[Array, PyTree]:
-        actor, key = program.algorithm.actor(carry.state), nth(carry.key, clock.step)
+        actor, key = program.algorithm.actor(state), nth(carry.key, clock.step)
         action, explorer = program.explorer.act(carry.explorer, actor, players.obs, players.ended, key, clock)
         return action.astype(carry.action.dtype), explorer
 
@@ -197,31 +183,6 @@ def choose(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, clock: C
     else:
         action, explorer = explored()
     return carry._replace(action=action, explorer=explorer)
-
-
-def updates(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, clock: Clock, n: Array) -> Loop:
-    """Returns what is passed on after ``n`` gradient steps."""
-    carry, ring = loop.carry, loop.ring
-    root = draws(carry.key, clock.step)
-
-    def one(u: Array, inner: tuple[PyTree, Metrics, Array, Array]) -> tuple[PyTree, Metrics, Array, Array]:
-        state, _, n_bad, in_a_row = inner
-        batch = draw(program.replay, env, ring, jax.random.fold_in(root, u + 1))
-        after, found = program.algorithm.update(state, batch, clock)
-        found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
-        if program.skips:
-            after, found = nonfinite.undo(state, after, found)
-            is_bad = ~found.pop(nonfinite.FINITE)
-        else:
-            is_bad = ~nonfinite.check((), found)
-        return after, found, n_bad + is_bad, jnp.where(is_bad, in_a_row + 1, 0)
-
-    begin = (carry.state, loop.metrics, loop.n_bad, carry.in_a_row)
-    state, metrics, n_bad, in_a_row = jax.lax.fori_loop(0, n, one, begin)
-    counts = carry.counts._replace(n_updates=carry.counts.n_updates + n)
-    return loop._replace(
-        carry=carry._replace(state=state, in_a_row=in_a_row, counts=counts), metrics=metrics, n_bad=n_bad
-    )
 
 
 def draw(replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array) -> Transition:
@@ -247,4 +208,4 @@ def due(config: OffPolicyConfig, counts: Counts, taken: Array, ended: Array, lea
     times, owed = jnp.divmod(owed, every)
     n = since if config.gradient_steps == -1 else times * config.gradient_steps
     n = jnp.where(times > 0, n, 0)
-    return n, Counts(step, owed, jnp.where(times > 0, 0, since), counts.n_updates)
+    return n, Counts(step, owed, jnp.where(times > 0, 0, since))

@@ -93,3 +93,8 @@ def rounded_up(n: int, most: int) -> int:
     while size < n:
         size *= 8
     return min(size, most)
+
+
+def copies(tree: PyTree) -> PyTree:
+    """Returns copies of arrays on the host."""
+    return jax.tree.map(np.array, jax.device_get(tree))

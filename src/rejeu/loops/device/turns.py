@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -10,9 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu import spaces
-from rejeu.core import PyTree
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Rollout, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
+from rejeu.loops import nonfinite
 from rejeu.loops.device.actions import scale
 
 NO_LIMIT = 2**32 - 1
@@ -29,7 +31,11 @@ class Limits(NamedTuple):
     progress: Any
     """Progress of schedules after 0, 1, ... turns of the chunk, ``float32 (capacity + 1,)``."""
     most_updates: Any
-    """Gradient steps of a turn at most, ``int32[]``; used to find the one that left NaN."""
+    """Gradient steps of a turn at most, or updates from rollouts, ``int32[]``; used to find the one that left NaN."""
+    learn_from: Any
+    """The environment step after which off-policy updates begin, ``uint32[]``."""
+    uses_part: Any
+    """Whether an incomplete rollout is learned from at the last step, ``bool[]``."""
 
 
 class Log(NamedTuple):
@@ -76,6 +82,81 @@ class Outcome(NamedTuple):
     truncated: Array
     kept: Array
     """Which of the steps count, ``bool (n_envs,)``; all but in the last turn."""
+
+
+class Report(NamedTuple):
+    """What a chunk says of its turns."""
+
+    metrics: Metrics
+    """Of the newest update, ``float32[]`` each; 0 before the first."""
+    n_updates: Array
+    """Gradient steps, ``int32[]``."""
+    n_bad: Array
+    """Updates whose metrics, or with ``skips`` whose state, were not finite, ``int32[]``."""
+    is_finite: Array
+    """Whether the state is finite after the chunk, ``bool[]``."""
+    outcome: Outcome
+    """Of the newest turn."""
+    log: Log
+
+
+class Learned(NamedTuple):
+    """What updates change."""
+
+    state: PyTree
+    """The algorithm's state."""
+    metrics: Metrics
+    """Of the newest update."""
+    n_updates: Array
+    """Gradient steps in this chunk, ``int32[]``."""
+    n_bad: Array
+    """Updates in this chunk that were not finite, ``int32[]``."""
+    in_a_row: Array
+    """How many of the newest updates were not finite, ``int32[]``."""
+
+
+def learn(algorithm: Algorithm, learned: Learned, batch: Transition | Rollout, clock: Clock, skips: bool) -> Learned:
+    """Returns what is learned from a batch; with ``skips``, an update that leaves NaN is undone."""
+    after, found = algorithm.update(learned.state, batch, clock)
+    found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
+    n = found["gradient_steps"].astype(jnp.int32) if "gradient_steps" in found else 1
+    if skips:
+        after, found = nonfinite.undo(learned.state, after, found)
+        is_bad = ~found.pop(nonfinite.FINITE)
+    else:
+        is_bad = ~nonfinite.check((), found)
+    in_a_row = jnp.where(is_bad, learned.in_a_row + 1, 0)
+    return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row)
+
+
+def nothing_learned(
+    update: Callable[..., tuple[PyTree, Metrics]], state: PyTree, in_a_row: Array, *arguments: Any
+) -> Learned:
+    """Returns what is learned before the first update: metrics are 0.
+
+    ``update`` of the state and ``arguments`` returns state and metrics; it is only traced.
+    """
+    _, found = jax.eval_shape(update, state, *arguments)
+    metrics = {name: jnp.float32(0) for name in found if name != TD_ERROR}
+    return Learned(state, metrics, jnp.int32(0), jnp.int32(0), in_a_row)
+
+
+def report_of(learned: Learned, players: Players, outcome: Outcome) -> Report:
+    """Returns the report of a chunk after its last turn."""
+    is_finite = nonfinite.check(jax.tree.leaves(learned.state), {})
+    return Report(learned.metrics, learned.n_updates, learned.n_bad, is_finite, outcome, players.log)
+
+
+def begun(players: Players, capacity: int) -> Players:
+    """Returns the environments at the beginning of a chunk."""
+    return players._replace(log=empty_log(capacity, len(players.ended)), bad=jnp.bool(False))
+
+
+def no_outcome(players: Players) -> Outcome:
+    """Returns the outcome before the first turn of a chunk."""
+    n_envs = len(players.ended)
+    never = jnp.zeros(n_envs, bool)
+    return Outcome(players.obs, jnp.zeros(n_envs, jnp.float32), never, never, never)
 
 
 def plain(space: gym.Space, obs: PyTree) -> PyTree:

@@ -1,0 +1,167 @@
+"""Runs on the device: the arguments of the program, and what comes back to the host after a chunk."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rejeu.core import Clock, Rollout, Transition
+from rejeu.envs.base import Step
+from rejeu.loops.checks import check_finite
+from rejeu.loops.device.transfer import copies, episodes_of, put_players, stacked, unstacked
+from rejeu.loops.device.turns import Limits, Report
+from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
+from rejeu.loops.packing import Readings
+from rejeu.loops.run import Progress, Run
+
+
+class Machine(ABC):
+    """A compiled program with its arguments on the device. Mutable. Abstract: there is one for each kind of learning.
+
+    With several runs their arrays have a leading axis, except for counters, which are equal in all runs.
+    """
+
+    def __init__(self, runs: Sequence[Run], program: Any) -> None:
+        """Takes runs of equal settings in JAX environments, and the program that trains them."""
+        self.n, self.env, self.program = len(runs), runs[0].env.env, program
+        self.carry: Any = None
+        self.store: Any = None
+        """The experience, which is donated to every chunk."""
+        self.carries: list[Any] = []
+        """The small arrays of the carry after the last chunk on the host, by run."""
+        self.reports: list[Report] = []
+        """The reports of the last chunk on the host, by run."""
+
+    @property
+    def capacity(self) -> int:
+        """Turns of a chunk at most."""
+        return self.program.capacity
+
+    @abstractmethod
+    def carry_of(self, run: Run, progress: float) -> Any:
+        """Returns the carry of a run, which may choose its first actions."""
+
+    @abstractmethod
+    def store_of(self, run: Run) -> Any:
+        """Returns the experience of a run, on the device."""
+
+    @abstractmethod
+    def put(self, run: Run, carry: Any, store: Any) -> None:
+        """Puts counters and experience into a run.
+
+        Args:
+            run: mutated.
+            carry: on the host, apart from large arrays.
+            store: on the device.
+        """
+
+    @abstractmethod
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        """Returns whether an incomplete rollout is learned from if the step ``last`` is reached in so many turns."""
+
+    @abstractmethod
+    def batch(self, run: Run, clock: Clock, number: int) -> Transition | Rollout:
+        """Returns the batch of a gradient step that was left out in the last turn, the ``number``-th of the turn."""
+
+    def push(self, runs: Sequence[Run], progress: float) -> None:
+        """Puts the runs onto the device."""
+        carries = [self.carry_of(run, progress) for run in runs]
+        self.carry = stacked(carries)
+        if self.n > 1:
+            self.carry = self.carry._replace(counts=carries[0].counts)
+        self.store = stacked([self.store_of(run) for run in runs])
+
+    def call(self, limits: Limits) -> None:
+        """Takes a chunk of turns."""
+        take = take_chunk if self.n == 1 else take_chunks
+        self.carry, self.store, report = take((self.program, self.env, self.carry, limits), self.store)
+        # Networks and environments stay on the device; everything else is small and comes to the host at once.
+        large = {"state": None, "explorer": None, "hyper": None, "counts": None}
+        small = self.carry._replace(**large, players=self.carry.players._replace(env=None))
+        small, counts, report = copies((small, self.carry.counts, report))
+        self.reports = unstacked(report, self.n)
+        self.carries = [one._replace(counts=counts) for one in unstacked(small, self.n)]
+
+    def fault(self, which: int) -> bool:
+        """Returns whether the last chunk left something that is not finite in a run."""
+        carry, report = self.carries[which], self.reports[which]
+        stops = report.n_bad > 0 and (not self.program.skips or carry.in_a_row >= MAX_SKIPPED)
+        return bool(carry.players.bad or not report.is_finite or stops)
+
+    def pull(self, which: int, run: Run) -> Progress:
+        """Puts what the last chunk did into a run, and returns it."""
+        carry, report, first_step = self.carries[which], self.reports[which], run.step
+        run.step = int(carry.counts.step)
+        run.state = unstacked(self.carry.state, self.n)[which]
+        run.carry = unstacked(self.carry.explorer, self.n)[which]
+        put_players(run, carry.players, unstacked(self.carry.players.env, self.n)[which])
+        run.n_updates += int(report.n_updates)
+        run.monitor.n_skipped += int(report.n_bad)
+        if report.n_updates:
+            run.metrics = Readings.of(
+                {name: jnp.asarray(value) for name, value in report.metrics.items()}, report.n_bad
+            )
+        self.put(run, carry, unstacked(self.store, self.n)[which])
+        episodes = episodes_of(run, report.log, first_step, run.step)
+        return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))
+
+    def raise_fault(self, run: Run, limits: Limits) -> NoReturn:
+        """Raises the error of a chunk of which nothing was pulled; the run is put before the fault.
+
+        Raises:
+            BadEnvironmentError: if a reward or an observation is not finite.
+            NonFiniteUpdate: if an update left numbers that are not finite.
+        """
+        self.n = 1
+        for i in range(int(limits.n_turns)):
+            progress = np.roll(limits.progress, -i)
+            one = limits._replace(n_turns=np.int32(1), progress=progress)
+            self.push([run], float(progress[0]))
+            self.call(one)
+            if self.carries[0].players.bad:
+                outcome: Any = self.reports[0].outcome
+                step = Step(outcome.obs, outcome.reward, outcome.terminated, outcome.truncated, None)
+                check_finite(run, step, run.step)
+            if self.fault(0):
+                self._raise_bad_update(run, one)
+            self.pull(0, run)
+        raise AssertionError("the chunk was not finite, and its turns are")
+
+    def _raise_bad_update(self, run: Run, limits: Limits) -> NoReturn:
+        """Raises the error of the first bad update of the next turn, with the state before it and its batch."""
+        in_a_row = int(self.carries[0].in_a_row) if self.program.skips else 0
+        number = 0
+        while True:
+            self.push([run], float(limits.progress[0]))
+            self.call(limits._replace(most_updates=np.int32(number + 1)))
+            if self.fault(0):
+                break
+            number += 1
+        self.push([run], float(limits.progress[0]))
+        self.call(limits._replace(most_updates=np.int32(number)))
+        carry = self.carries[0]
+        clock = Clock(carry.counts.step, carry.players.episode, limits.progress[1])
+        batch = self.batch(run, clock, number)
+        raise NonFiniteUpdate(None if self.program.skips else self.carry.state, batch, clock, in_a_row)
+
+
+@eqx.filter_jit(donate="all-except-first")
+def take_chunk(kept: tuple[Any, ...], store: Any) -> tuple[Any, Any, Report]:
+    """Returns carry, experience and report after a chunk; only the experience is donated."""
+    program, env, carry, limits = kept
+    return program.chunk(env, carry, store, limits)
+
+
+@eqx.filter_jit(donate="all-except-first")
+def take_chunks(kept: tuple[Any, ...], store: Any) -> tuple[Any, Any, Report]:
+    """Does the same for several runs."""
+    program, env, carry, limits = kept
+    axes = type(carry)(**{name: None if name == "counts" else 0 for name in carry._fields})
+    one = lambda carry, store: program.chunk(env, carry, store, limits)  # noqa: E731
+    return jax.vmap(one, in_axes=(axes, 0), out_axes=(axes, 0, 0))(carry, store)

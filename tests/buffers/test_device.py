@@ -1,0 +1,168 @@
+"""The replay buffer on the device returns the batches of the replay buffer on the host."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rejeu import spaces
+from rejeu.buffers.device import DeviceReplay, below, uploaded
+from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
+from rejeu.buffers.ring import Ring
+from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.envs.functional.vector import goal_functions
+from rejeu.loops.device.off_policy import draws
+from tests.jax_environments import Reach
+from tests.loops.device.same_draws import use_same_draws
+
+ROWS, N_ENVS, BATCH = 23, 3, 40
+LENGTHS = (7, 30, 3)
+"""Steps of the episodes of each environment; the second is longer than the ring."""
+
+
+def ring_of(n_envs: int) -> Ring:
+    """Returns an empty ring with all counters."""
+    space = Reach().observation_space
+    leaves, structure = spaces.leaves(space), spaces.structure(space)
+    return Ring(ROWS * n_envs, n_envs, leaves, structure, (1,), np.float32, counters=("since_start", "until_end"))
+
+
+def observations(rng: np.random.Generator, n: int) -> dict[str, np.ndarray]:
+    """Returns random observations on the grid of ``Reach``."""
+    return {key: np.round(rng.uniform(-9, 9, (n, 1))).astype(np.float32) / 4 for key in Reach().observation_space}
+
+
+def steps(n_envs: int, n: int) -> list[Any]:
+    """Returns the steps of episodes that end by both flags: action, reward, terminated, successor, ended, first obs."""
+    rng, time = np.random.default_rng(1), np.zeros(n_envs, int)
+    found = []
+    for _ in range(n):
+        time += 1
+        ended = time == np.array(LENGTHS[:n_envs])
+        time[ended] = 0
+        action = rng.uniform(-1, 1, (n_envs, 1)).astype(np.float32)
+        reward = rng.normal(size=n_envs).astype(np.float32)
+        found.append((action, reward, ended & (rng.random(n_envs) < 0.5), observations(rng, n_envs), ended,
+                      observations(rng, n_envs)))  # fmt: skip
+    return found
+
+
+def filled(n_envs: int, n: int) -> Ring:
+    """Returns a ring after ``n`` steps of every environment."""
+    ring = ring_of(n_envs)
+    ring.begin(observations(np.random.default_rng(0), n_envs))
+    for action, reward, terminated, next_obs, ended, first in steps(n_envs, n):
+        ring.add(action, reward, terminated, next_obs)
+        if ended.any():
+            ring.begin(first, np.flatnonzero(ended))
+    return ring
+
+
+def device_replay(n_envs: int, **settings: Any) -> DeviceReplay:
+    """Returns how batches of the ring are drawn on the device."""
+    structure = spaces.structure(Reach().observation_space)
+    return DeviceReplay(ROWS, n_envs, structure, 0.9, BATCH, achieved=0, desired=1, **settings)
+
+
+def assert_same_batches(replay: DeviceReplay, buffer: Any, stops: bool, exact: bool) -> None:
+    """Asserts that device and host return equal batches for equal random numbers."""
+    env, key = Reach(stops=stops), jnp.array([3, 4], jnp.uint32)
+    ring = uploaded(replay, buffer.ring)
+    terminated = env.compute_terminated if stops else None
+    for step in range(3):
+        run = SimpleNamespace(replay=buffer, key=key, step=step, rng=None)
+        batch = jax.jit(lambda ring, key: replay.draw(ring, key, env.compute_reward, terminated))(
+            ring, jax.random.fold_in(draws(key, jnp.uint32(step)), 1)
+        )
+        use_same_draws(run)
+        expected = run.replay.draw(run.rng, (BATCH,))[0]
+        del buffer.draw
+        if isinstance(buffer, HerReplayBuffer):
+            del buffer.goal_index
+        for one, two in zip(jax.tree.leaves(batch), jax.tree.leaves(expected), strict=True):
+            assert one.dtype == two.dtype
+            np.testing.assert_allclose(one, two, rtol=0, atol=0 if exact else 1e-6)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize(("n_envs", "n"), [(1, 15), (3, 15), (3, 100)])
+def test_uniform_batches_equal_those_of_the_host(n_envs: int, n: int, n_steps: int) -> None:
+    buffer = ReplayBuffer(filled(n_envs, n), 0.9, n_steps, each_reward=True)
+    assert_same_batches(device_replay(n_envs, n_steps=n_steps, each_reward=True), buffer, False, n_steps == 1)
+
+
+@pytest.mark.parametrize("strategy", ["future", "final", "episode", "random"])
+@pytest.mark.parametrize(
+    ("n", "n_steps", "stops"),
+    [(15, 1, False), (100, 1, True), (100, 3, True)],
+    ids=["running", "overwritten", "n-step"],
+)
+def test_hindsight_batches_equal_those_of_the_host(strategy: str, n: int, n_steps: int, stops: bool) -> None:
+    config = HindsightConfig(n_sampled_goal=4, goal_selection_strategy=strategy)
+    goals = goal_functions(Reach(stops=stops))
+    assert goals is not None
+    buffer = HerReplayBuffer(filled(N_ENVS, n), 0.9, config, goals, n_steps)
+    replay = device_replay(N_ENVS, n_steps=n_steps, strategy=strategy)
+    assert_same_batches(replay, buffer, stops, n_steps == 1)
+
+
+@pytest.mark.parametrize("n", [5, 60])
+def test_writing_on_the_device_equals_writing_on_the_host(n: int) -> None:
+    replay, ring = device_replay(N_ENVS, strategy="future"), ring_of(N_ENVS)
+    ring.begin(observations(np.random.default_rng(0), N_ENVS))
+    on_device = uploaded(replay, ring)
+
+    @jax.jit
+    def write(on_device: Any, step: Any) -> Any:
+        action, reward, terminated, next_obs, ended, first = step
+        on_device = replay.add(on_device, action, reward, terminated, next_obs, jnp.ones(N_ENVS, bool))
+        return replay.begin(on_device, first, ended)
+
+    for step in steps(N_ENVS, n):
+        on_device = write(on_device, step)
+    host = filled(N_ENVS, n)
+    expected = uploaded(replay, host)
+    for name in ("obs", "action", "reward", "kind", "head"):
+        for one, two in zip(*(jax.tree.leaves(getattr(x, name)) for x in (on_device, expected)), strict=True):
+            np.testing.assert_array_equal(one, two, err_msg=name)
+    env, time = np.concatenate([np.full(host.head[i] - host.oldest()[i] + 1, i) for i in range(N_ENVS)]), np.concatenate(
+        [np.arange(host.oldest()[i], host.head[i] + 1) for i in range(N_ENVS)]
+    )  # fmt: skip
+    for table in ("begins", "ends"):  # episodes are numbered otherwise after a reset of the numbers
+        one, two = (
+            np.asarray(getattr(x, table))[env * ROWS + np.asarray(x.episode)[host.index(env, time)] % ROWS]
+            for x in (on_device, expected)
+        )
+        if table == "begins":
+            one, two = (np.maximum(x, host.oldest()[env]) for x in (one, two))
+        np.testing.assert_array_equal(one, two, err_msg=table)
+
+
+@pytest.mark.parametrize("parts", [[60], [10, 10, 12, 8, 20]])
+def test_rows_of_the_device_are_written_to_the_host_with_their_counters(parts: list[int]) -> None:
+    ring, total = filled(N_ENVS, 1), 1
+    for part in parts:
+        total += min(part, 10)
+        after = filled(N_ENVS, total)
+        times = ring.head[:, None] + np.arange(ROWS)[None]
+        index = after.base[:, None] + times % ROWS
+        rows = {"obs": [store[index] for store in after.obs], "action": after.action[index]}
+        ring.write(after.head, rows | {"reward": after.reward[index], "kind": after.kind[index]})
+        for name in ("head", "n_steps", "start"):
+            np.testing.assert_array_equal(getattr(ring, name), getattr(after, name), err_msg=name)
+        np.testing.assert_array_equal(ring.records, after.records)
+        np.testing.assert_array_equal(ring.kind, after.kind)
+
+
+def test_whole_numbers_from_random_bits_equal_64_bit_arithmetic() -> None:
+    rng = np.random.default_rng(0)
+    bits = rng.integers(2**32, size=1000, dtype=np.uint32)
+    n = rng.integers(1, 2**31 - 1, size=1000)
+    np.testing.assert_array_equal(
+        below(jnp.asarray(bits), jnp.asarray(n)), (bits.astype(object) * n.astype(object)) >> 32
+    )

@@ -1,0 +1,92 @@
+"""Minimal environments in JAX shared by several tests."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, time_is_up
+
+
+class Point(NamedTuple):
+    """A position, a goal, and the number of steps of the episode."""
+
+    position: Array
+    goal: Array
+    time: Array
+
+
+class Reach(GoalEnv):
+    """Move a point on a line to a goal, as :class:`tests.environments.Reach`: 10 steps, or fewer if it ``stops`` there.
+
+    All numbers are multiples of 1/4 if actions are rounded (``grid``), so that no arithmetic rounds.
+    """
+
+    stops: bool = eqx.field(static=True, default=False)
+    grid: bool = eqx.field(static=True, default=True)
+    max_episode_steps: int | None = eqx.field(static=True, default=10)
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        keys = ("observation", "achieved_goal", "desired_goal")
+        return spaces.Dict({key: spaces.Box(-20.0, 20.0, (1,), np.float32) for key in keys})
+
+    @property
+    def action_space(self) -> spaces.Box:
+        return spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, key: Array) -> tuple[Point, Any]:
+        position, goal = jax.random.randint(key, (2, 1), -8, 9).astype(jnp.float32) / 4
+        state = Point(position, goal, jnp.zeros((), jnp.int32))
+        return state, self.observe(state)
+
+    def step(self, key: Array, state: Point, action: Array) -> tuple[Point, Any, Array, Array, Array]:
+        action = jnp.round(4 * action) / 4 if self.grid else action
+        after = Point(state.position + action, state.goal, state.time + 1)
+        reward = self.compute_reward(after.position, after.goal)
+        terminated = (reward == 0.0) if self.stops else jnp.zeros((), bool)
+        return after, self.observe(after), reward, terminated, time_is_up(after.time, self.max_episode_steps)
+
+    def success(self, state: Point) -> Array:
+        return self.compute_reward(state.position, state.goal) == 0.0
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array:
+        return (jnp.abs(achieved_goal - desired_goal)[..., 0] < 0.5).astype(jnp.float32) - 1.0
+
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array | None:
+        return self.compute_reward(achieved_goal, desired_goal) == 0.0 if self.stops else None
+
+    def observe(self, state: Point) -> dict[str, Array]:
+        """Returns the observation of a state."""
+        return {"observation": state.position, "achieved_goal": state.position, "desired_goal": state.goal}
+
+
+class Breaks(FunctionalEnv):
+    """Returns NaN in an observation or a reward in the step ``at`` of every episode."""
+
+    at: int = eqx.field(static=True, default=25)
+    what: str = eqx.field(static=True, default="reward")
+    max_episode_steps: int | None = eqx.field(static=True, default=None)
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    @property
+    def action_space(self) -> spaces.Discrete:
+        return spaces.Discrete(2)
+
+    def reset(self, key: Array) -> tuple[Array, Array]:
+        return jnp.zeros((), jnp.int32), jnp.zeros(2)
+
+    def step(self, key: Array, state: Array, action: Array) -> tuple[Array, Array, Array, Array, Array]:
+        broken = jnp.where(state + 1 == self.at, jnp.nan, 0.0)
+        reward, obs = (broken, 0.0) if self.what == "reward" else (jnp.float32(0.0), broken)
+        never = jnp.zeros((), bool)
+        return state + 1, jnp.full(2, obs), reward, never, never

@@ -1,0 +1,109 @@
+"""On-policy learning on the device: the same as on the host, step by step, and wherever the chunks end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.callbacks import Checkpoint
+from tests.sharing import shared_learners
+
+SMALL: dict[str, Any] = {"n_steps": 16, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
+PPO = {"batch_size": 8, "n_epochs": 2}
+
+
+def make(kind: Any, env: Any, n_envs: int = 2, **settings: Any) -> Any:
+    """Returns a small agent in environments in JAX."""
+    with shared_learners():
+        return kind("MlpPolicy", rejeu.make_vector(env, n_envs), **{**SMALL, **settings})
+
+
+def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
+    """Asserts that two agents have the same parameters, rollouts, episodes and counters."""
+    for name, value in one.get_parameters().items():
+        np.testing.assert_allclose(value, two.get_parameters()[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    assert one.run.replay.length == two.run.replay.length
+    for name, rows in one.run.replay.arrays().items():
+        np.testing.assert_allclose(rows, two.run.replay.arrays()[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    np.testing.assert_array_equal(one.run.replay.started, two.run.replay.started)
+    assert len(one.history) == len(two.history)
+    np.testing.assert_allclose(one.history.table()[:, :4], two.history.table()[:, :4], rtol=tolerance)
+    for name in ("step", "episode", "n_updates"):
+        assert getattr(one.run, name) == getattr(two.run, name), name
+
+
+@pytest.mark.parametrize(
+    ("kind", "env_id", "settings"),
+    [
+        (rejeu.PPO, "jax/CartPole-v1", {**PPO, "learning_rate": "lin_1e-3", "normalize": True}),
+        (rejeu.A2C, "jax/CartPole-v1", {"n_steps": 5}),
+        pytest.param(rejeu.PPO, "jax/Pendulum-v1", {**PPO, "target_kl": 1e-4}, marks=pytest.mark.exhaustive),
+        pytest.param(rejeu.PPO, "jax/Pendulum-v1", {**PPO, "use_sde": True}, marks=pytest.mark.exhaustive),
+        pytest.param(rejeu.RecurrentPPO, "jax/CartPole-v1", PPO, marks=pytest.mark.exhaustive),
+    ],
+)
+@pytest.mark.parametrize("n_steps", [75, 55])
+def test_training_equals_the_loop_of_the_host(kind: Any, env_id: str, settings: dict[str, Any], n_steps: int) -> None:
+    """75 steps end in a part of a rollout that PPO learns from, and 55 in one that waits for the next ``learn``."""
+    device, host = (make(kind, env_id, **settings) for _ in range(2))
+    host.on_device = False
+    for agent in (device, host):
+        agent.learn(n_steps)
+        agent.learn(30, reset_num_timesteps=False)
+    assert device.stops is not None
+    assert host.stops is None
+    assert device.n_updates > 2
+    assert_same_runs(device, host, 1e-3)
+
+
+def test_results_do_not_depend_on_where_chunks_end() -> None:
+    class Often:
+        every = 10
+
+        def __call__(self, agent: Any, progress: Any) -> None:
+            steps.append(progress.step)
+
+    steps: list[int] = []
+    one, two = (make(rejeu.PPO, "jax/CartPole-v1", **PPO) for _ in range(2))
+    one.learn(100)
+    two.learn(100, Often())
+    assert {10, 20, 30, 40, 100} <= {*steps}
+    assert_same_runs(one, two, 0.0)
+
+
+def test_a_resumed_run_continues_bit_for_bit(tmp_path: Path) -> None:
+    whole, parts = (make(rejeu.PPO, "jax/CartPole-v1", **PPO) for _ in range(2))
+    whole.learn(150)
+    parts.learn(150, [Checkpoint(tmp_path, every=22), lambda agent, progress: progress.step < 60])
+    assert parts.num_timesteps < 150
+    assert parts.run.replay.length
+    with shared_learners():
+        resumed = rejeu.PPO.resume(tmp_path, env=rejeu.make_vector("jax/CartPole-v1", 2))
+    assert resumed.resumed.exact
+    resumed.learn()
+    assert_same_runs(whole, resumed, 0.0)
+
+
+def test_nan_is_reported_as_on_the_host(tmp_path: Path) -> None:
+    device, host = (make(rejeu.PPO, "jax/CartPole-v1", **PPO, learning_rate=1e38) for _ in range(2))
+    host.on_device, errors = False, []
+    for agent in (device, host):
+        agent.report_folder = tmp_path
+        with pytest.raises(rejeu.NonFiniteError) as raised:
+            agent.learn(200)
+        errors.append(raised.value)
+    assert errors[0].step == errors[1].step
+    assert errors[0].names == errors[1].names
+    assert errors[0].batch is not None
+    assert all(np.isfinite(value).all() for value in device.get_parameters().values())
+
+
+def test_rollouts_of_whole_episodes_train_on_the_host_with_a_warning() -> None:
+    agent = make(rejeu.PPO, "jax/CartPole-v1", **PPO, n_episodes=1)
+    with pytest.warns(UserWarning, match="n_episodes"):
+        agent.learn(40)
+    assert agent.num_timesteps == 40
