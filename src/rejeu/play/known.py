@@ -55,7 +55,13 @@ KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
 }
 """Actions and descriptions of the keys, by id."""
 KNOWN |= {f"jax/{env_id}": KNOWN[env_id] for env_id in [*KNOWN] if env_id.startswith(("Cart", "Mountain", "Pendulum"))}
-KNOWN |= {"jax/Parking-v0": KNOWN["parking-v0"]}
+KNOWN |= {"jax/Parking-v0": KNOWN["parking-v0"], "jax/Ball-v0": KNOWN["rejeu/Ball-v0"]}
+KNOWN["jax/PointMaze-v0"] = {
+    "a": ([-1.0, 0.0], "left"),
+    "d": ([1.0, 0.0], "right"),
+    "w": ([0.0, 1.0], "up"),
+    "s": ([0.0, -1.0], "down"),
+}
 
 
 def full_name(name: str) -> str:

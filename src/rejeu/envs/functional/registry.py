@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rejeu.envs.functional.drawing import Drawing
     from rejeu.envs.functional.protocol import FunctionalEnv
 
-MODULE = "rejeu.envs.functional"
+OWN = "rejeu.envs.functional"
 MakeDrawing = Callable[["FunctionalEnv", str], "Drawing"]
 """Returns the drawing of an environment for a render mode, ``"rgb_array"`` or ``"human"``."""
 
@@ -37,12 +37,17 @@ class Entry(NamedTuple):
 
 
 REGISTRY: dict[str, Entry] = {
-    "jax/CartPole-v1": Entry("cart_pole:CartPole", 500, 475.0, "drawing:cart_pole"),
-    "jax/Pendulum-v1": Entry("pendulum:Pendulum", 200, None, "drawing:pendulum"),
-    "jax/MountainCar-v0": Entry("mountain_car:MountainCar", 200, -110.0, "drawing:mountain_car"),
-    "jax/MountainCarContinuous-v0": Entry("mountain_car:MountainCarContinuous", 999, 90.0, "drawing:mountain_car"),
-    "jax/Acrobot-v1": Entry("acrobot:Acrobot", 500, -100.0, "drawing:acrobot"),
-    "jax/Parking-v0": Entry("parking:Parking", 500, None, "drawing:parking"),
+    "jax/CartPole-v1": Entry(f"{OWN}.cart_pole:CartPole", 500, 475.0, f"{OWN}.drawing:cart_pole"),
+    "jax/Pendulum-v1": Entry(f"{OWN}.pendulum:Pendulum", 200, None, f"{OWN}.drawing:pendulum"),
+    "jax/MountainCar-v0": Entry(f"{OWN}.mountain_car:MountainCar", 200, -110.0, f"{OWN}.drawing:mountain_car"),
+    "jax/MountainCarContinuous-v0": Entry(
+        f"{OWN}.mountain_car:MountainCarContinuous", 999, 90.0, f"{OWN}.drawing:mountain_car"
+    ),
+    "jax/Acrobot-v1": Entry(f"{OWN}.acrobot:Acrobot", 500, -100.0, f"{OWN}.drawing:acrobot"),
+    "jax/Ball-v0": Entry(f"{OWN}.ball:Ball", None, None, "rejeu.envs.ball.functional:BallScene"),
+    "jax/PointMaze-v0": Entry(f"{OWN}.point_maze:PointMaze", 200, None, f"{OWN}.drawing:Maze"),
+    "jax/BitFlipping-v0": Entry(f"{OWN}.bit_flipping:BitFlipping", None, None, f"{OWN}.drawing:Bits"),
+    "jax/Parking-v0": Entry(f"{OWN}.parking:Parking", 500, None, f"{OWN}.drawing:parking"),
 }
 """The environments by id."""
 
@@ -82,7 +87,7 @@ def register_with_gymnasium() -> None:
         if env_id not in gym.registry:
             gym.register(
                 env_id,
-                f"{MODULE}.gym_env:GymnasiumEnv",
+                f"{OWN}.gym_env:GymnasiumEnv",
                 max_episode_steps=entry.max_episode_steps,
                 reward_threshold=entry.reward_threshold,
                 kwargs={"env": env_id},
@@ -123,4 +128,4 @@ def _imported(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     module, _, name = value.partition(":")
-    return getattr(importlib.import_module(f"{MODULE}.{module}"), name)
+    return getattr(importlib.import_module(module), name)
