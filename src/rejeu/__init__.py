@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from rejeu.sb3.common.evaluation import evaluate_policy
     from rejeu.sb3.common.monitor import Monitor
     from rejeu.schedules import Exponential, Linear
+    from rejeu.sweeps.sweep import sweep
     from rejeu.tuning import tune
 
 __version__ = "0.1.0"
@@ -85,6 +86,7 @@ _MODULES = {
     "rejeu.reporting.report": "write_report",
     "rejeu.reporting.video": "record_video show_videos",
     "rejeu.schedules": "Exponential Linear",
+    "rejeu.sweeps.sweep": "sweep",
     "rejeu.tuning": "tune",
 }
 """The public names by the module that defines them."""
@@ -136,6 +138,7 @@ __all__ = [
     "record_video",
     "register",
     "show_videos",
+    "sweep",
     "tune",
     "write_report",
 ]

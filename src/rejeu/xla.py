@@ -16,6 +16,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 THREADS = "NPROC"
 """Environment variable with the size of XLA's CPU thread pool."""
+CORES = "REJEU_CORES"
+"""Environment variable with the most cores that a process should use; set for each run of a sweep."""
 LITTLE_WORK = 2**23
 """Multiplications in the largest layer of an update up to which one thread is faster than two. Measured on 2 cores: with
 two threads a step of DDPG with batches of 128 and layers 128-128 takes 1.5 times as long; with one thread batches of 256 and
@@ -54,11 +56,13 @@ def enable_cache() -> None:
 
 
 def cores() -> int:
-    """Returns the number of processor cores that this process may use."""
+    """Returns the number of processor cores that this process may use; the environment variable ``REJEU_CORES`` limits it."""
     try:
-        return len(os.sched_getaffinity(0))
+        found = len(os.sched_getaffinity(0))
     except AttributeError:  # macOS and Windows
-        return os.cpu_count() or 1
+        found = os.cpu_count() or 1
+    limit = os.environ.get(CORES, "")
+    return min(found, int(limit)) if limit.isdecimal() and int(limit) > 0 else found
 
 
 def threads_for(work: float) -> int:

@@ -186,6 +186,18 @@ def listening(agent: BaseAgent, callbacks: Sequence[Callback]) -> Iterator[None]
                 ends.callback(one.after_training, agent, error)
 
 
+def restore_callbacks(agent: BaseAgent, callbacks: Sequence[Callback]) -> None:
+    """Restores the state of callbacks of a resumed run that is not trained further.
+
+    Raises:
+        CheckpointError: if a saved state is damaged.
+    """
+    saved = unpacked(agent.saved_callbacks or (), callbacks)
+    for callback in callbacks:
+        if isinstance(callback, Stateful):
+            restore_callback(callback, saved)
+
+
 def unpacked(saved: Sequence[tuple[str, Any]], callbacks: Sequence[Callback]) -> list[tuple[str, Any]]:
     """Returns the saved states of callbacks under the present names of their classes.
 

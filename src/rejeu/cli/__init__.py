@@ -18,7 +18,7 @@ from typing import Any
 from tyro.extras import subcommand_cli_from_dict
 
 import rejeu
-from rejeu import errors, interrupt
+from rejeu import errors, interrupt, supervised
 from rejeu.cli import parsing
 from rejeu.cli.commands import COMMANDS, MODULES
 
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
         os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
-    with interrupt.leaving(), warnings.catch_warnings():
+    with interrupt.leaving(), supervised.by_parent(), warnings.catch_warnings():
         warnings.showwarning = show_warning
         return run_command(argv)
 

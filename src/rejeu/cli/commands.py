@@ -95,16 +95,41 @@ class Train(EnvironmentOptions):
 
 
 @dataclass(frozen=True)
+class Sweep:
+    """Trains many runs: the environments, algorithms, settings and seeds of a plan, on one machine, several, or a Ray cluster.
+
+    Ctrl-C stops all runs cleanly; rejeu resume continues. Example: rejeu sweep plan.toml --workers 4
+    """
+
+    plan: Annotated[Positional[Path], arg(metavar="FILE")]
+    """TOML file with the plan."""
+    out: Folder = None
+    """Folder of the sweep; one of the same plan is joined. By default a new one under runs."""
+    workers: Count = None
+    """Runs trained at once; by default half as many as there are cores, with --ray as many as the cluster has room for."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
+    """Train on this Ray cluster: auto, or HOST:PORT."""
+    imports: Annotated[tuple[str, ...], UseAppendAction, arg(name="import", metavar="MODULE")] = ()
+    """Import this module or Python file first, in each run: one that registers algorithms or environments."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
+
+
+@dataclass(frozen=True)
 class Resume(RunOptions):
-    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a study of rejeu tune.
+    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a study of rejeu tune, or a sweep.
 
     Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
     """
 
     run: RunPath
     """Its folder."""
+    finish: Annotated[bool, FlagCreatePairsOff] = False
+    """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
     workers: Count = None
-    """Of a study: trials at once; by default half as many as there are cores."""
+    """Of a sweep or a study: runs or trials at once; by default half as many as there are cores."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
+    """Of a sweep: train on this Ray cluster, auto or HOST:PORT."""
     steps: Count = None
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
     minutes: Minutes = None
@@ -392,6 +417,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "tune": Tune,
     "resume": Resume,
+    "sweep": Sweep,
     "evaluate": Evaluate,
     "record": Record,
     "play": Play,

@@ -7,20 +7,31 @@ from contextlib import closing
 from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
-from rejeu.cli import jsonout, run_folder, tune
+from rejeu.cli import jsonout, run_folder, sweep, tune
 from rejeu.cli.commands import Resume
 from rejeu.cli.output import echo
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
+from rejeu.sweeps.folder import is_sweep
 from rejeu.tuning.study import StudyFolder
 
 
 def run(arguments: Resume) -> int:
-    """Trains and returns the exit status, as ``rejeu train`` does."""
+    """Trains and returns the exit status, as ``rejeu train``, ``rejeu sweep`` or ``rejeu tune`` does.
+
+    Raises:
+        ValueError: for options of a sweep with the folder of a run.
+    """
+    if is_sweep(arguments.run):
+        return jsonout.run(sweep.resume, arguments)
+    if arguments.ray is not None:
+        raise ValueError(f"{arguments.run} is no sweep; --ray is for the folder of one")
     if StudyFolder(arguments.run).plan.is_file():
         return jsonout.run(tune.resume, arguments)
+    if arguments.workers is not None:
+        raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
     return jsonout.run(resume, arguments)
 
 
@@ -62,6 +73,8 @@ def choose_limits(agent: Agent, arguments: Resume) -> Limits:
     """
     steps, minutes = arguments.steps, arguments.minutes
     if has_reached_goal(agent):
+        if arguments.finish:
+            return Limits()
         if steps is None and minutes is None:
             raise ValueError(
                 f"the run is complete after {agent.num_timesteps:,} steps; to train further: rejeu resume {arguments.run} "

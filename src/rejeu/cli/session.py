@@ -13,7 +13,7 @@ import numpy as np
 
 from rejeu import errors, xla
 from rejeu.agents import Agent, load
-from rejeu.agents.training import run_name, tracker_id
+from rejeu.agents.training import restore_callbacks, run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import as_dict, echo, noted_in, reporter, summary
@@ -73,6 +73,11 @@ class Session(NamedTuple):
     has_video: bool = True
     """Whether a video is recorded at the end."""
 
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing left to train, so that only files are written."""
+        return not self.is_new and self.limits == Limits() and has_reached_goal(self.agent)
+
     def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
         """Trains, evaluates, plots and records a video; prints a summary, and returns the exit status and the result.
 
@@ -130,15 +135,18 @@ class Session(NamedTuple):
         evaluate, callbacks = self.callbacks(stop)
         episodes = EpisodeTable(lambda: agent.history, folder.episodes)
         try:
-            agent.learn(
-                limits.steps,
-                callbacks,
-                log_interval=4 * self.config.n_envs,
-                reset_num_timesteps=self.is_new,
-                progress_bar=True,
-                minutes=limits.minutes,
-                sinks=[*outputs, RetryingSink(episodes, agent.failed_writes)],
-            )
+            if self.is_over:
+                restore_callbacks(agent, callbacks)
+            else:
+                agent.learn(
+                    limits.steps,
+                    callbacks,
+                    log_interval=4 * self.config.n_envs,
+                    reset_num_timesteps=self.is_new,
+                    progress_bar=True,
+                    minutes=limits.minutes,
+                    sinks=[*outputs, RetryingSink(episodes, agent.failed_writes)],
+                )
             save(agent, folder.agent)
             if not evaluate.results:
                 save(agent, folder.best)
