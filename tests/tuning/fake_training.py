@@ -2,16 +2,22 @@
 
 import json
 import math
-import signal
+import os
 import sys
+import threading
 import time
 from pathlib import Path
 
 HEADER = "step,seconds,success_rate,mean_return,std_return,mean_length,episodes,best"
 
 
+def stop_at_end():
+    sys.stdin.read()  # until the supervisor closes it
+    os._exit(143)
+
+
 def main(words):
-    signal.signal(signal.SIGINT, lambda *_: sys.exit(130))
+    threading.Thread(target=stop_at_end, daemon=True).start()
     command = words[0]
     path = Path(words[1] if command == "resume" else words[words.index("--out") + 1])
     source = path / "preset.json" if command == "resume" else Path(words[words.index("--preset") + 1])

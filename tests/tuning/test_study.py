@@ -2,7 +2,6 @@
 
 import json
 import math
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,10 +10,11 @@ import pytest
 from rejeu import presets, tuning
 from rejeu.errors import CheckpointError
 from rejeu.interrupt import Interrupt
+from rejeu.sweeps import processes
 from rejeu.tuning import LogUniform, final, plan as plans, study as studies
 from rejeu.tuning.search import Search
 from rejeu.tuning.study import StudyFolder
-from rejeu.tuning.training import Command, Training
+from rejeu.tuning.training import Command
 
 optuna = pytest.importorskip("optuna")
 
@@ -25,11 +25,7 @@ RATE = {"learning_rate": LogUniform(1e-5, 4e-3)}
 @pytest.fixture(autouse=True)
 def pretend(monkeypatch):
     """Lets trainings run the program that pretends."""
-
-    def spawn(training, words, log, environ):
-        return subprocess.Popen([sys.executable, "-S", str(FAKE), *words[3:]], stdout=log, stderr=log, process_group=0)
-
-    monkeypatch.setattr(Training, "spawn", spawn)
+    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
     monkeypatch.setattr("rejeu.tuning.search.POLL", 0.03)
     monkeypatch.setattr("rejeu.tuning.final.POLL", 0.03)
 
@@ -262,14 +258,14 @@ def test_the_value_of_a_trial_must_be_finite(tmp_path):
 
 def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
     study = tuning.open_study(make_plan(steps=4000), tmp_path / "study")
-    search = Search(study, Command("Pendulum-v1", (), {}), 1)
-    processes = []
+    search = Search(study, Command("Pendulum-v1", (), processes.environment(1)), 1)
+    begun = []
 
     def fail(outcomes):
-        processes.extend(training.process for one in search.running for training in one.trainings)
+        begun.extend(training.process for one in search.running for training in one.trainings)
         raise OSError("the disk is full")
 
     with pytest.raises(OSError, match="the disk is full"):
         search.run(Interrupt(), fail)
-    assert processes
-    assert all(process.poll() is not None for process in processes)
+    assert begun
+    assert all(process.poll() is not None for process in begun)

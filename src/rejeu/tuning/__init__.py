@@ -11,17 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rejeu import envs, presets, xla
+from rejeu import envs, presets
 from rejeu.algorithms.search import Choice, Integers, LogUniform, NearOne, SearchSpace, Uniform
+from rejeu.errors import MissingExtra
 from rejeu.interrupt import Interrupt
 from rejeu.presets import Preset
 from rejeu.reporting.tabular import number
-from rejeu.tuning import final, plan as plans, study as studies
+from rejeu.sweeps.processes import default_workers, environment, threads_of
+from rejeu.tuning import final, page, plan as plans, study as studies
 from rejeu.tuning.final import Final
 from rejeu.tuning.plan import Measure, Plan, Pruner
 from rejeu.tuning.search import Search, Watch
 from rejeu.tuning.study import Outcome, Study, StudyFolder
-from rejeu.tuning.training import Command, env_options, environment
+from rejeu.tuning.training import Command, env_options
 
 Echo = Callable[[str], object]
 
@@ -203,9 +205,9 @@ def run(
         echo: takes messages.
     """
     plan, folder = study.plan, study.folder
-    at_once = workers or max(xla.cores() // 2, 1)
-    threads = environment(at_once * plan.trial_seeds)
-    Search(study, Command(env, options, threads), at_once).run(stop, watch)
+    at_once = workers or default_workers()
+    command = Command(env, options, environment(threads_of(at_once * plan.trial_seeds)))
+    Search(study, command, at_once).run(stop, watch)
     outcomes = study.outcomes()
     best = studies.best_of(outcomes)
     compared = None
@@ -215,11 +217,16 @@ def run(
         failed: list[str] = []
         if not final.is_default(study, study.preset_of(best, "")):
             echo(f"comparing trial {best.index} with the default on {plan.final_seeds} fresh seeds each")
-            failed = final.train(study, best, Command(env, options, environment(at_once)), at_once, stop, echo)
+            command = Command(env, options, environment(threads_of(at_once)))
+            failed = final.train(study, best, command, at_once, stop, echo)
         compared = None if stop.requested else final.result(study, best, failed)
     complete = study.is_searched() and not stop.requested and not (compared and compared.failed)
-    result = Result(folder.path, plan, tuple(outcomes), best, compared, complete, stop.signal)
-    return result
+    notes = []
+    try:
+        echo(f"page          {page.write(study, outcomes, compared)}")
+    except (MissingExtra, OSError) as error:
+        notes.append(f"no {folder.page.name}: {error}")
+    return Result(folder.path, plan, tuple(outcomes), best, compared, complete, stop.signal, tuple(notes))
 
 
 def source(study: Study, best: Outcome) -> str:

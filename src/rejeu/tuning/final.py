@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,8 @@ from rejeu.interrupt import Interrupt
 from rejeu.presets import Preset
 from rejeu.reporting import statistics
 from rejeu.reporting.comparison import Comparison, compare
-from rejeu.reporting.runs import read_run
+from rejeu.reporting.runs import Run, read_run
+from rejeu.tuning.plan import Measure
 from rejeu.tuning.search import IDLE, POLL
 from rejeu.tuning.study import Outcome, Study, hold
 from rejeu.tuning.training import Command, Training
@@ -36,10 +37,11 @@ class Final:
 
     verdict: Verdict
     difference: tuple[float, float, float] | None
-    """Interquartile mean of the winner's returns minus that of the default's, and its 95 % interval."""
+    """Interquartile mean of the winner's last evaluations minus that of the default's, and its 95 % interval."""
     comparison: Comparison | None
     failed: tuple[str, ...]
     """Trainings that failed, with the reason."""
+    measure: Measure = "return"
 
     def __str__(self) -> str:
         if self.verdict == "not compared":
@@ -48,7 +50,7 @@ class Final:
             return "the best trial has the hyperparameters of the default; there is nothing to compare"
         assert self.difference is not None
         value, low, high = self.difference
-        text = f"by {value:,.4g} in IQM return (95 % interval {low:,.4g} to {high:,.4g})"
+        text = f"by {value:,.4g} in IQM {self.measure} (95 % interval {low:,.4g} to {high:,.4g})"
         if self.verdict == "no difference found":
             return f"on fresh seeds the winner is not shown to be better than the default: they differ {text}"
         return f"on fresh seeds the winner is {self.verdict} than the default {text}"
@@ -99,7 +101,7 @@ def train(
             while not stop.requested and waiting and len(running) < workers and time.monotonic() >= next_look:
                 training = waiting.pop(0)
                 try:
-                    lock = hold(training.path.with_name(f"{training.path.name}.lock"))
+                    lock = hold(training.path.with_name(f"{training.path.name}.claim"))
                 except Timeout:
                     waiting.append(training)
                     next_look = time.monotonic() + IDLE
@@ -135,17 +137,21 @@ def result(study: Study, best: Outcome, failed: list[str]) -> Final:
         return Final("not compared", None, None, tuple(failed))
     labeled = [dataclasses.replace(run, algorithm=labels[name]) for name, found in runs.items() for run in found]
     comparison = compare(labeled, "algorithm", score="evaluation", seed=study.plan.seed)
-    by_label = {group.label: group.scores for group in comparison.groups}
-    winner, default = (by_label[labels[name]] for name in runs)
+    winner, default = ([last_values(found, study.plan.column)] for found in runs.values())
     value, low, high = difference(winner, default, study.plan.seed)
     verdict: Verdict = "better" if low > 0 else "worse" if high < 0 else "no difference found"
-    return Final(verdict, (value, low, high), comparison, tuple(failed))
+    return Final(verdict, (value, low, high), comparison, tuple(failed), study.plan.measure)
 
 
-def finished(folder: Path) -> list[Any]:
+def finished(folder: Path) -> list[Run]:
     """Returns the finished runs in a folder."""
     found = [read_run(path) for path in sorted(folder.glob("seed_*")) if (path / "config.json").is_file()]
     return [run for run in found if run.state == "finished"]
+
+
+def last_values(runs: Sequence[Run], column: str) -> np.ndarray:
+    """Returns a column of the last evaluation of each run, ``float64 (n_runs,)``."""
+    return np.array([run.evaluations.column(column)[-1] for run in runs])
 
 
 def difference(one: statistics.Scores, other: statistics.Scores, seed: int) -> tuple[float, float, float]:

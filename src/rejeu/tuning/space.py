@@ -36,7 +36,7 @@ def from_json(name: str, record: Mapping[str, Any]) -> Dimension:
         ValueError: if the record is not one of a dimension.
     """
     kind, fields = record.get("kind"), {key: value for key, value in record.items() if key != "kind"}
-    if kind == "Choice" and fields.keys() == {"values"} and isinstance(fields["values"], list):
+    if kind == "Choice" and fields.keys() == {"values"} and isinstance(fields["values"], list | tuple):
         return Choice(tuple(fields["values"]))
     if isinstance(kind, str) and kind in KINDS and fields.keys() == {"low", "high"}:
         return KINDS[kind](**fields)
@@ -84,9 +84,8 @@ def _range(text: str, declared: Dimension | None) -> Range:
     try:
         ends = [number(part) for part in (low, high)]
     except ValueError:
-        raise ValueError(f"{text!r} must be low..high, such as 1e-4..1e-2, or a list such as [64,128]") from None
-    if not dots:
-        raise ValueError(f"{text!r} must be low..high, such as 1e-4..1e-2; --set fixes a value")
+        fixed = "" if dots else "; --set fixes a value"
+        raise ValueError(f"{text!r} must be low..high, such as 1e-4..1e-2, or a list such as [64,128]{fixed}") from None
     whole = all(isinstance(end, int) for end in ends)
     kind = (
         PREFIXES[prefix] if colon else type(declared) if isinstance(declared, Range) else Integers if whole else Uniform
