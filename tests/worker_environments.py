@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 import time
+from random import SystemRandom
 
 import gymnasium as gym
 import numpy as np
@@ -171,3 +172,67 @@ class Leaving(gym.Env):
         if action == 1:
             os._exit(3)
         return np.ones(1, np.float32), 0.0, False, False, {"action_mask": [1, 1]}
+
+
+class Paced(gym.Env):
+    """Adds its actions up, in episodes of 2 to 6 steps, half of which succeed.
+
+    Every step takes a time of its own, up to twice ``seconds``, which no seed determines. The state can be saved.
+    """
+
+    observation_space = spaces.Box(-99.0, 99.0, (3,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, seconds=0.0):
+        self.seconds = seconds
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.total, self.length = 0, float(self.np_random.uniform()), int(self.np_random.integers(2, 7))
+        return self.see(), {}
+
+    def step(self, action):
+        time.sleep(2 * self.seconds * SystemRandom().random())
+        self.time, self.total = self.time + 1, self.total + float(action[0])
+        over, even = self.time >= self.length, self.length % 2 == 0
+        return self.see(), -abs(self.total), over and even, over and not even, {"is_success": even} if over else {}
+
+    def see(self):
+        return np.array([self.time, self.total, self.length], np.float32)
+
+    def get_state(self):
+        return {
+            "place": [self.time, self.total, self.length],
+            "rng": None if self._np_random is None else self._np_random.bit_generator.state,
+        }
+
+    def set_state(self, state):
+        self.time, self.total, self.length = state["place"]
+        self.np_random.bit_generator.state = state["rng"]
+
+
+class Gated(Losable):
+    """Episodes of 3 steps. The one that was seeded with 0 waits at steps while the file ``gate`` is there, and at further
+    resets while ``gate.reset`` is there.
+    """
+
+    is_first = False
+
+    def __init__(self, gate, at_reset=None):
+        super().__init__(at_reset)
+        self.lengths, self.gate = (3,), gate
+
+    def reset(self, **kwargs):
+        if kwargs.get("seed") is None:
+            self.wait(self.gate.with_suffix(".reset"))
+        else:
+            self.is_first = kwargs["seed"] == 0
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        self.wait(self.gate)
+        return super().step(action)
+
+    def wait(self, gate):
+        while self.is_first and gate.exists():
+            time.sleep(0.01)

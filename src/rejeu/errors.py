@@ -46,5 +46,9 @@ class WorkerError(RuntimeError):
     """A worker process failed. The message contains its traceback, if there is one."""
 
 
+class ClusterError(ConnectionError):
+    """A Ray cluster cannot be reached, or a machine of it cannot be used. The message says why, on one line."""
+
+
 class RunInUseError(RuntimeError):
     """Another process is training in the folder of this run."""

@@ -21,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from rejeu.envs.make import GymnasiumVector, make_vector
-from rejeu.envs.workers import pool
+from rejeu.envs.workers import local
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
@@ -204,9 +204,9 @@ def test_answers_that_nobody_fetched_are_dropped():
     """As after a Ctrl-C that came between question and answer."""
     vector = make("nothing")
     vector.reset()
-    vector.workers.send({i: ("step", np.zeros(1, np.float32)) for i in range(2)})
+    vector.workers.send({i: ("step", np.zeros(1, np.float32), False) for i in range(2)})
     np.testing.assert_array_equal(vector.step(actions(0, 0)).obs[:, 1], 2)
-    vector.workers.send({0: ("step", np.zeros(1, np.float32))})
+    vector.workers.send({0: ("step", np.zeros(1, np.float32), False)})
     np.testing.assert_array_equal(vector.reset_done(np.array([True, False]))[:, 1], [0, 2])
     vector.close()
 
@@ -285,7 +285,7 @@ def test_a_function_that_cannot_be_sent_is_refused():
 
 def test_a_self_resetting_vector_without_shared_memory_is_refused():
     """Its workers forget a masked reset, and would reset once more instead of taking the next step."""
-    env = AsyncVectorEnv([Counter] * 2, shared_memory=False, context=pool.START_METHOD)
+    env = AsyncVectorEnv([Counter] * 2, shared_memory=False, context=local.START_METHOD)
     with pytest.raises(
         ValueError, match=r"AsyncVectorEnv without shared memory .*autoreset_mode=AutoresetMode.DISABLED"
     ):
@@ -376,7 +376,7 @@ def test_where_a_script_stands_is_told_from_its_text(tmp_path):
         tmp_path,
         """
         import threading
-        from rejeu.envs.workers.pool import main_runs_again
+        from rejeu.envs.workers.local import main_runs_again
 
         def ask():
             print(main_runs_again())
@@ -390,7 +390,7 @@ def test_where_a_script_stands_is_told_from_its_text(tmp_path):
         """,
     )
     assert ran.stdout.split() == ["True", "False", "None"]
-    asked = "from rejeu.envs.workers.pool import main_runs_again as ask; print(ask())"
+    asked = "from rejeu.envs.workers.local import main_runs_again as ask; print(ask())"
     assert subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout == "False\n"
 
 

@@ -237,7 +237,9 @@ class BaseAgent(ABC):
         self.run: Run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
 
     @abstractmethod
-    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+    def make_envs(
+        self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
+    ) -> VectorEnv:
         """Returns vector environments for this agent; the arguments are those of :func:`rejeu.make_vector`."""
 
     @abstractmethod

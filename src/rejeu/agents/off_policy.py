@@ -26,6 +26,7 @@ from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
 from rejeu.loops.device import loops as device_loops
+from rejeu.loops.first_of_n import first_of_n
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
 
@@ -111,8 +112,10 @@ class OffPolicyAgent(Agent):
         """
         return policy.q_values(self, observation, action, critics)
 
-    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
-        return make_vector(env, n_envs, backend, seed)
+    def make_envs(
+        self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
+    ) -> VectorEnv:
+        return make_vector(env, n_envs, backend, seed, wait_for=wait_for)
 
     def with_masks(self, obs: Any, masks: Any) -> Any:
         refuse_masks(masks, self.name)
@@ -130,7 +133,8 @@ class OffPolicyAgent(Agent):
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
             return device_loops.off_policy(self.run, self.learner, self.config, n_steps, progress, self.stops)
-        return off_policy(self.run, self.learner, self.config, n_steps, progress)
+        learn = off_policy if self.run.env.wait_for is None else first_of_n
+        return learn(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:
         begin_episodes(self.run)

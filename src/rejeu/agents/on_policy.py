@@ -57,8 +57,16 @@ class OnPolicyAgent(Agent):
         """
         return policy.value(self, observation, state, episode_start)
 
-    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
-        return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
+    def make_envs(
+        self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
+    ) -> VectorEnv:
+        vector = (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
+        if (wait_for := wait_for or vector.wait_for) is not None:
+            raise ValueError(
+                f"wait_for={wait_for} is for off-policy algorithms such as SAC, and {self.name} learns from rollouts in which "
+                "all environments step together; make the environments without wait_for"
+            )
+        return vector
 
     def with_masks(self, obs: Any, masks: Any) -> Any:
         if not self.takes_masks:

@@ -106,7 +106,8 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
             return vector
         env_id, backend = environment(path, header)
         try:
-            vector = agent.make_envs(env_id, header.n_envs, backend, agent.seed)
+            several = {} if header.wait_for is None else {"wait_for": header.wait_for}
+            vector = agent.make_envs(env_id, header.n_envs, backend, agent.seed, **several)
             made.callback(vector.close)
             agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:

@@ -243,6 +243,8 @@ class RunHeader(msgspec.Struct):
     """A :class:`SavedRun`, encoded by :mod:`rejeu.io.json_arrays`."""
     env_id: Any = None
     backend: Any = None
+    wait_for: Positive | None = None
+    """Missing in older checkpoints."""
     own_env: Any = False
     threads: Annotated[int, Meta(ge=1, le=1024)] | None = None
     """Of JAX's device; missing in older checkpoints."""
@@ -333,6 +335,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "run_id": agent.run_id,
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,
+        "wait_for": run.env.wait_for,
         "own_env": agent.made_from_id,
         "threads": xla.threads(),
         "versions": versions(),

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 
+from rejeu import validation
 from rejeu.envs import seeds
 from rejeu.envs.adapters import adapter_of
 from rejeu.envs.base import Step, VectorEnv
@@ -24,10 +25,13 @@ from rejeu.envs.in_process import InProcess
 from rejeu.envs.registry import maker, register
 from rejeu.envs.seeds import Seed
 from rejeu.envs.workers.pool import TIMEOUT, check_options
+from rejeu.envs.workers.remote import Actors
 from rejeu.envs.workers.vector import InWorkers
 
-Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async", "jax"]
-BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async", "jax")
+Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async", "jax", "ray"]
+BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async", "jax", "ray")
+WORKERS: tuple[Backend, ...] = ("gymnasium-async", "ray")
+"""Backends whose environments are in worker processes."""
 ENVPOOL_FROM = 4
 """Smallest number of environments for which ``backend="auto"`` prefers EnvPool."""
 
@@ -44,6 +48,16 @@ __all__ = [
 ]
 
 
+class WorkerOptions(NamedTuple):
+    """Options of environments in workers; see :func:`make_vector`."""
+
+    worker_timeout: float | None = TIMEOUT
+    restart_workers: int = 0
+    wait_for: int | None = None
+    arrivals: Any = None
+    ray: Mapping[str, Any] | None = None
+
+
 def make_vector(
     env: Any,
     n_envs: int = 1,
@@ -52,6 +66,9 @@ def make_vector(
     *,
     worker_timeout: float | None = TIMEOUT,
     restart_workers: int = 0,
+    wait_for: int | None = None,
+    arrivals: Any = None,
+    ray: Mapping[str, Any] | None = None,
     **env_kwargs: Any,
 ) -> VectorEnv:
     """Returns a vector environment of ``n_envs`` environments.
@@ -62,23 +79,33 @@ def make_vector(
             kind, whose automatic resets are undone.
         n_envs: how many; ignored for vector environments.
         backend: ``"envpool"`` (C++ threads), ``"gymnasium"`` (in this process), ``"gymnasium-async"`` (one worker process
-            each), ``"jax"`` (compiled, for ids that begin with ``jax/``), or ``"auto"`` (see :func:`auto_backend`). The
-            attribute ``backend`` of the result tells which.
+            each), ``"ray"`` (one actor each, on the machines of a Ray cluster), ``"jax"`` (compiled, for ids that begin with
+            ``jax/``), or ``"auto"`` (see :func:`auto_backend`). The attribute ``backend`` of the result tells which.
         seed: seeds the environments at their first reset: a number, from which environment i takes the i-th after it, or a
             sequence of one number for each environment. An agent that trains in them begins with its own seed instead of a
             number, and keeps a sequence. None draws one.
-        worker_timeout: seconds that worker processes have for a step or a reset before they count as hung; None: for
-            ever. Of no meaning on other backends.
-        restart_workers: how many worker processes that crashed or hung are restarted, with a warning, and their
-            episode counted as truncated there; after that, and by default, :class:`rejeu.errors.WorkerError` is raised.
-            Only for ``backend="gymnasium-async"``.
+        worker_timeout: seconds that workers have for a step or a reset before they count as hung; None: for ever. Of no
+            meaning on other backends.
+        restart_workers: how many workers that crashed, hung or were lost with their machine are restarted, with a warning,
+            and their episode counted as truncated there; after that, and by default, :class:`rejeu.errors.WorkerError` is
+            raised. Only for ``"gymnasium-async"`` and ``"ray"``, like the options that follow.
+        wait_for: how many results off-policy algorithms take at a time, from 1 to ``n_envs``: those that arrive first.
+            They are stored, and these environments go on, while the others still step. None: all environments step
+            together.
+        arrivals: the attribute ``arrivals`` of the environments of an earlier run with the same ``wait_for``, to take the
+            results in the same order. None: in the order in which they arrive.
+        ray: for ``"ray"``: ``address`` of the cluster (``"HOST:PORT"`` or ``"auto"``; by default that in the environment
+            variable ``RAY_ADDRESS``, else Ray is started on this machine), and what each environment reserves:
+            ``num_cpus`` (1), ``num_gpus`` (0), ``memory`` in bytes, ``resources`` by name.
         env_kwargs: handed to ``gymnasium.make``.
 
     Raises:
-        ValueError: for an unknown id or backend, with the nearest known; for seeds that are not one for each environment.
+        ValueError: for an unknown id or backend, with the nearest known; for seeds that are not one for each environment;
+            for options out of range, or of another backend.
         MissingExtra: if a package is not installed.
         TypeError: if ``env`` is none of the above, or a function that cannot be sent to a worker process.
         WorkerError: if a worker process cannot be started.
+        ClusterError: if the Ray cluster cannot be reached, or has other versions.
 
     >>> make_vector("Pendulum-v1", n_envs=4, backend="gymnasium").n_envs
     4
@@ -87,11 +114,12 @@ def make_vector(
         raise ValueError(f"backend={backend!r} must be one of {', '.join(BACKENDS)}")
     if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
-    check_workers(env, backend, worker_timeout, restart_workers)
+    workers = WorkerOptions(worker_timeout, restart_workers, wait_for, arrivals, ray)
+    check_workers(env, n_envs, backend, workers)
     if isinstance(env, VectorEnv | gym.vector.VectorEnv) or adapter_of(env) is not None:
         n_envs = env.n_envs if isinstance(env, VectorEnv) else env.num_envs
     seed = seeds.checked(seed, n_envs)
-    vector = _made(env, n_envs, backend, seed, worker_timeout, restart_workers, env_kwargs)
+    vector = _made(env, n_envs, backend, seed, workers, env_kwargs)
     if isinstance(seed, tuple):
         vector.seeds = seed
     return vector
@@ -102,13 +130,7 @@ make_vec = make_vector
 
 
 def _made(
-    env: Any,
-    n_envs: int,
-    backend: Backend,
-    seed: Seed,
-    worker_timeout: float | None,
-    restart_workers: int,
-    env_kwargs: dict[str, Any],
+    env: Any, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: dict[str, Any]
 ) -> VectorEnv:
     """Returns what :func:`make_vector` does, for arguments that were checked."""
     if isinstance(env, VectorEnv):
@@ -126,27 +148,22 @@ def _made(
             )
         return InProcess([env], seed)
     if callable(env):
-        if backend == "gymnasium-async":
-            return InWorkers(env, n_envs, seed, worker_timeout, restart_workers)
+        if backend in WORKERS:
+            starter = Actors(workers.ray or {}) if backend == "ray" else None
+            return InWorkers(env, n_envs, seed, *workers[:4], starter)
         return InProcess([env() for _ in range(n_envs)], seed)
     if not isinstance(env, str):
         raise TypeError(
             f"env must be an id, a Gymnasium environment, a function that makes one or a vector environment, got "
             f"{type(env).__name__}"
         )
-    vector = _of_id(env, n_envs, backend, seed, worker_timeout, restart_workers, env_kwargs)
+    vector = _of_id(env, n_envs, backend, seed, workers, env_kwargs)
     vector.made_from = env, env_kwargs
     return vector
 
 
 def _of_id(
-    env: str,
-    n_envs: int,
-    backend: Backend,
-    seed: Seed,
-    worker_timeout: float | None,
-    restart_workers: int,
-    env_kwargs: dict[str, Any],
+    env: str, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: dict[str, Any]
 ) -> VectorEnv:
     if backend == "auto":
         backend = auto_backend(env, n_envs, env_kwargs)
@@ -158,14 +175,7 @@ def _of_id(
     if backend == "jax":
         threshold = functional.REGISTRY[env].reward_threshold if functional.is_functional(env) else None
         return JaxVector(functional.make(env, **env_kwargs), n_envs, seed, env_id=env, reward_threshold=threshold)
-    return make_vector(
-        maker(env, **env_kwargs),
-        n_envs,
-        backend,
-        seed,
-        worker_timeout=worker_timeout,
-        restart_workers=restart_workers,
-    )
+    return make_vector(maker(env, **env_kwargs), n_envs, backend, seed, **workers._asdict())
 
 
 def auto_backend(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] = MappingProxyType({})) -> Backend:
@@ -185,14 +195,23 @@ def auto_backend(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] = Mappi
     return "envpool" if envpool_knows(env_id) else "gymnasium"
 
 
-def check_workers(env: Any, backend: Backend, worker_timeout: float | None, restart_workers: int) -> None:
+def check_workers(env: Any, n_envs: int, backend: Backend, options: WorkerOptions) -> None:
     """Raises ``ValueError`` if options of worker processes are out of range, or given where there will be none."""
-    check_options(worker_timeout, restart_workers)
-    if restart_workers and (backend != "gymnasium-async" or not (isinstance(env, str) or is_maker(env))):
-        raise ValueError(
-            f"restart_workers={restart_workers} is for worker processes, got backend={backend!r} and an env of type "
-            f"{type(env).__name__}; use backend='gymnasium-async' and an id or a function"
-        )
+    check_options(options.worker_timeout, options.restart_workers)
+    in_workers = backend in WORKERS and (isinstance(env, str) or is_maker(env))
+    for name, value in options._asdict().items():
+        is_given = name != "worker_timeout" and value is not None and (name != "restart_workers" or value)
+        if is_given and not in_workers:
+            raise ValueError(
+                f"{name}={value!s:.40} is for worker processes, got backend={backend!r} and an env of type "
+                f"{type(env).__name__}; use backend='gymnasium-async' or 'ray', and an id or a function"
+            )
+    if options.wait_for is not None:
+        validation.whole("wait_for", options.wait_for, least=1, most=n_envs)
+    elif options.arrivals is not None:
+        raise ValueError("arrivals is the order of results in a run with wait_for; give the wait_for of that run too")
+    if options.ray is not None and backend != "ray":
+        raise ValueError(f"ray={dict(options.ray)} is for backend='ray', got backend={backend!r}")
 
 
 def is_maker(env: Any) -> bool:

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from rejeu.core import Masked
 from rejeu.envs.adapters import adapter_of
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, check_workers, make_vector
+from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, check_workers, make_vector
 from rejeu.envs.registry import maker
 from rejeu.envs.seeds import Seed
 from rejeu.envs.validation import id_of
@@ -202,7 +202,7 @@ def make_masked(
         TypeError: for a vector environment whose single environments cannot be accessed.
         ValueError: for worker options out of range, or ``restart_workers`` where there are no worker processes.
     """
-    check_workers(env, backend, worker_timeout, restart_workers)
+    check_workers(env, n_envs, backend, WorkerOptions(worker_timeout, restart_workers))
     if adapter_of(env) is not None:
         env = make_vector(env, seed=seed)
     if isinstance(env, MaskedVector):

@@ -1,38 +1,26 @@
-"""Environments in worker processes, with timeouts and optional restarts.
-
-A process that uses JAX has threads, so forking it is unsafe. On Linux, workers are forked from a server process without
-threads. On other systems they are spawned. Both run the main script again, up to its ``if __name__ == "__main__":``.
-"""
+"""A pool of workers with one environment each, with timeouts and optional restarts."""
 
 from __future__ import annotations
 
-import ast
-import linecache
 import math
-import multiprocessing
-import signal
-import sys
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from multiprocessing.reduction import ForkingPickler
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from multiprocessing import connection
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-from gymnasium.vector.utils import CloudpickleWrapper
 
-from rejeu.envs.workers import process
+from rejeu.envs.workers.local import check_sendable
 from rejeu.envs.workers.process import Description, Failure
+from rejeu.envs.workers.worker import CLOSE_SECONDS, LOOK_SECONDS, Lost, Starter, Worker, seconds_until
 from rejeu.errors import WorkerError
 
-START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 TIMEOUT = 300.0
 """Default timeout of a step or a reset, in seconds."""
 START_SECONDS = 600.0
 """Minimum timeout for making an environment, in seconds. It does not apply if there is no timeout."""
-CLOSE_SECONDS = 5.0
-"""Seconds that the processes have to exit before they are terminated."""
 RESTARTED = "worker_restarted"
 """Key of ``info`` with the reason why the worker of an environment was restarted."""
 
@@ -43,136 +31,45 @@ class Restarted(NamedTuple):
     why: str
 
 
-class Lost(Exception):
-    """A worker process exited unexpectedly or timed out. The message states which worker and which request."""
-
-
-class Worker:
-    """A handle of a worker process, which runs one environment."""
-
-    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, *shared: Any) -> None:
-        """Starts the process. ``shared`` is passed to :func:`rejeu.envs.workers.process.serve`."""
-        self.number = number
-        self.asked: str | None = "make"
-        """The pending request, None if there is none."""
-        self._ended: str | None = None
-        self.pipe, theirs = context.Pipe()
-        arguments = (theirs, CloudpickleWrapper(make), number, *(shared or (None,)))
-        self.process = context.Process(target=process.serve, args=arguments, daemon=True)
-        self.process.start()
-        theirs.close()
-
-    def ask(self, request: str, *arguments: Any) -> None:
-        """Sends a request. The answer must be fetched with :meth:`answer`."""
-        self.asked = arguments[0].__name__.strip("_") if request == "call" else request
-        process.send(self.pipe, (request, *arguments))
-
-    def answer(self, deadline: float | None) -> Any:
-        """Waits for the answer and returns it.
-
-        Args:
-            deadline: in the time of ``time.monotonic``. None waits without limit.
-
-        Raises:
-            Lost: if there is no answer.
-            WorkerError: if the answer cannot be unpickled in this process.
-        """
-        seconds = None if deadline is None else max(deadline - time.monotonic(), 0.0)
-        try:
-            if not self.pipe.poll(seconds):
-                raise Lost(f"the worker process of environment {self.number} gave no answer to {self.asked!r}")
-            answer = process.receive(self.pipe)
-        except (EOFError, ConnectionError):
-            where = f"at {self.asked!r}"
-            raise Lost(
-                f"the worker process of environment {self.number} ended by itself {where} ({self.end()})"
-            ) from None
-        except Lost:
-            raise
-        except Exception as error:  # unpickling an object of an unknown class can raise anything
-            self.asked = None
-            raise WorkerError(f"what environment {self.number} sent cannot be read in this process: {error}") from error
-        self.asked = None
-        return answer
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process is running."""
-        return self._ended is None and self.process.is_alive()
-
-    def end(self) -> str:
-        """Terminates the process immediately, and returns its exit code as text."""
-        if self._ended is not None:
-            return self._ended
-        self.pipe.close()
-        process = self.process
-        process.join(0.2)  # the pipe may close shortly before the process exits
-        for stop in (process.terminate, process.kill):
-            if process.is_alive():
-                stop()
-                process.join(CLOSE_SECONDS)
-        code = process.exitcode
-        names = {-one: one.name for one in signal.Signals}
-        self._ended = f"exit code {code}" + (f", {names[code]}" if code in names else "")
-        if code is not None:
-            process.close()
-        return self._ended
-
-
 class Workers:
-    """A pool of worker processes with one environment each.
+    """A pool of workers with one environment each.
 
     Requests are sent to several workers at once, and the answers may arrive in any order. A lost worker is replaced
     with a warning, up to ``restarts`` times in total. After that, a lost worker raises ``WorkerError``, and the other
-    processes are terminated.
+    workers are terminated.
     """
 
     def __init__(
         self,
         makes: Sequence[Callable[[], gym.Env]],
-        start_method: str | None = None,
+        starter: Starter,
         timeout: float | None = TIMEOUT,
         restarts: int = 0,
-        shared: Callable[[Any], tuple[Any, ...]] = lambda context: (None,),
-        preload: str | None = None,
     ) -> None:
         """Starts all workers, and waits until their environments are made.
 
         Args:
             makes: functions that make one environment each. They are sent to the workers.
-            start_method: start method of ``multiprocessing``. None uses :data:`START_METHOD`.
+            starter: starts workers. It is closed with the pool.
             timeout: seconds to wait for the answers to a request. None waits without limit.
             restarts: maximum number of lost workers that are replaced.
-            shared: takes the ``multiprocessing`` context and returns further arguments of each worker.
-            preload: name of an additional module that the workers need.
 
         Raises:
             TypeError: if a function cannot be pickled.
             ValueError: if ``timeout`` or ``restarts`` is invalid.
-            WorkerError: if an environment cannot be made, or if the main script would start workers recursively.
+            WorkerError: if an environment cannot be made.
         """
         check_options(timeout, restarts)
         for make in makes:
             check_sendable(make)
-        start_method = START_METHOD if start_method is None else start_method
-        if start_method != "fork" and main_runs_again():
-            raise WorkerError(
-                "worker processes run the main script again from its beginning, so what starts them must stand under "
-                "`if __name__ == '__main__':`; put it there, or use backend='gymnasium'"
-            )
-        self._makes = list(makes)
-        self._context: Any = multiprocessing.get_context(start_method)
-        if start_method == "forkserver":
-            # Imported once, in the server, so that a worker starts in milliseconds. The import starts no threads.
-            self._context.set_forkserver_preload([process.__name__, *([] if preload is None else [preload])])
-        self._shared = shared(self._context)
+        self._makes, self._starter = list(makes), starter
         self.timeout = timeout
         self.restarts_left = self._restarts = restarts
         self.workers: list[Worker] = []
-        self._finalizer = weakref.finalize(self, _end, self.workers)
+        self._finalizer = weakref.finalize(self, _end, self.workers, starter)
         try:
-            for number in range(len(makes)):
-                self.workers.append(self._start(number))
+            for number, make in enumerate(self._makes):
+                self.workers.append(starter.start(number, make))
             self.descriptions = [self._made(worker) for worker in self.workers]
         except BaseException:
             self.end()
@@ -180,21 +77,17 @@ class Workers:
 
     @property
     def closed(self) -> bool:
-        """Whether the processes were terminated."""
+        """Whether the workers were terminated."""
         return not self._finalizer.alive
-
-    def _start(self, number: int) -> Worker:
-        return Worker(number, self._makes[number], self._context, *self._shared)
 
     def _made(self, worker: Worker) -> Description:
         """Waits until an environment is made, and returns its description."""
+        deadline = None if self.timeout is None else time.monotonic() + max(self.timeout, START_SECONDS)
         try:
-            made = worker.answer(None if self.timeout is None else time.monotonic() + max(self.timeout, START_SECONDS))
+            worker.connect(deadline)
+            made = worker.answer(deadline)
         except Lost as lost:
-            raise WorkerError(
-                f"{lost}; what it printed says why. It runs the main script again, so that must be possible to import; "
-                "backend='gymnasium' does without workers"
-            ) from None
+            raise WorkerError(f"{lost}; what it printed says why. {self._starter.advice}") from None
         if isinstance(made, Failure):
             raise WorkerError(f"environment {worker.number} could not be made in a worker process:\n{made.trace}")
         return made
@@ -227,12 +120,37 @@ class Workers:
             WorkerError: if a worker was lost and cannot be replaced. All workers are then terminated.
         """
         deadline = None if self.timeout is None else time.monotonic() + self.timeout
+        # all answers, otherwise the next request would receive the remaining ones
+        return self._without_lost({number: self._answer(number, deadline) for number in numbers})
+
+    def first(self, numbers: Collection[int]) -> dict[int, Any]:
+        """Waits until one of these workers has answered, and returns what has arrived, in any order.
+
+        The answers and errors are those of :meth:`answers`. Each request has the timeout for itself.
+        """
+        waiting = {self.workers[number].pipe: number for number in numbers}
         found: dict[int, Any] = {}
-        for number in numbers:  # all answers, otherwise the next request would receive the remaining ones
-            try:
-                found[number] = self.workers[number].answer(deadline)
-            except Lost as lost:
-                found[number] = lost
+        while not found:
+            oldest = min(self.workers[number].asked_at for number in numbers)
+            deadline = None if self.timeout is None else oldest + self.timeout
+            ready = connection.wait([*waiting], seconds_until(deadline, LOOK_SECONDS))
+            found = {waiting[pipe]: self._answer(waiting[pipe], None) for pipe in ready}  # type: ignore[index]
+            if not found:
+                found = {number: self._answer(number, 0.0) for number in numbers if self._is_overdue(number)}
+        return self._without_lost(found)
+
+    def _is_overdue(self, number: int) -> bool:
+        worker = self.workers[number]
+        late = self.timeout is not None and time.monotonic() >= worker.asked_at + self.timeout
+        return late or not worker.alive
+
+    def _answer(self, number: int, deadline: float | None) -> Any:
+        try:
+            return self.workers[number].answer(deadline)
+        except Lost as lost:
+            return lost
+
+    def _without_lost(self, found: dict[int, Any]) -> dict[int, Any]:
         for number, answer in found.items():
             if isinstance(answer, Lost):
                 found[number] = self._replaced(number, answer)
@@ -256,8 +174,8 @@ class Workers:
             RuntimeWarning,
             stacklevel=2,
         )
-        self.workers[number] = self._start(number)
         try:
+            self.workers[number] = self._starter.start(number, self._makes[number])
             self._made(self.workers[number])
         except BaseException:
             self.end()
@@ -265,7 +183,7 @@ class Workers:
         return Restarted(why)
 
     def close(self) -> None:
-        """Closes the environments, and terminates processes that do not respond. Further calls do nothing."""
+        """Closes the environments, and terminates workers that do not respond. Further calls do nothing."""
         if self.closed:
             return
         for worker in self.workers:
@@ -274,20 +192,20 @@ class Workers:
         deadline = time.monotonic() + CLOSE_SECONDS
         for worker in self.workers:
             if worker.asked == "close":
-                worker.process.join(max(deadline - time.monotonic(), 0.0))
+                worker.join(max(deadline - time.monotonic(), 0.0))
         self.end()
 
     def end(self) -> None:
-        """Terminates the processes immediately."""
+        """Terminates the workers immediately."""
         self._finalizer()
 
 
-def _end(workers: Sequence[Worker]) -> None:
+def _end(workers: Sequence[Worker], starter: Starter) -> None:
     for worker in workers:
-        if worker.alive:
-            worker.process.terminate()
+        worker.stop()
     for worker in workers:
         worker.end()
+    starter.close()
 
 
 def check_options(timeout: float | None, restarts: int) -> None:
@@ -296,44 +214,3 @@ def check_options(timeout: float | None, restarts: int) -> None:
         raise ValueError(f"worker_timeout={timeout!r} must be a number of seconds above 0, or None to wait for ever")
     if isinstance(restarts, bool) or not isinstance(restarts, int) or restarts < 0:
         raise ValueError(f"restart_workers={restarts!r} must be a whole number of at least 0")
-
-
-def check_sendable(make_one: Callable[[], gym.Env]) -> None:
-    """Raises ``TypeError`` unless the function can be pickled and sent to another process."""
-    try:
-        ForkingPickler.dumps(CloudpickleWrapper(make_one))
-    except Exception as error:  # pickling the objects that it refers to can raise anything
-        raise TypeError(
-            f"the function that makes environments is sent to worker processes, and cannot be pickled: {error}; let it "
-            "make what it needs instead of referring to it, or use backend='gymnasium'"
-        ) from error
-
-
-def main_runs_again() -> bool | None:
-    """Returns whether a worker process, which imports the main script, would execute the current statement again.
-
-    None if this is unknown: in a thread other than the main thread, or if the source of the script is unavailable.
-    """
-    main = sys.modules["__main__"]
-    spec = getattr(main, "__spec__", None)
-    path = getattr(main, "__file__", None)
-    if path is None or (spec is not None and spec.name.endswith("__main__")):
-        return False  # interactive, or a package run with -m: a worker imports neither
-    frame, here = sys._getframe(), None
-    while frame is not None:
-        if frame.f_globals is vars(main) and frame.f_code.co_name == "<module>":
-            here = frame.f_lineno
-        frame = frame.f_back  # type: ignore[assignment]
-    source = "".join(linecache.getlines(path, vars(main)))
-    if here is None or not source:
-        return None
-    try:
-        statements = ast.parse(source).body
-    except SyntaxError:
-        return None
-    return not any(
-        isinstance(statement, ast.If)
-        and statement.lineno <= here <= (statement.end_lineno or here)
-        and any(isinstance(node, ast.Name) and node.id == "__name__" for node in ast.walk(statement.test))
-        for statement in statements
-    )

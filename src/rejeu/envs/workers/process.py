@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import signal
+import socket
+import threading
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -14,9 +17,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
+from rejeu import cluster
 from rejeu.envs import batching, snapshot, validation
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves
+
+TOKEN_BYTES = 32
+"""Length of the token that a worker on another machine presents."""
+CONNECT_SECONDS = 30.0
+"""Seconds that a worker has to connect to the machine that has started it."""
 
 
 class Failure(NamedTuple):
@@ -64,29 +73,58 @@ def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarr
     ]
 
 
-def serve(
-    pipe: Connection, make: CloudpickleWrapper, number: int, buffers: Sequence[Any] | None, n_envs: int = 0
-) -> None:
+class Encoder(ABC):
+    """How a worker hands over observations. Abstract; sent to the worker, which calls it once."""
+
+    @abstractmethod
+    def __call__(self, space: gym.Space) -> Callable[[Any], Any]:
+        """Returns a function that takes an observation, and returns what is sent in its place."""
+
+
+class ToSharedMemory(Encoder):
+    """Writes observations into shared memory, and sends None."""
+
+    def __init__(self, buffers: Sequence[Any], n_envs: int, number: int) -> None:
+        """Takes the memory of :func:`rows`, and the index of the environment."""
+        self.buffers, self.n_envs, self.number = buffers, n_envs, number
+
+    def __call__(self, space: gym.Space) -> Callable[[Any], None]:
+        put, number = batching.make_writer(space, rows(space, self.buffers, self.n_envs)), self.number
+        return lambda obs: put(number, obs)
+
+
+class ToLeaves(Encoder):
+    """Sends observations as the list of their leaves, arrays of the kept dtypes."""
+
+    def __call__(self, space: gym.Space) -> Callable[[Any], list[np.ndarray]]:
+        stores = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves(space)]
+        put = batching.make_writer(space, stores)
+
+        def encode(obs: Any) -> list[np.ndarray]:
+            put(0, obs)
+            return [np.array(store[0]) for store in stores]
+
+        return encode
+
+
+def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder | None) -> None:
     """Answers requests for one environment, until it is closed or the main process exits.
 
     Args:
         pipe: connection to the main process.
         make: makes the environment.
-        number: index of the environment.
-        buffers: shared memory for the observations of ``n_envs`` environments. None sends them through the pipe.
-        n_envs: total number of environments.
+        encoder: encodes the observations. None sends them as they are.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
     env: gym.Env | None = None
     try:
         env = make.fn()
-        put = None
-        if buffers is not None:
-            put = batching.make_writer(env.observation_space, rows(env.observation_space, buffers, n_envs))
+        encode = unchanged if encoder is None else encoder(env.observation_space)
         send(pipe, Description(env.observation_space, env.action_space, env.metadata, env.render_mode))
         while (request := receive(pipe))[0] != "close":
-            send(pipe, _answered(env, request, put, number))
-    except (EOFError, ConnectionResetError):
+            send(pipe, _answered(env, request, encode))
+    except (EOFError, ConnectionError):
         pass
     except Exception as error:  # any exception of the constructor: the main process raises it
         send(pipe, Failure("raised", str(error), traceback.format_exc()))
@@ -96,14 +134,64 @@ def serve(
         pipe.close()
 
 
-def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None, number: int) -> Any:
+class RemoteWorker:
+    """A worker that connects to the process that has started it; a Ray actor is made of this class."""
+
+    def serve(self, address: tuple[str, int], token: bytes) -> None:
+        """Connects, says where it runs, and answers requests until the environment is closed or the connection ends."""
+        connected = socket.create_connection(address, CONNECT_SECONDS)
+        connected.sendall(token)
+        pipe = as_connection(connected)
+        send(pipe, {"node": node_address(), "versions": cluster.versions()})
+        try:
+            make, encoder = receive(pipe)
+        except EOFError:
+            return
+        except Exception as error:  # unpickling a function of a module that is missing here can raise anything
+            send(pipe, Failure("raised", str(error), traceback.format_exc()))
+            return
+        serve(pipe, make, encoder)
+
+
+def node_address() -> str:
+    """Returns the address of the Ray node on which this process runs."""
+    import ray
+
+    return str(ray.util.get_node_ip_address())
+
+
+def as_connection(connected: socket.socket) -> Connection:
+    """Returns a connected socket, which is detached, as a connection for messages."""
+    connected.settimeout(None)
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    return Connection(connected.detach())
+
+
+def receive_exactly(connected: socket.socket, n: int) -> bytes:
+    """Returns ``n`` bytes of a socket.
+
+    Raises:
+        OSError: if it ends before, or times out.
+    """
+    data = b""
+    while len(data) < n:
+        part = connected.recv(n - len(data))
+        if not part:
+            raise ConnectionError("the connection has ended")
+        data += part
+    return data
+
+
+def unchanged(obs: Any) -> Any:
+    """Returns an observation as it is."""
+    return obs
+
+
+def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any]) -> Any:
     """Returns the answer of the environment, or a :class:`Failure`."""
     try:
-        answer = _answer(env, *request)
-        if put is None or request[0] not in ("step", "reset"):
-            return answer
-        put(number, answer[0])
-        return answer[1:]
+        return _answer(env, encode, *request)
     except BadEnvironmentError as error:
         return Failure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # the environment can raise anything
@@ -111,12 +199,17 @@ def _answered(env: gym.Env, request: Any, put: Callable[[int, Any], None] | None
         return Failure(kind, str(error), traceback.format_exc())
 
 
-def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
+def _answer(env: gym.Env, encode: Callable[[Any], Any], name: str, *arguments: Any) -> Any:
     """Returns the answer of an environment to one request."""
     if name == "step":
-        return checked_step(env, arguments[0])
+        action, resets = arguments
+        if resets:
+            return step_and_reset(env, action, encode)
+        obs, *rest = checked_step(env, action)
+        return encode(obs), *rest
     if name == "reset":
-        return batching.reset_env(env, *arguments)
+        obs, info = batching.reset_env(env, *arguments)
+        return encode(obs), info
     if name == "snapshot":
         return snapshot.state_of(env)
     if name == "restore":
@@ -125,6 +218,23 @@ def _answer(env: gym.Env, name: str, *arguments: Any) -> Any:
     assert name == "call", name
     function, *rest = arguments
     return function(env, *rest)
+
+
+def step_and_reset(
+    env: gym.Env, action: Any, encode: Callable[[Any], Any]
+) -> tuple[Any, float, bool, bool, dict[str, Any], list[np.ndarray] | None]:
+    """Steps an environment, and resets it if the episode has ended.
+
+    Returns:
+        The observation to act on, encoded, the reward, both flags, the info, and the leaves of the final observation, None
+        if the episode goes on.
+    """
+    obs, reward, terminated, truncated, info = checked_step(env, action)
+    final = None
+    if terminated or truncated:
+        final = ToLeaves()(env.observation_space)(obs)
+        obs, _ = batching.reset_env(env)
+    return encode(obs), reward, terminated, truncated, info, final
 
 
 def checked_step(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

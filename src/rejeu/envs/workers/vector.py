@@ -1,9 +1,12 @@
-"""A vector environment with one worker process per environment and observations in shared memory."""
+"""A vector environment with one worker per environment, in processes of this machine or in actors of a Ray cluster."""
 
 from __future__ import annotations
 
 import ctypes
+import warnings
+from array import array
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,17 +18,24 @@ from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.workers import process
+from rejeu.envs.workers.arrivals import INDEX, Result, checked_record, from_saved, to_saved
+from rejeu.envs.workers.local import Processes
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
-from rejeu.envs.workers.process import Failure
+from rejeu.envs.workers.process import Failure, ToSharedMemory
+from rejeu.envs.workers.worker import Starter
 from rejeu.errors import BadEnvironmentError, WorkerError
+from rejeu.io.records import convert
 from rejeu.spaces import leaves, structure
 
 
 class InWorkers(VectorEnv):
-    """Environments in worker processes that are stepped in parallel.
+    """Environments in workers that are stepped in parallel.
 
     If a lost worker is replaced, its episode is truncated. The step has reward 0 and ``truncated=True``, the previous
     observation is repeated as the next observation, and ``info["worker_restarted"]`` contains the reason.
+
+    With ``wait_for``, the environments can also step on their own: :meth:`send` gives actions to those that await one, and
+    :meth:`receive` returns the results that arrive first. The other methods step and reset all environments together.
 
     Args:
         make_one: makes an environment. It is sent to the workers, and called once in this process.
@@ -33,13 +43,15 @@ class InWorkers(VectorEnv):
         seed: seed of the first reset. The seed of a restarted worker is derived from the last seed of its environment.
         worker_timeout: timeout of a step or a reset, in seconds. None waits without limit.
         restart_workers: maximum number of lost workers that are replaced, in total.
+        wait_for: number of results that :meth:`receive` returns.
+        arrivals: which results it returns, a record of another run (see :attr:`arrivals`). None: those that arrive first.
+        starter: starts workers elsewhere, which send their observations. None starts processes with shared memory.
 
     Raises:
         TypeError: if ``make_one`` cannot be pickled.
+        ValueError: if ``arrivals`` is not a record of so many environments.
         WorkerError: if a worker cannot be started, or fails to make its environment.
     """
-
-    backend = "gymnasium-async"
 
     def __init__(
         self,
@@ -48,12 +60,16 @@ class InWorkers(VectorEnv):
         seed: Seed = None,
         worker_timeout: float | None = TIMEOUT,
         restart_workers: int = 0,
+        wait_for: int | None = None,
+        arrivals: Any = None,
+        starter: Starter | None = None,
     ) -> None:
         one = make_one()
         self.observation_space, self.action_space = one.observation_space, one.action_space
         self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(one)
         one.close()
-        self.n_envs = n_envs
+        self.backend = "gymnasium-async" if starter is None else "ray"
+        self.n_envs, self.wait_for = n_envs, wait_for
         self.n_steps = 0
         """Number of steps of the vector."""
         self._lost: dict[int, Restarted] = {}
@@ -64,10 +80,21 @@ class InWorkers(VectorEnv):
         self._seed = seed
         self._seeds: list[int | None] = [None] * n_envs
         """Last seed of each environment."""
+        self._results: dict[int, Result] = {}
+        """Results that have arrived and were not taken yet, by environment, the oldest first."""
+        self._begun: dict[int, list[np.ndarray]] = {}
+        """First observations of episodes that environments have begun by themselves, where no result was taken since."""
+        self._pending: set[int] = set()
+        """Environments that are stepping on their own."""
+        self._record = array("H")
+        self._given = None if wait_for is None or arrivals is None else checked_record(arrivals, n_envs, wait_for)
         self._leaves = leaves(self.observation_space)
         self._stores = [np.zeros((n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
-        self.workers = Workers([make_one] * n_envs, None, worker_timeout, restart_workers, self._share)
+        self._rows: list[np.ndarray] | None = None
+        """Shared memory for the observations of all environments, None if workers send them."""
+        starter = Processes(encoders=self._share) if starter is None else starter
+        self.workers = Workers([make_one] * n_envs, starter, worker_timeout, restart_workers)
         for i, made in enumerate(self.workers.descriptions):
             if (made.observation_space, made.action_space) != (self.observation_space, self.action_space):
                 self.close()
@@ -76,19 +103,26 @@ class InWorkers(VectorEnv):
                     f"those of the first are {self.observation_space} and {self.action_space}; all must be the same"
                 )
 
-    def _share(self, context: Any) -> tuple[list[Any], int]:
-        """Allocates shared memory for the observations, and returns the arguments with which workers use it."""
+    def _share(self, context: Any) -> Callable[[int], ToSharedMemory]:
+        """Allocates shared memory for the observations, and returns a function that returns each worker's use of it."""
         buffers = [context.RawArray(ctypes.c_byte, max(self.n_envs * leaf.nbytes, 1)) for leaf in self._leaves]
         self._rows = process.rows(self.observation_space, buffers, self.n_envs)
-        return buffers, self.n_envs
+        return partial(ToSharedMemory, buffers, self.n_envs)
 
     def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
+        self._results, self._begun, self._pending = {}, {}, set()
         return self._reset(dict(enumerate(for_each(seed, self.n_envs))))
 
     def reset_done(self, done: np.ndarray) -> Any:
-        return self._reset(dict.fromkeys(np.flatnonzero(done).tolist()))
+        rest = []
+        for i in np.flatnonzero(done).tolist():
+            if i in self._begun:
+                self._put(i, self._begun.pop(i))
+            else:
+                rest.append(i)
+        return self._reset(dict.fromkeys(rest))
 
     def _reset(self, seeds: Mapping[int, int | None]) -> Any:
         """Resets the environments in ``seeds``, and repeats the reset of those whose worker was lost during it."""
@@ -100,7 +134,7 @@ class InWorkers(VectorEnv):
         while waiting:
             said = self._heard(self.workers.ask(waiting), "reset")
             done = [i for i, answer in said.items() if not isinstance(answer, Restarted)]
-            self._take(done)
+            self._take({i: said[i] for i in done})
             waiting = {i: ("reset", self._next_seed(i)) for i in said if i not in done}
         return self._obs
 
@@ -127,23 +161,123 @@ class InWorkers(VectorEnv):
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
         lost = {i: self._lost.pop(i) for i in which if i in self._lost}
-        asked = {i: ("step", action[i]) for i in which if i not in lost}
+        asked = {i: ("step", action[i], False) for i in which if i not in lost}
         said = {**self._heard(self.workers.ask(asked), "step"), **lost}
-        stepped = []
+        stepped = {}
         for i, answer in said.items():
             if isinstance(answer, Restarted):
                 truncated[i], info[i] = True, {RESTARTED: answer.why}
             else:
-                reward[i], terminated[i], truncated[i], info[i] = answer
-                stepped.append(i)
+                _, reward[i], terminated[i], truncated[i], info[i] = stepped[i] = answer
         self._take(stepped)
         return Step(self._obs, reward, terminated, truncated, info)
 
-    def _take(self, which: Sequence[int]) -> None:
-        """Copies observations out of shared memory, to which a lost worker may still have written."""
-        rows: Any = slice(None) if len(which) == self.n_envs else which
+    def _take(self, answers: Mapping[int, Any]) -> None:
+        """Writes the observations of answers, or copies them out of shared memory, which a lost worker may still change."""
+        if self._rows is None:
+            for i, answer in answers.items():
+                self._put(i, answer[0])
+            return
+        rows: Any = slice(None) if len(answers) == self.n_envs else [*answers]
         for store, shared in zip(self._stores, self._rows, strict=True):
             store[rows] = shared[rows]
+
+    def _put(self, i: int, parts: Sequence[np.ndarray]) -> None:
+        """Writes the leaves of an observation of environment ``i``."""
+        for store, part in zip(self._stores, parts, strict=True):
+            store[i] = part
+
+    def _parts(self, i: int, encoded: Any) -> list[np.ndarray]:
+        """Returns the leaves of an observation of environment ``i`` that has just arrived."""
+        return encoded if self._rows is None else [np.array(shared[i]) for shared in self._rows]
+
+    @property
+    def arrivals(self) -> np.ndarray:
+        """Which results :meth:`receive` has returned, ``uint16 (turns, wait_for)``: a row of indices for each call.
+
+        Given to :func:`rejeu.make_vector` again, they repeat a run.
+        """
+        return np.frombuffer(self._record.tobytes(), INDEX).reshape(-1, self.wait_for or self.n_envs)
+
+    def send(self, action: np.ndarray) -> None:
+        """Gives actions to the environments that await one, which step on their own, and reset where an episode ends.
+
+        Args:
+            action: in the environment's own range, ``(n_envs, ...)``; other rows are ignored.
+        """
+        idle = [i for i in range(self.n_envs) if i not in self._pending and i not in self._results]
+        lost = [i for i in idle if i in self._lost]
+        self.workers.send({i: ("step", action[i], True) for i in idle if i not in self._lost})
+        self._pending.update(idle)
+        for i in lost:
+            self._arrived(i, self._lost.pop(i))
+
+    def receive(self) -> Step:
+        """Returns the first ``wait_for`` results that arrive; ``which`` of the step says whose they are.
+
+        The observations of the other environments are those that they were given actions for. Where an episode ended, the
+        next has begun; :meth:`reset_done` returns its first observation.
+
+        Raises:
+            WorkerError, BadEnvironmentError: as for :meth:`step`.
+        """
+        assert self.wait_for is not None
+        chosen = self._chosen()
+        while len(self._results) < self.wait_for if chosen is None else not chosen <= self._results.keys():
+            self._listen()
+        which = np.array(sorted([*self._results][: self.wait_for] if chosen is None else chosen))
+        self._record.extend(which.tolist())
+        self.n_steps += 1
+        reward = np.zeros(self.n_envs, np.float32)
+        terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
+        info: list[dict[str, Any]] = [{}] * self.n_envs
+        for i in which.tolist():
+            result = self._results.pop(i)
+            self._put(i, result.obs)
+            reward[i], terminated[i], truncated[i], info[i] = result[1:5]
+            if result.begun is not None:
+                self._begun[i] = result.begun
+        return Step(self._obs, reward, terminated, truncated, info, which=which)
+
+    def _chosen(self) -> set[int] | None:
+        """Returns the environments whose results the given record says are next, None without one or at its end."""
+        assert self.wait_for is not None
+        turn = len(self._record) // self.wait_for
+        if self._given is None or turn > len(self._given):
+            return None
+        if turn == len(self._given):
+            warnings.warn(
+                f"the record of arrivals ends after {turn:,} turns; from here on results are taken as they arrive",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+            self._given = None
+            return None
+        return set(self._given[turn].tolist())
+
+    def _listen(self) -> None:
+        """Waits until at least one environment that steps on its own has answered."""
+        for i, answer in self.workers.first(self._pending).items():
+            self._arrived(i, answer)
+
+    def _arrived(self, i: int, answer: Any) -> None:
+        """Keeps the result of an environment. One whose worker was lost has none until its new episode has begun."""
+        self._heard({i: answer}, "step")
+        if isinstance(answer, Restarted):
+            self._lost[i] = answer
+            self.workers.send({i: ("reset", self._next_seed(i))})
+            return
+        self._pending.discard(i)
+        begun = self._parts(i, answer[0])
+        if i in self._lost:
+            before = [np.array(store[i]) for store in self._stores]
+            why = {RESTARTED: self._lost.pop(i).why}
+            self._results[i] = Result(before, 0.0, False, True, why, begun)
+            return
+        _, reward, terminated, truncated, info, final = answer
+        self._results[i] = Result(
+            begun if final is None else final, reward, terminated, truncated, info, None if final is None else begun
+        )
 
     def _heard(self, said: dict[int, Any], what: str) -> dict[int, Any]:
         """Returns the answers. Raises if one of them is a failure."""
@@ -163,13 +297,24 @@ class InWorkers(VectorEnv):
     def goals(self) -> GoalFunctions | None:
         return goals_module.goal_functions(self._make_one())
 
-    def snapshot(self) -> list[Any] | None:
+    def snapshot(self) -> Any:
+        while self._pending:
+            self._listen()
         said = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
         self._lost |= {i: answer for i, answer in said.items() if isinstance(answer, Restarted)}
+        for i in self._lost:
+            self._results.pop(i, None)
         known = all(isinstance(one, list) for one in said.values())  # None: not supported
-        return [said[i] for i in range(self.n_envs)] if known else None
+        states = [said[i] for i in range(self.n_envs)] if known else None
+        if states is None or self.wait_for is None:
+            return states
+        results = [to_saved(i, result) for i, result in self._results.items()]
+        return {"states": states, "wait_for": self.wait_for, "results": results, "arrivals": self.arrivals}
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
+        if isinstance(saved, dict) and {*saved} == {"states", "wait_for", "results", "arrivals"}:
+            self._restore_results(saved)
+            saved = saved["states"]
         snapshot.check_count(saved, self.n_envs)
         replies = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
         for i, answer in replies.items():
@@ -180,6 +325,24 @@ class InWorkers(VectorEnv):
             store[...] = leaf
         self._seed = None
         return [i for i, is_over in replies.items() if is_over]
+
+    def _restore_results(self, saved: Mapping[str, Any]) -> None:
+        """Restores the results that waited, and the record of those that were taken.
+
+        Raises:
+            CheckpointError, ValueError: if they are damaged, or of another ``wait_for`` or another record.
+        """
+        if self.wait_for is None or saved["wait_for"] != self.wait_for:
+            raise ValueError(f"the run had wait_for={saved['wait_for']!r}, and the environments have {self.wait_for}")
+        record = checked_record(saved["arrivals"], self.n_envs, self.wait_for)
+        given = None if self._given is None else self._given[: len(record)]
+        if given is not None and not np.array_equal(given, record):
+            raise ValueError("the record of arrivals that is given is of another run")
+        results = [from_saved(one, self._leaves) for one in convert(saved["results"], list[Any])]
+        if len({i for i, _ in results}) < len(results) or any(i >= self.n_envs for i, _ in results):
+            raise ValueError(f"the results that wait are not those of {self.n_envs} environments")
+        self._results = dict(results)
+        self._record = array("H", record.ravel().tolist())
 
     def close(self) -> None:
         """Closes the environments and ends the processes. Further calls do nothing."""

@@ -11,6 +11,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers import calls
+from rejeu.envs.workers.local import Processes, ProcessWorker
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
 from rejeu.envs.workers.process import Failure
 from rejeu.errors import BadEnvironmentError, WorkerError
@@ -61,7 +62,7 @@ class SubprocVecEnv(VecEnv):
         self._n_steps = 0
         self._last: list[Any] = [None] * len(env_fns)
         """The last observation of each environment."""
-        self.workers = Workers(env_fns, start_method, worker_timeout, restart_workers, preload=__name__)
+        self.workers = Workers(env_fns, Processes(start_method, preload=__name__), worker_timeout, restart_workers)
         first = self.workers.descriptions[0]
         super().__init__(len(env_fns), first.observation_space, first.action_space)
         self.metadata, self.render_mode = first.metadata, first.render_mode
@@ -74,7 +75,7 @@ class SubprocVecEnv(VecEnv):
     @property
     def processes(self) -> list[Any]:
         """The processes, one for each environment."""
-        return [worker.process for worker in self.workers.workers]
+        return [worker.process for worker in self.workers.workers if isinstance(worker, ProcessWorker)]
 
     def reset(self) -> Any:
         """Resets every environment, with the seeds and options set before, and returns the observations."""

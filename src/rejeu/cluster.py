@@ -1,0 +1,152 @@
+"""Connections to a Ray cluster: bounded waits, errors of one line, and no Ray left running when nothing uses it.
+
+Ray is imported here, when it is needed first. Only Ray Core is used.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import signal
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata
+from typing import Any
+
+from rejeu.errors import ClusterError, MissingExtra
+
+REACH_SECONDS = 10.0
+"""Seconds that a cluster has to accept a connection."""
+MATCHING = ("rejeu", "gymnasium", "numpy")
+"""Packages whose versions must be the same on all machines, like those of Python and Ray."""
+
+_connections: set[Connection] = set()
+"""Those that are open; Ray has one connection for the whole process."""
+_is_ours = False
+"""Whether Ray was connected here, and not by the user's program."""
+
+
+class Connection:
+    """The use of a Ray cluster by one part of a program. Mutable; see :func:`connect`."""
+
+    def __init__(self, ray: Any) -> None:
+        self.ray = ray
+        """The module ``ray``."""
+        _connections.add(self)
+
+    def close(self) -> None:
+        """Ends this use, and disconnects from Ray with the last one, unless the program itself connected to Ray.
+
+        Further calls do nothing. A cluster that was started for this process ends then.
+        """
+        global _is_ours
+        _connections.discard(self)
+        if _is_ours and not _connections:
+            _is_ours = False
+            self.ray.shutdown()
+
+
+def connect(address: str | None = None, purpose: str = "backend='ray'") -> Connection:
+    """Connects this process to a Ray cluster, or uses the connection that it has.
+
+    Args:
+        address: ``"HOST:PORT"`` of the cluster, or ``"auto"`` for the one that this machine belongs to. None: the one in the
+            environment variable ``RAY_ADDRESS``, else one that is started on this machine for this process.
+        purpose: what needs Ray, for the message if it is not installed.
+
+    Raises:
+        MissingExtra: if Ray is not installed.
+        ClusterError: if there is no such cluster, it does not answer, or has another version of Python or Ray.
+        ValueError: for an address of another form.
+    """
+    global _is_ours
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingExtra(purpose, "ray", "ray") from error
+    if not ray.is_initialized():
+        given = address or os.environ.get("RAY_ADDRESS") or None
+        if given is not None and given != "auto":
+            check_reachable(given)
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster that is started here reports nothing
+        try:
+            with signals_kept():
+                ray.init(
+                    given,
+                    include_dashboard=None if given else False,
+                    logging_level=logging.ERROR,
+                    configure_logging=False,
+                )
+        except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+            where = "a cluster on this machine" if given is None else f"the Ray cluster {given!r}"
+            raise ClusterError(f"cannot connect to {where}: {one_line(error)}") from error
+        _is_ours = True
+    return Connection(ray)
+
+
+def check_reachable(address: str) -> None:
+    """Connects to an address once, because Ray itself may wait for minutes.
+
+    Raises:
+        ValueError: unless the address is ``HOST:PORT``.
+        ClusterError: if nothing accepts the connection within :data:`REACH_SECONDS`.
+    """
+    host, _, port = address.rpartition(":")
+    if "://" in address:
+        raise ValueError(
+            f"the Ray address {address!r} is that of a client; run on a machine of the cluster, with 'auto'"
+        )
+    if not host or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
+        raise ValueError(f"the Ray address is {address!r}, expected HOST:PORT such as '10.0.0.1:6379', or 'auto'")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), REACH_SECONDS).close()
+    except OSError as error:
+        raise ClusterError(
+            f"the Ray cluster {address!r} cannot be reached: {error}; start it with `ray start --head`, or check the address"
+        ) from error
+
+
+@contextmanager
+def signals_kept() -> Iterator[None]:
+    """Restores the handlers of SIGINT and SIGTERM on exit, because Ray replaces them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            if handler is not None:
+                signal.signal(number, handler)
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that must be the same on all machines; empty for a package that has none."""
+    found = {"Python": ".".join(platform.python_version_tuple()[:2])}
+    for package in MATCHING:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = ""
+    return found
+
+
+def check_versions(there: Mapping[str, str], where: str) -> None:
+    """Raises ``ClusterError`` if the versions of another machine, called ``where``, differ from :func:`versions` here."""
+    here = versions()
+    wrong = [
+        f"{name} {there.get(name) or 'of no version'} and not {own}"
+        for name, own in here.items()
+        if there.get(name) != own
+    ]
+    if wrong:
+        raise ClusterError(f"{where} has {', '.join(wrong)} as here; install the same versions on all machines")
+
+
+def one_line(error: object) -> str:
+    """Returns the text of an error on one line, shortened to 400 characters."""
+    return " ".join(str(error).split())[:400]

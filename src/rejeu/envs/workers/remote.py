@@ -1,0 +1,219 @@
+"""Workers on the machines of a Ray cluster: one actor each.
+
+Ray places the actors, and ends them. Requests and answers do not go through Ray, because a call of an actor takes several
+times as long as a message: each actor connects to this process, with a token that is accepted once. The messages are
+pickles, as Ray's own are, and are not encrypted: a cluster must be in a network that it shares with nobody else.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector.utils import CloudpickleWrapper
+
+from rejeu import cluster, validation
+from rejeu.envs.workers import process
+from rejeu.envs.workers.process import TOKEN_BYTES, RemoteWorker, ToLeaves
+from rejeu.envs.workers.worker import LOOK_SECONDS, Starter, Worker, seconds_until
+from rejeu.errors import WorkerError
+
+SLOW_START_SECONDS = 30.0
+"""Seconds after which a warning says that a worker still waits for its place on the cluster."""
+TOKEN_SECONDS = 5.0
+"""Seconds that a connection has to present its token."""
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """What an environment in an actor reserves, and where."""
+
+    address: str | None = None
+    """``"HOST:PORT"`` of the cluster, or ``"auto"``; see :func:`rejeu.cluster.connect`."""
+    num_cpus: float = 1.0
+    """CPUs that each environment reserves; a fraction for simulators that mostly wait."""
+    num_gpus: float = 0.0
+    """GPUs that each environment reserves."""
+    memory: float | None = None
+    """Bytes of memory that each environment reserves, None for none."""
+    resources: Mapping[str, float] = field(default_factory=dict)
+    """Custom resources of the cluster that each environment reserves, by name."""
+
+    def __post_init__(self) -> None:
+        if self.address is not None and not isinstance(self.address, str):
+            raise TypeError(f"address={self.address!r} must be 'HOST:PORT' or 'auto'")
+        validation.coerce(self, ("num_cpus", "num_gpus"), validation.number, least=0)
+        validation.coerce(self, "memory", validation.number, optional=True, least=0)
+        if not isinstance(self.resources, Mapping):
+            raise TypeError(f"resources={self.resources!r} must be a dict of numbers by name")
+        resources = {
+            str(key): validation.number(f"resources[{key!r}]", one, least=0) for key, one in self.resources.items()
+        }
+        validation.assign(self, resources=resources)
+
+    def reserved(self) -> dict[str, Any]:
+        """Returns the reservation as options of a Ray actor."""
+        return {
+            "num_cpus": self.num_cpus,
+            "num_gpus": self.num_gpus,
+            "memory": self.memory,
+            "resources": dict(self.resources),
+        }
+
+
+class Actors(Starter):
+    """Starts workers as actors of a Ray cluster."""
+
+    advice = "backend='gymnasium-async' uses processes of this machine"
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        """Connects to the cluster, and listens for its workers.
+
+        Args:
+            options: the fields of :class:`RayOptions`.
+
+        Raises:
+            MissingExtra: if Ray is not installed.
+            ClusterError: if the cluster cannot be reached.
+            TypeError, ValueError: for invalid options.
+        """
+        self.options = validation.build(RayOptions, options)
+        self._connection = cluster.connect(self.options.address)
+        self.ray = self._connection.ray
+        try:
+            self._class = self.ray.remote(RemoteWorker)
+            self._server = socket.create_server((self.ray.util.get_node_ip_address(), 0), backlog=1024)
+        except BaseException:
+            self._connection.close()
+            raise
+        self._waiting: dict[bytes, ActorWorker] = {}
+        """Workers that have not connected yet, by their tokens."""
+
+    def start(self, number: int, make: Callable[[], gym.Env]) -> ActorWorker:
+        token = secrets.token_bytes(TOKEN_BYTES)
+        # Ray would restart a lost actor by itself, but with an environment that nobody has seeded.
+        actor = self._class.options(max_restarts=0, max_task_retries=0, **self.options.reserved()).remote()
+        worker = ActorWorker(number, make, self, actor, actor.serve.remote(self._server.getsockname()[:2], token))
+        self._waiting[token] = worker
+        return worker
+
+    def accept(self, seconds: float) -> None:
+        """Waits for one connection, for at most so many seconds. Those without a token that is expected are closed."""
+        self._server.settimeout(max(seconds, 0.01))
+        try:
+            connected, _ = self._server.accept()
+        except TimeoutError:
+            return
+        with suppress(OSError):
+            connected.settimeout(TOKEN_SECONDS)
+            token = process.receive_exactly(connected, TOKEN_BYTES)
+            known = next((one for one in self._waiting if hmac.compare_digest(one, token)), None)
+            if known is not None:
+                self._waiting.pop(known).connected(process.as_connection(connected))
+                return
+        connected.close()
+
+    def forget(self, worker: ActorWorker) -> None:
+        """Accepts no connection of a worker anymore."""
+        self._waiting = {token: one for token, one in self._waiting.items() if one is not worker}
+
+    def close(self) -> None:
+        self._server.close()
+        self._connection.close()
+
+
+class ActorWorker(Worker):
+    """A handle of a worker in an actor of a Ray cluster."""
+
+    def __init__(self, number: int, make: Callable[[], gym.Env], actors: Actors, actor: Any, served: Any) -> None:
+        """Takes an actor, and the reference to the end of its only task."""
+        super().__init__(number, None)
+        self._make, self._actors, self._actor, self._served = CloudpickleWrapper(make), actors, actor, served
+        self._node, self._ended = "", ""
+        self._is_connected = False
+
+    @property
+    def place(self) -> str:
+        return f"the Ray actor of environment {self.number}" + (f" on node {self._node}" if self._node else "")
+
+    @property
+    def alive(self) -> bool:
+        return not self._ended and not self._actors.ray.wait([self._served], timeout=0)[0]
+
+    def connected(self, pipe: Connection) -> None:
+        """Takes the connection that the actor has made."""
+        self.pipe, self._is_connected = pipe, True
+
+    def connect(self, deadline: float | None) -> None:
+        began, is_told = time.monotonic(), False
+        while not self._is_connected:
+            self._actors.accept(seconds_until(deadline, LOOK_SECONDS))
+            if self._is_connected:
+                break
+            if not self.alive:
+                raise WorkerError(f"{self.place} could not be started: {self.end()}")
+            if deadline is not None and time.monotonic() >= deadline:
+                raise WorkerError(f"{self.place} found no place on the cluster, {self._needs()}: {self.end()}")
+            if not is_told and time.monotonic() - began > SLOW_START_SECONDS:
+                is_told = True
+                warnings.warn(
+                    f"{self.place} waits for a place on the cluster, {self._needs()}", RuntimeWarning, stacklevel=2
+                )
+        hello = self.answer(deadline)
+        self._node = hello["node"]
+        try:
+            cluster.check_versions(hello["versions"], f"node {self._node}")
+        except BaseException:
+            self.end()
+            raise
+        self.asked, self.asked_at = "make", time.monotonic()
+        process.send(self.pipe, (self._make, ToLeaves()))
+
+    def _needs(self) -> str:
+        given = {key: value for key, value in self._actors.options.reserved().items() if value}
+        found = self._actors.ray.cluster_resources()
+        return f"of which each environment reserves {given}, and which has {found.get('CPU', 0):g} CPUs in all"
+
+    def stop(self) -> None:
+        if not self._ended:
+            with suppress(Exception):  # Ray may be gone already
+                self._actors.ray.kill(self._actor, no_restart=True)
+
+    def join(self, seconds: float) -> None:
+        self._actors.ray.wait([self._served], timeout=seconds)
+
+    def end(self) -> str:
+        if self._ended:
+            return self._ended
+        if self._is_connected:
+            self.pipe.close()
+        self._actors.forget(self)
+        self._ended = self._how_it_ended()
+        with suppress(Exception):  # Ray may be gone already
+            self._actors.ray.kill(self._actor, no_restart=True)
+        return self._ended
+
+    def _how_it_ended(self) -> str:
+        """Returns the error of an actor that has ended by itself, on one line."""
+        ray = self._actors.ray
+        if not ray.is_initialized():
+            return "Ray was shut down"
+        try:
+            ray.get(self._served, timeout=0.5)
+        except ray.exceptions.GetTimeoutError:
+            return "it was ended"
+        except ray.exceptions.RayTaskError as error:
+            return f"{type(error.cause).__name__}: {cluster.one_line(error.cause)}"
+        except ray.exceptions.RayError as error:
+            reason = str(error).strip().splitlines()
+            return cluster.one_line(reason[-1].partition(" Some common causes")[0]) if reason else type(error).__name__
+        return "it has returned"
