@@ -22,6 +22,7 @@ import rejeu
 from rejeu import cli, validation
 from rejeu.algorithms import ppo, sac
 from rejeu.cli import settings
+from rejeu.sweeps import processes
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -105,6 +106,14 @@ PREPARATIONS = {"docs/play.md": play_a_recording, "docs/networks.md": import_box
 
 
 @pytest.fixture
+def trainings_pretend(monkeypatch):
+    """Lets the trainings of a study run a program that pretends."""
+    pytest.importorskip("optuna")
+    fake = Path(__file__).parent / "tuning" / "fake_training.py"
+    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(fake), *words])
+
+
+@pytest.fixture
 def windows_close(monkeypatch):
     """Closes each window after some turns."""
     pygame = pytest.importorskip("pygame")
@@ -129,6 +138,8 @@ def test_the_examples_of_a_page_run(page, short, request, tmp_path, monkeypatch)
     if prepare := PREPARATIONS.get(page.relative_to(ROOT).as_posix()):
         prepare()
         request.getfixturevalue("windows_close")
+    if page.name == "tuning.md":
+        request.getfixturevalue("trainings_pretend")
     module = ModuleType("example")  # where classes and functions of the page are found again
     monkeypatch.setitem(sys.modules, "example", module)
     for block in blocks(page):
