@@ -1,6 +1,7 @@
 """The commands compare, runs and status."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,15 @@ def test_runs_are_whole_lines_in_a_pipe(runs, capsys):
     assert sum("long" * 30 in line and "finished" in line for line in lines) == 1
     assert any("PPO_0" in line and "1,000 (20%)" in line and "interrupted" in line for line in lines)
     assert any("DQN_0" in line and " in training" in line for line in lines)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows allows no such name")
+def test_names_cannot_control_the_terminal(runs, capsys):
+    write_run(runs / "a\x1b[2J\nb")
+    assert cli.main(["runs", str(runs)]) == 0
+    printed = capsys.readouterr().out
+    assert "\x1b" not in printed
+    assert r"a\x1b[2J\nb" in printed
 
 
 def test_runs_in_an_empty_folder(tmp_path, capsys):

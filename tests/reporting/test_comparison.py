@@ -101,6 +101,13 @@ def test_run_without_an_evaluation_before_the_end_of_the_shortest_is_left_out(tm
     assert "late has no evaluation within what is compared and is left out" in comparison.notes
 
 
+def test_absurd_returns_are_damage(tmp_path):
+    folder = write_run(tmp_path / "run")
+    with (folder / "episodes.csv").open("a", encoding="utf-8") as file:
+        file.write("1000,0,1e200,10,nan,10\n")
+    assert compare(folder, samples=10).groups[0].score[0] == 10
+
+
 def test_time_that_was_set_back_is_sorted(tmp_path):
     folder = write_run(tmp_path / "run", steps=40)
     rows = ["step,env,return,length,success,seconds", "10,0,1,10,,3", "20,0,2,10,,1", "30,0,3,10,,2", "40,0,4,10,,10"]

@@ -46,11 +46,18 @@ def test_only_some_columns(tmp_path):
         (b"a,b\n1,2\n3\n4,5\n", "left out of a.csv: 1 damaged row"),
         (b"a,b\n1," + b"2" * 70 + b"\n", "left out of a.csv: 1 damaged row"),
         (b"a,b\n1,2\n3,", "the last row of a.csv is incomplete and was left out"),
+        (b"a,b\r1,2\r3,4\n", "the header of a.csv is damaged"),
+        (b"a" * 200_000 + b"\n1\n", "the header of a.csv is damaged"),
     ],
 )
 def test_damage_is_noted(tmp_path, content, note):
     (tmp_path / "a.csv").write_bytes(content)
     assert read_table(tmp_path / "a.csv").notes == (note,)
+
+
+def test_file_of_a_spreadsheet_has_a_mark_before_the_header(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfstep,b\r\n1,2\r\n")
+    assert [*read_table(tmp_path / "a.csv").columns] == ["step", "b"]
 
 
 def test_missing_file(tmp_path):

@@ -85,9 +85,10 @@ def show(comparison: Comparison) -> None:
     tables.show(head, map(row_of, comparison.groups), 2)
     console = Console(highlight=False)
     console.print(comparison.definition, soft_wrap=True)
-    levels = {group.env_id: number(group.reached[2]) for group in comparison.groups}
+    levels = {group.env_id or "an unknown environment": number(group.reached[2]) for group in comparison.groups}
     console.print(
-        f"threshold: {', '.join(f'{level} on {escape(env)}' for env, level in levels.items())}", soft_wrap=True
+        f"threshold: {', '.join(f'{level} on {escape(env)}' for env, level in levels.items())}",
+        soft_wrap=True,
     )
     for one in comparison.improvements:
         better, other, env, text = map(escape, improvement_row(one))

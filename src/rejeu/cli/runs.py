@@ -37,8 +37,9 @@ def run(arguments: Runs) -> int:
 def show(rows: Sequence[Mapping[str, Any]]) -> None:
     """Prints the table."""
     head = ["run", "environment", "algorithm", "state", "steps", "best result"]
-    names = ("run", "env", "algorithm", "state")
-    tables.show(head, ([*(row[name] for name in names), steps_of(row), best_of(row)] for row in rows), 3)
+    names = ("env", "algorithm", "state")
+    cells = ([shown(row["run"], 300), *(row[name] for name in names), steps_of(row), best_of(row)] for row in rows)
+    tables.show(head, cells, 3)
 
 
 def steps_of(row: Mapping[str, Any]) -> str:

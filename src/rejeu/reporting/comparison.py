@@ -18,7 +18,7 @@ from rejeu.io import atomic
 from rejeu.io.records import shown
 from rejeu.reporting import statistics
 from rejeu.reporting.run_list import read_all
-from rejeu.reporting.runs import Run, flat
+from rejeu.reporting.runs import HUGE, Run, flat
 from rejeu.reporting.tabular import (
     cell,
     csv_text,
@@ -363,7 +363,7 @@ class Curve:
         else:  # of a run that is in progress or crashed only the means are known
             x = run.metrics.column("step" if axis == "steps" else "time/time_elapsed")
             y = run.metrics.column("rollout/ep_rew_mean")
-        known = np.isfinite(x) & np.isfinite(y)
+        known = np.isfinite(x) & (np.abs(y) < HUGE)
         x, y = x[known], y[known]
         if not len(x) or x[-1] <= 0:
             return cls(run, x[:0], y[:0], f"{name} has no episode yet and is left out")
@@ -376,7 +376,7 @@ class Curve:
         if score == "evaluation":
             table = run.evaluations
             when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
-            good = np.isfinite(when) & np.isfinite(value)
+            good = np.isfinite(when) & (np.abs(value) < HUGE)
             if not good.any():
                 return cls(run, x[:0], y[:0], f"{name} has no evaluation and is left out")
             curve.evaluation = when[good], value[good]

@@ -47,6 +47,8 @@ MAX_WORD = 10_000
 """Upper limit on the length of a word of the command that repeats a run, in characters."""
 MAX_STEP = 2**53
 """Upper limit on environment steps; larger numbers are damage."""
+HUGE = 1e100
+"""Magnitude from which a return is taken for damage."""
 RECENT = 60.0
 """Seconds since the last write up to which a run without a lock counts as running."""
 
@@ -141,7 +143,8 @@ class Run:
         limit = ["--minutes", f"{self.minutes_asked:g}"] if self.minutes_asked else ["--steps", str(self.steps_asked)]
         words += limit if self.minutes_asked or self.steps_asked else []
         options = {"seed": self.seed, "envs": self.n_envs, "backend": config.get("backend")}
-        options |= {name: config.get(name) for name in ("evaluate_every", "evaluate_episodes", "success_threshold")}
+        others = ("evaluate_every", "evaluate_episodes", "success_threshold", "video_every")
+        options |= {name: config.get(name) for name in others}
         for name, value in options.items():
             words += [] if value is None else [f"--{name.replace('_', '-')}", text(value)]
         if self.env_kwargs:

@@ -85,7 +85,10 @@ def read_table(path: Path, only: Collection[str] | None = None, skip_lines: int 
     header, _, body = data.partition(b"\n")
     if not header.strip():
         return Table({}, (*notes, f"{name} is empty"))
-    names = next(csv.reader([header.decode("utf-8", "replace").strip("\r")]), [])
+    try:
+        names = next(csv.reader([header.decode("utf-8-sig", "replace").strip("\r")]), [])
+    except csv.Error:  # a carriage return, or a name of 100,000 characters
+        return Table({}, (*notes, f"the header of {name} is damaged"))
     if len(names) > MAX_COLUMNS or len({*names}) < len(names):
         return Table({}, (*notes, f"{name} has {len(names)} columns, expected up to {MAX_COLUMNS} of different names"))
     if body and not body.endswith(b"\n"):

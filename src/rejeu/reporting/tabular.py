@@ -27,12 +27,12 @@ def interval_text(group: Any) -> str:
 def number(value: float) -> str:
     """Returns a number for a table, with four significant digits; ``-`` if it is not finite.
 
-    >>> number(1234567.0), number(0.012345), number(math.inf)
-    ('1,234,567', '0.01235', '-')
+    >>> number(1234567.0), number(0.012345), number(1e30), number(math.inf)
+    ('1,234,567', '0.01235', '1e+30', '-')
     """
     if not math.isfinite(value):
         return "-"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return f"{value:,.0f}" if 1000 <= abs(value) < 1e12 else f"{value:.4g}"
 
 
 def curve_parts(values: np.ndarray) -> dict[str, list[float]]:

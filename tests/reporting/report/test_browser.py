@@ -6,9 +6,11 @@ import time
 
 import pytest
 
+from rejeu.reporting.comparison import compare
 from rejeu.reporting.report import write_report
 from rejeu.reporting.report.live import make_server
 from tests.reporting.report.folders import write, write_hostile
+from tests.reporting.test_comparison import write_run
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright; pip install 'rejeu[browser]'")
@@ -120,6 +122,15 @@ def test_no_script_of_a_hostile_run_folder_runs(browser, tmp_path):
         assert page.locator("img").count() == 0
         assert opened.requests == []
         assert page.locator("h2").last.text_content() in ("Configuration", "Repeat this run")
+
+
+def test_comparison_with_long_labels_fits_the_window(browser, tmp_path):
+    runs = [write_run(tmp_path / str(seed), "A" * 200, env="E" * 300, seed=seed) for seed in range(2)]
+    (path,) = compare(runs, samples=10).save(tmp_path / "page.html")
+    with Opened(browser, path.as_uri(), width=390) as opened:
+        assert opened.page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert opened.messages == []
+        assert opened.requests == []
 
 
 def test_policy_stops_an_injected_script_and_requests(browser, report):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.reporting.runs import Episodes, Run
+from rejeu.reporting.runs import HUGE, Episodes, Run
 from rejeu.reporting.tables import Table
 
 MAX_DOTS = 1500
@@ -24,8 +24,6 @@ MAX_METRICS = 60
 """Most metrics that are drawn."""
 DIGITS = 6
 """Significant digits of the numbers in a page."""
-HUGE = 1e100
-"""Magnitude from which a return is taken for damage."""
 NORMAL = 1.959964
 """Half-width of the central 95 % of a standard normal distribution."""
 
