@@ -61,9 +61,17 @@ class Train(EnvironmentOptions):
     envs: Count = None
     """Environments stepped at once; by default the preset's, else 1."""
     backend: Name = None
-    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto."""
+    """auto, envpool, gymnasium, gymnasium-async or ray; by default the preset's, else auto."""
     restart_workers: Annotated[int, arg(metavar="N")] = 0
-    """With --backend gymnasium-async: how many worker processes that crashed or hung are restarted."""
+    """With --backend gymnasium-async or ray: how many workers that crashed, hung or were lost are restarted."""
+    wait_for: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
+    """With these: take the first K results that arrive, and do not wait for the other environments."""
+    arrivals: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """With --wait-for: take the results in the order of an earlier run, its arrivals.npy."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
+    """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
+    env_cpus: Annotated[float, arg(metavar="N", help_behavior_hint="(default: 1)")] = 1.0
+    """With --backend ray: CPUs that each environment reserves; a fraction for simulators that mostly wait."""
     seed: Count = None
     """Seeds everything; by default a random one."""
     seeds: Count = None
@@ -129,11 +137,15 @@ class Resume(RunOptions):
     workers: Count = None
     """Of a sweep or a study: runs or trials at once; by default half as many as there are cores."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
-    """Of a sweep: train on this Ray cluster, auto or HOST:PORT."""
+    """Of a sweep, or of a run with --backend ray: use this Ray cluster, auto or HOST:PORT."""
     steps: Count = None
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
     minutes: Minutes = None
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
+    restart_workers: Annotated[int, arg(metavar="N")] = 0
+    """As for rejeu train; for this part of the run."""
+    env_cpus: Annotated[float, arg(metavar="N", help_behavior_hint="(default: 1)")] = 1.0
+    """With --backend ray: CPUs that each environment reserves; a fraction for simulators that mostly wait."""
     no_report: Annotated[bool, FlagCreatePairsOff] = False
     """Write no report.html at the end."""
     no_video: Annotated[bool, FlagCreatePairsOff] = False

@@ -20,10 +20,13 @@ import gymnasium as gym
 from rejeu.cli import settings
 from rejeu.cli.commands import EnvironmentOptions, RunOptions
 from rejeu.cli.importing import find_id, find_wrapper, imports
-from rejeu.envs.make import VectorEnv, make_vector
+from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import are_plain, maker, register
 from rejeu.errors import CheckpointError
 from rejeu.reporting.video import make_rendering_env
+
+DEFAULT_WORKERS = WorkerOptions()
+"""All environments step together; lost workers are not restarted."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,9 @@ class Environment:
         """Returns a new one; ``more`` are further keyword arguments, such as ``render_mode``."""
         return Wrapped(maker(self.env_id, **{**self.kwargs, **more}), self.wrappers)()
 
-    def vector(self, n_envs: int, backend: str, seed: int | None, restart_workers: int = 0) -> VectorEnv:
+    def vector(
+        self, n_envs: int, backend: str, seed: int | None, workers: WorkerOptions = DEFAULT_WORKERS
+    ) -> VectorEnv:
         """Returns ``n_envs`` of them; the arguments are those of :func:`rejeu.make_vector`.
 
         Raises:
@@ -53,12 +58,12 @@ class Environment:
         """
         if not self.wrappers:
             return make_vector(
-                self.env_id, n_envs, backend, seed, restart_workers=restart_workers, **self.kwargs  # type: ignore[arg-type]
+                self.env_id, n_envs, backend, seed, **workers._asdict(), **self.kwargs  # type: ignore[arg-type]
             )  # fmt: skip
         if backend == "envpool":
             raise ValueError("the envpool backend takes no wrappers; use --backend gymnasium")
         make = Wrapped(maker(self.env_id, **self.kwargs), self.wrappers)
-        return make_vector(make, n_envs, backend, seed, restart_workers=restart_workers)  # type: ignore[arg-type]
+        return make_vector(make, n_envs, backend, seed, **workers._asdict())  # type: ignore[arg-type]
 
     def rendering(self) -> gym.Env:
         """Returns a new one that renders to arrays.

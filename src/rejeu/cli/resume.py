@@ -12,6 +12,7 @@ from rejeu.cli.commands import Resume
 from rejeu.cli.output import echo
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
+from rejeu.envs.make import WorkerOptions
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
 from rejeu.sweeps.folder import is_sweep
@@ -26,8 +27,6 @@ def run(arguments: Resume) -> int:
     """
     if is_sweep(arguments.run):
         return jsonout.run(sweep.resume, arguments)
-    if arguments.ray is not None:
-        raise ValueError(f"{arguments.run} is no sweep; --ray is for the folder of one")
     if StudyFolder(arguments.run).plan.is_file():
         return jsonout.run(tune.resume, arguments)
     if arguments.workers is not None:
@@ -40,10 +39,14 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     stopwatch = Stopwatch()
     folder = RunFolder(arguments.run)
     config = run_folder.read_config(folder)
+    if arguments.ray is not None and config.backend != "ray":
+        raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray is for these")
     require(config.log)
     kind = agent_of_file(config.algorithm, folder.config)
     environment = run_folder.of_run(folder, config, arguments)
-    with closing(environment.vector(config.n_envs, config.backend, config.seed)) as env:
+    ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
+    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=config.wait_for, ray=ray)
+    with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
             agent = kind.resume(folder.checkpoints, env)

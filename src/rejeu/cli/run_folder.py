@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from msgspec import Meta
 
 from rejeu.cli import environment
@@ -69,6 +70,11 @@ class RunFolder:
     def checkpoints(self) -> Path:
         """Folder of the checkpoints from which the run can be resumed."""
         return self.path / "checkpoints"
+
+    @property
+    def arrivals(self) -> Path:
+        """In which order the results of environments were taken, of a run with ``wait_for``; see :func:`read_arrivals`."""
+        return self.path / "arrivals.npy"
 
     @property
     def curve(self) -> Path:
@@ -139,6 +145,8 @@ class RunConfig:
     """Names of its wrappers, innermost first; used in messages only."""
     log: tuple[LogName, ...] = ()
     """Logs beside ``metrics.csv``."""
+    wait_for: Positive | None = None
+    """How many results are taken at a time, None where all environments step together; missing in older folders."""
 
 
 def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
@@ -195,6 +203,27 @@ def read_config(folder: RunFolder) -> RunConfig:
         return convert(content, RunConfig)
     except (Malformed, CheckpointError) as error:
         raise CheckpointError(f"{folder.config} is damaged: {error}") from None
+
+
+def write_arrivals(folder: RunFolder, arrivals: np.ndarray) -> None:
+    """Writes the order in which the results of environments were taken."""
+    with atomic.replacing(folder.arrivals) as file:
+        np.save(file, arrivals, allow_pickle=False)
+
+
+def read_arrivals(path: Path) -> np.ndarray:
+    """Returns what :func:`write_arrivals` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it is not a NumPy array without pickles.
+    """
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise CheckpointError(
+            f"{path} is not the arrivals.npy of a run: {' '.join(str(error).split())[:100]}"
+        ) from None
 
 
 def versions() -> dict[str, str | None]:

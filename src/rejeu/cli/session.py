@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from rejeu import errors, xla
 from rejeu.agents import Agent, load
 from rejeu.agents.training import restore_callbacks, run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
+from rejeu.cli import run_folder
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import as_dict, echo, noted_in, reporter, summary
 from rejeu.cli.run_folder import RunConfig, RunFolder
@@ -154,8 +156,16 @@ class Session(NamedTuple):
             save(agent, folder.agent)
             raise
         finally:
+            self.write_arrivals()
             agent.failed_writes.attempt(f"table {folder.episodes}", lambda: agent.history.write_csv(folder.episodes))
         return evaluate, not stop.requested and has_reached_goal(agent)
+
+    def write_arrivals(self) -> None:
+        """Writes the order in which the results of environments were taken, if they did not wait for each other."""
+        agent, folder = self.agent, self.folder
+        if agent.env is not None and (arrivals := agent.env.arrivals) is not None:
+            write = partial(run_folder.write_arrivals, folder, arrivals)
+            agent.failed_writes.attempt(f"order of arrival {folder.arrivals}", write)
 
     def callbacks(self, stop: Interrupt) -> tuple[Evaluate, list[Any]]:
         """Returns the callback that evaluates, and all callbacks of the run."""

@@ -19,7 +19,7 @@ from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo, header
 from rejeu.cli.run_folder import RunConfig
 from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
-from rejeu.envs.make import VectorEnv
+from rejeu.envs.make import VectorEnv, WorkerOptions
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
 from rejeu.interrupt import Interrupt
 from rejeu.io.records import shown
@@ -94,7 +94,15 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     backend = default_backend(made, preset)
     if backend == "envpool" and not is_envpool_installed() and made.is_registered():
         backend = "gymnasium"
-    return made.vector(n_envs, arguments.backend or backend, seed, arguments.restart_workers)
+    backend = arguments.backend or backend
+    ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if backend == "ray" else None
+    order = None if arguments.arrivals is None else run_folder.read_arrivals(arguments.arrivals)
+    return made.vector(
+        n_envs,
+        backend,
+        seed,
+        WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order, ray=ray),
+    )
 
 
 def default_backend(made: Environment, preset: Preset | None) -> str:
@@ -155,6 +163,7 @@ def make_config(
         seed=seed,
         n_envs=env.n_envs,
         backend=env.backend,
+        wait_for=env.wait_for,
         steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
         minutes=arguments.minutes,
         success_threshold=arguments.success_threshold,

@@ -161,6 +161,11 @@ class VectorEnv(ABC):
     def goals(self) -> GoalFunctions | None:
         """Returns the goal functions, or None for environments without goals."""
 
+    @property
+    def arrivals(self) -> np.ndarray | None:
+        """In which order results were taken, where environments do not wait for each other; None elsewhere."""
+        return None
+
     def identities(self) -> set[int]:
         """Returns the ids of the vector and, where they are known, of the environments in it.
 

@@ -192,12 +192,12 @@ class InWorkers(VectorEnv):
         return encoded if self._rows is None else [np.array(shared[i]) for shared in self._rows]
 
     @property
-    def arrivals(self) -> np.ndarray:
+    def arrivals(self) -> np.ndarray | None:
         """Which results :meth:`receive` has returned, ``uint16 (turns, wait_for)``: a row of indices for each call.
 
-        Given to :func:`rejeu.make_vector` again, they repeat a run.
+        Given to :func:`rejeu.make_vector` again, they repeat a run. None without ``wait_for``.
         """
-        return np.frombuffer(self._record.tobytes(), INDEX).reshape(-1, self.wait_for or self.n_envs)
+        return None if self.wait_for is None else np.array(self._record, INDEX).reshape(-1, self.wait_for)
 
     def send(self, action: np.ndarray) -> None:
         """Gives actions to the environments that await one, which step on their own, and reset where an episode ends.
