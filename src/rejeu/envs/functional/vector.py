@@ -18,6 +18,7 @@ from jax import Array
 from rejeu import prng
 from rejeu.envs.base import Step, VectorEnv, success_of
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
+from rejeu.envs.functional.validation import check
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed
 from rejeu.spaces import cast, leaves
@@ -132,6 +133,7 @@ class JaxVector(VectorEnv):
 
     Raises:
         ValueError: if ``n_envs`` is no positive whole number.
+        BadEnvironmentError: if the environment cannot be compiled, or returns something else than it declares.
 
     >>> from rejeu.envs.functional import make
     >>> vector = JaxVector(make("jax/Pendulum-v1"), n_envs=4, seed=0)
@@ -153,6 +155,7 @@ class JaxVector(VectorEnv):
     ) -> None:
         if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
             raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
+        check(env)
         self.env = env
         self.n_envs = n_envs
         self.env_id = type(env).__name__ if env_id is None else env_id
