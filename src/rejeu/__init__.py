@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         load,
         register,
     )
+    from rejeu.agents.together import train_seeds
     from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
     from rejeu.buffers.replay_memory import ReplayMemory
     from rejeu.buffers.uniform import ReplayBuffer
@@ -68,6 +69,7 @@ __version__ = "0.1.0"
 _MODULES = {
     "rejeu.agents": "A2C AGENTS DDPG DQN PPO QRDQN SAC TD3 TQC CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent RecurrentPPO "
     "load register",
+    "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",
     "rejeu.buffers.uniform": "ReplayBuffer",
@@ -139,6 +141,7 @@ __all__ = [
     "register",
     "show_videos",
     "sweep",
+    "train_seeds",
     "tune",
     "write_report",
 ]

@@ -21,6 +21,7 @@ import numpy as np
 from rejeu import spaces, validation, xla
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import RunFolder, Stateful
+from rejeu.core import Algorithm
 from rejeu.envs.make import Backend, VectorEnv
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
@@ -213,11 +214,15 @@ class BaseAgent(ABC):
         noise = self.make_noise()
         if noise is not None:
             check_fits(noise, action_space)
-        algorithm = self.algorithm.make(self.config, observation_space, action_space)
-        if self.config.normalize is not None:
-            explorer = exploration.make(algorithm, noise)
-            algorithm = normalized(algorithm, explorer, self.obs_leaves, self.config.normalize, self.config.gamma)
-        self.learner = Learner(algorithm, noise, self.config.nonfinite == "skip")
+        self.learner = Learner(self.algorithm_of(self.config), noise, self.config.nonfinite == "skip")
+
+    def algorithm_of(self, config: Any) -> Algorithm:
+        """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
+        algorithm = self.algorithm.make(config, self.observation_space, self.action_space)
+        if config.normalize is None:
+            return algorithm
+        explorer = exploration.make(algorithm, self.make_noise())
+        return normalized(algorithm, explorer, self.obs_leaves, config.normalize, config.gamma)
 
     def n_threads(self, n_envs: int) -> int:
         """Returns how many threads JAX should use: all for images and large layers, else one."""

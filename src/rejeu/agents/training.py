@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -114,16 +114,42 @@ def train(
     The other arguments are those of :meth:`Agent.learn`.
     """
     warn_without_noise(agent)
-    run, bar = agent.run, []
+    bar = []
     if progress_bar:
-        bar = [ProgressBar(call.n_steps, call.seconds, taken=run.step - call.first_step, spent=call.spent)]
-    callbacks = in_order([*(() if callback is None else [callback] if callable(callback) else callback), *bar])
+        taken = agent.run.step - call.first_step
+        bar = [ProgressBar(call.n_steps, call.seconds, taken=taken, spent=call.spent)]
+    callbacks = in_order([*listed(callback), *bar])
+    agent.stops = device.stops_of(agent, call, callbacks)
+    with session(agent, call, callbacks, tb_log_name, sinks) as record:
+        try:
+            with Interrupt() as interrupt:
+                for turn in agent.loop(*horizon(agent, call)):
+                    if record(turn) or interrupt.requested:
+                        break
+            agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
+            finite.settle(agent)
+        except NonFiniteUpdate as broken:
+            raise finite.reported(agent, broken) from None
+
+
+@contextmanager
+def session(
+    agent: BaseAgent,
+    call: TrainingCall,
+    callbacks: Sequence[Callback],
+    tb_log_name: str | None = None,
+    sinks: Iterable[Sink] = (),
+) -> Iterator[Callable[[Progress], bool]]:
+    """While entered, the agent is learning: outputs are open, and callbacks were told.
+
+    Yields a function that is called after every turn of the loop. It records the turn, calls the callbacks, and returns
+    whether training is over.
+    """
     agent.training_call = call
     agent.callbacks = stateful(callbacks)
     agent.interrupted, agent.interrupted_by = False, None
-    run.success_threshold = agent.success_threshold
+    agent.run.success_threshold = agent.success_threshold
     agent.failed_writes.forget_written()
-    agent.stops = device.stops_of(agent, call, callbacks)
     with ExitStack() as stack:
         stack.callback(agent.failed_writes.warn)
         outputs = open_outputs(agent, sinks, tb_log_name, stack)
@@ -132,21 +158,27 @@ def train(
             output.write_config(run_config(agent, call))
         stack.enter_context(marked_as_learning(agent, outputs))
         stack.enter_context(listening(agent, callbacks))
-        try:
-            with Interrupt() as interrupt:
-                first = run.step
-                remaining = None if call.last_step is None else call.last_step - first
-                for turn in agent.loop(remaining, lambda taken: call.progress(first + taken, run.episode)):
-                    record_turn(agent, call, turn, outputs)
-                    answers = [callback(agent, turn) for callback in callbacks]
-                    agent.failed_writes.retry_if_due()
-                    stopped = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
-                    if stopped or interrupt.requested or call.is_over(turn.step, run.episode):
-                        break
-            agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
-            finite.settle(agent)
-        except NonFiniteUpdate as broken:
-            raise finite.reported(agent, broken) from None
+
+        def record(turn: Progress) -> bool:
+            record_turn(agent, call, turn, outputs)
+            answers = [callback(agent, turn) for callback in callbacks]
+            agent.failed_writes.retry_if_due()
+            stopped = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
+            return stopped or call.is_over(turn.step, agent.run.episode)
+
+        yield record
+
+
+def horizon(agent: BaseAgent, call: TrainingCall) -> tuple[int | None, Callable[[int], float]]:
+    """Returns the number of steps that are left to take, and the progress of schedules after a number of them."""
+    run, first = agent.run, agent.run.step
+    remaining = None if call.last_step is None else call.last_step - first
+    return remaining, lambda taken: call.progress(first + taken, run.episode)
+
+
+def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:
+    """Returns one callback, several or none as a list."""
+    return [] if callback is None else [callback] if callable(callback) else [*callback]
 
 
 def in_order(callbacks: Iterable[Callback]) -> list[Callback]:

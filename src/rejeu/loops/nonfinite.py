@@ -104,6 +104,8 @@ class NonFiniteUpdate(Exception):
         self.state = state
         """The state before it; None if the update was undone."""
         self.batches, self.clock, self.in_a_row = batches, clock, in_a_row
+        self.which = 0
+        """Its run, where several are trained together."""
 
 
 class Call(NamedTuple):

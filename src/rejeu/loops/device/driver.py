@@ -12,6 +12,7 @@ from rejeu.loops.checks import check_state
 from rejeu.loops.device.machine import Machine
 from rejeu.loops.device.turns import NO_LIMIT, Limits
 from rejeu.loops.learner import Learner
+from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.run import Progress, Run
 from rejeu.loops.timing import Timer
 
@@ -41,7 +42,8 @@ def train(
     progress: Callable[[int], float],
     stops: Stops,
     begin: Callable[[Run], None],
-) -> Iterator[list[Progress]]:
+    active: Sequence[int] = (0,),
+) -> Iterator[list[Progress | None]]:
     """Trains runs of equal settings for exactly ``n_steps`` environment steps each; yields after every chunk.
 
     Args:
@@ -52,52 +54,64 @@ def train(
         progress: returns the progress of schedules after a number of steps.
         stops: where chunks must end.
         begin: starts episodes in the environments of a run.
+        active: indices of the runs that are trained, ascending. The caller may remove some between chunks: such runs stay
+            as they are, and None stands for what they did. There must be one.
 
     Raises:
         BadEnvironmentError: if a reward or an observation is not finite.
         NonFiniteError: if the state is not finite when training begins.
         NonFiniteUpdate: if an update leaves numbers that are not finite.
     """
-    n_envs, first = runs[0].env.n_envs, runs[0].step
+    n_envs, first = runs[0].env.n_envs, runs[active[0]].step
     last = None if n_steps is None else first + n_steps
     for run in runs:
         check_state(run, learner)
     timers = [Timer(run.seconds) for run in runs]
     pace = Pace(machine.capacity)
     known: list[Any] = []
-    while last is None or runs[0].step < last:
+    while active and (last is None or runs[active[0]].step < last):
+        leader = runs[active[0]]
         for timer in timers:
             timer.lap()
         for run in runs:
             if run.obs is None or run.env.must_reset:
                 begin(run)
         if not known or any(now is not then for now, then in zip(held(runs), known, strict=True)):
-            machine.push(runs, progress(runs[0].step - first))
+            machine.push(runs, leader, progress(leader.step - first))
         for timer in timers:
             timer.lap("replay")
-        step = runs[0].step
+        step = leader.step
         n_turns = min(pace.turns, turns_left(step, n_envs, last, stops))
         limits = Limits(
             np.int32(n_turns),
             np.uint32(NO_LIMIT if last is None else last),
             schedule(progress, step - first, n_turns, n_envs, machine.capacity, last, first),
             np.int32(ALL),
-            np.uint32(runs[0].learn_from),
-            np.bool_(machine.uses_part(runs[0], n_turns, last)),
+            np.uint32(leader.learn_from),
+            np.bool_(machine.uses_part(leader, n_turns, last)),
         )
         began = time.perf_counter()
         machine.call(limits)
-        for i, run in enumerate(runs):
+        for i in active:
             if machine.fault(i):
-                machine.raise_fault(run, limits)
-        turns = []
-        for i, (run, timer) in enumerate(zip(runs, timers, strict=True)):
-            timer.lap("update")
-            turns.append(machine.pull(i, run))
-            timer.lap("replay")
+                raise_fault(machine, i, runs[i], limits)
+        turns: list[Progress | None] = [None] * len(runs)
+        for i in active:
+            timers[i].lap("update")
+            turns[i] = machine.pull(i, runs[i])
+            timers[i].lap("replay")
         pace.note(n_turns, time.perf_counter() - began)
         known = held(runs)
         yield turns
+
+
+def raise_fault(machine: Machine, which: int, run: Run, limits: Limits) -> None:
+    """Raises the error of a run in a chunk; an error of an update says which run it is."""
+    try:
+        machine.raise_fault(run, limits)
+    except NonFiniteUpdate as error:
+        error.which = which
+        raise
 
 
 def held(runs: Sequence[Run]) -> list[Any]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.loops.device.driver import Stops, train
 from rejeu.loops.device.off_policy_machine import OffPolicyMachine
 from rejeu.loops.device.on_policy_machine import OnPolicyMachine
+from rejeu.loops.device.variants import Variants
 from rejeu.loops.learner import Learner
 from rejeu.loops.off_policy import begin_episodes
 from rejeu.loops.on_policy import begin_episodes as begin_rollouts
@@ -28,8 +29,9 @@ def off_policy(
     The other arguments and the errors are those of :func:`rejeu.loops.off_policy.off_policy`.
     """
     machine = OffPolicyMachine([run], learner, config, stops)
-    for turns in train(machine, [run], learner, n_steps, progress, stops, begin_episodes):
-        yield turns[0]
+    for (turn,) in train(machine, [run], learner, n_steps, progress, stops, begin_episodes):
+        assert turn is not None
+        yield turn
 
 
 def on_policy(
@@ -45,5 +47,39 @@ def on_policy(
     The other arguments and the errors are those of :func:`rejeu.loops.on_policy.on_policy`.
     """
     machine = OnPolicyMachine([run], learner, config, stops)
-    for turns in train(machine, [run], learner, n_steps, progress, stops, lambda run: begin_rollouts(run, config)):
-        yield turns[0]
+    for (turn,) in train(machine, [run], learner, n_steps, progress, stops, lambda run: begin_rollouts(run, config)):
+        assert turn is not None
+        yield turn
+
+
+def together(
+    runs: Sequence[Run],
+    learner: Learner,
+    config: OffPolicyConfig | OnPolicyConfig,
+    n_steps: int | None,
+    progress: Callable[[int], float],
+    stops: Stops,
+    active: Sequence[int],
+    variants: Variants | None = None,
+    hyper: Sequence[dict[str, float]] | None = None,
+) -> Iterator[list[Progress | None]]:
+    """Trains several runs of equal settings in one program; yields what each has done after every chunk.
+
+    Args:
+        runs: mutated.
+        learner: of one of them.
+        config: its hyperparameters.
+        n_steps: environment steps of each run.
+        progress: of schedules, after a number of steps.
+        stops: where chunks must end.
+        active: see :func:`rejeu.loops.device.driver.train`.
+        variants: what makes the algorithm, if hyperparameters differ.
+        hyper: those that differ, by run.
+    """
+    differing = [{}] * len(runs) if hyper is None else hyper
+    if isinstance(config, OnPolicyConfig):
+        on = OnPolicyMachine(runs, learner, config, stops, variants, differing)
+        yield from train(on, runs, learner, n_steps, progress, stops, lambda run: begin_rollouts(run, config), active)
+    else:
+        off = OffPolicyMachine(runs, learner, config, stops, variants, differing)
+        yield from train(off, runs, learner, n_steps, progress, stops, begin_episodes, active)

@@ -34,7 +34,9 @@ class Machine(ABC):
         self.store: Any = None
         """The experience, which is donated to every chunk."""
         self.carries: list[Any] = []
-        """The small arrays of the carry after the last chunk on the host, by run."""
+        """The carry after the last chunk by run, on the host apart from large arrays of a single run."""
+        self.experience: list[Any] = []
+        """What :meth:`fetch` returned after the last chunk, by run."""
         self.reports: list[Report] = []
         """The reports of the last chunk on the host, by run."""
 
@@ -48,18 +50,20 @@ class Machine(ABC):
         """Returns the carry of a run, which may choose its first actions."""
 
     @abstractmethod
+    def begin(self, runs: Sequence[Run]) -> None:
+        """Notes where the experience of the runs ends, before they are put onto the device."""
+
+    @abstractmethod
     def store_of(self, run: Run) -> Any:
         """Returns the experience of a run, on the device."""
 
     @abstractmethod
-    def put(self, run: Run, carry: Any, store: Any) -> None:
-        """Puts counters and experience into a run.
+    def fetch(self, carries: Sequence[Any]) -> list[Any]:
+        """Returns the new experience of each run, on the host."""
 
-        Args:
-            run: mutated.
-            carry: on the host, apart from large arrays.
-            store: on the device.
-        """
+    @abstractmethod
+    def put(self, run: Run, carry: Any, experience: Any) -> None:
+        """Puts counters and new experience into a run, which is mutated."""
 
     @abstractmethod
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
@@ -69,24 +73,28 @@ class Machine(ABC):
     def batch(self, run: Run, clock: Clock, number: int) -> Transition | Rollout:
         """Returns the batch of a gradient step that was left out in the last turn, the ``number``-th of the turn."""
 
-    def push(self, runs: Sequence[Run], progress: float) -> None:
-        """Puts the runs onto the device."""
+    def push(self, runs: Sequence[Run], leader: Run, progress: float) -> None:
+        """Puts the runs onto the device, with the counters of ``leader``."""
+        self.begin(runs)
         carries = [self.carry_of(run, progress) for run in runs]
         self.carry = stacked(carries)
         if self.n > 1:
-            self.carry = self.carry._replace(counts=carries[0].counts)
+            self.carry = self.carry._replace(counts=carries[[run is leader for run in runs].index(True)].counts)
         self.store = stacked([self.store_of(run) for run in runs])
 
     def call(self, limits: Limits) -> None:
         """Takes a chunk of turns."""
         take = take_chunk if self.n == 1 else take_chunks
         self.carry, self.store, report = take((self.program, self.env, self.carry, limits), self.store)
-        # Networks and environments stay on the device; everything else is small and comes to the host at once.
-        large = {"state": None, "explorer": None, "hyper": None, "counts": None}
-        small = self.carry._replace(**large, players=self.carry.players._replace(env=None))
-        small, counts, report = copies((small, self.carry.counts, report))
-        self.reports = unstacked(report, self.n)
-        self.carries = [one._replace(counts=counts) for one in unstacked(small, self.n)]
+        counts, self.reports = copies(self.carry.counts), unstacked(copies(report), self.n)
+        if self.n == 1:  # networks and environments stay on the device; everything else is small
+            players = self.carry.players
+            small = copies(players._replace(env=None))._replace(env=players.env)
+            self.carries = [self.carry._replace(players=small, counts=counts, in_a_row=copies(self.carry.in_a_row))]
+        else:
+            views = jax.device_get(self.carry._replace(counts=None))
+            self.carries = [one._replace(counts=counts) for one in unstacked(views, self.n)]
+        self.experience = self.fetch(self.carries)
 
     def fault(self, which: int) -> bool:
         """Returns whether the last chunk left something that is not finite in a run."""
@@ -98,16 +106,15 @@ class Machine(ABC):
         """Puts what the last chunk did into a run, and returns it."""
         carry, report, first_step = self.carries[which], self.reports[which], run.step
         run.step = int(carry.counts.step)
-        run.state = unstacked(self.carry.state, self.n)[which]
-        run.carry = unstacked(self.carry.explorer, self.n)[which]
-        put_players(run, carry.players, unstacked(self.carry.players.env, self.n)[which])
+        run.state, run.carry = carry.state, carry.explorer
+        put_players(run, carry.players)
         run.n_updates += int(report.n_updates)
         run.monitor.n_skipped += int(report.n_bad)
         if report.n_updates:
             run.metrics = Readings.of(
                 {name: jnp.asarray(value) for name, value in report.metrics.items()}, report.n_bad
             )
-        self.put(run, carry, unstacked(self.store, self.n)[which])
+        self.put(run, carry, self.experience[which])
         episodes = episodes_of(run, report.log, first_step, run.step)
         return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))
 
@@ -122,7 +129,7 @@ class Machine(ABC):
         for i in range(int(limits.n_turns)):
             progress = np.roll(limits.progress, -i)
             one = limits._replace(n_turns=np.int32(1), progress=progress)
-            self.push([run], float(progress[0]))
+            self.push([run], run, float(progress[0]))
             self.call(one)
             if self.carries[0].players.bad:
                 outcome: Any = self.reports[0].outcome
@@ -138,12 +145,12 @@ class Machine(ABC):
         in_a_row = int(self.carries[0].in_a_row) if self.program.skips else 0
         number = 0
         while True:
-            self.push([run], float(limits.progress[0]))
+            self.push([run], run, float(limits.progress[0]))
             self.call(limits._replace(most_updates=np.int32(number + 1)))
             if self.fault(0):
                 break
             number += 1
-        self.push([run], float(limits.progress[0]))
+        self.push([run], run, float(limits.progress[0]))
         self.call(limits._replace(most_updates=np.int32(number)))
         carry = self.carries[0]
         clock = Clock(carry.counts.step, carry.players.episode, limits.progress[1])

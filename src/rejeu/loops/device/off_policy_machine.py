@@ -14,13 +14,12 @@ from jax import Array
 from rejeu import spaces
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers.device import DeviceReplay, DeviceRing, uploaded, written
-from rejeu.buffers.ring import Ring
 from rejeu.core import Clock, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.loops.device.driver import Stops, capacity_of
 from rejeu.loops.device.machine import Machine
 from rejeu.loops.device.off_policy import Carry, Counts, OffPolicyProgram, choose, draw, draws
-from rejeu.loops.device.transfer import copies, players_of, rounded_up
+from rejeu.loops.device.transfer import copies, players_of, rounded_up, unstacked
 from rejeu.loops.device.variants import Variants
 from rejeu.loops.learner import Learner
 from rejeu.loops.run import Run
@@ -52,6 +51,8 @@ class OffPolicyMachine(Machine):
             variants,
         )
         super().__init__(runs, program)
+        self.heads: np.ndarray = np.zeros(0)
+        """Times of the newest rows that the hosts' rings have, ``int64 (n_runs, n_envs)``."""
         self.hyper = {id(run): one for run, one in zip(runs, hyper, strict=True)}
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
@@ -76,13 +77,24 @@ class OffPolicyMachine(Machine):
             carry = carry._replace(action=jnp.array(run.action))
         return carry
 
+    def begin(self, runs: Sequence[Run]) -> None:
+        self.heads = np.stack([run.replay.ring.head for run in runs])
+
     def store_of(self, run: Run) -> DeviceRing:
         return uploaded(self.program.replay, run.replay.ring)
 
-    def put(self, run: Run, carry: Any, store: DeviceRing) -> None:
-        run.action = carry.action
+    def fetch(self, carries: Sequence[Any]) -> list[Any]:
+        heads = np.asarray(self.store.head).astype(np.int64).reshape(self.n, -1)
+        size = rounded_up(int((heads - self.heads).max()) + 1, self.program.replay.rows)
+        first = self.heads.astype(np.int32)
+        rows = rows_from(self.program.replay, self.store, first if self.n > 1 else first[0], size)
+        self.heads = heads
+        return list(zip(heads, unstacked(jax.device_get(rows), self.n), strict=True))
+
+    def put(self, run: Run, carry: Any, experience: Any) -> None:
+        run.action = np.array(carry.action)
         run.owed, run.steps_since_update = int(carry.counts.owed), int(carry.counts.since_update)
-        download(self.program.replay, store, run.replay.ring)
+        run.replay.ring.write(*experience)
 
     def batch(self, run: Run, clock: Clock, number: int) -> Transition:
         batch = drawn(self.program.replay, self.env, self.store, self.carry.key, clock.step, np.uint32(number + 1))
@@ -107,15 +119,10 @@ def drawn(
 
 @eqx.filter_jit
 def rows_from(replay: DeviceReplay, ring: DeviceRing, first: Any, size: int) -> dict[str, Any]:
-    """Returns rows of the ring; see :func:`rejeu.buffers.device.written`."""
-    return written(replay, ring, first, size)
-
-
-def download(replay: DeviceReplay, ring: DeviceRing, host: Ring) -> None:
-    """Writes the rows that are new on the device into the ring of the host."""
-    head = np.asarray(ring.head).astype(np.int64)
-    size = rounded_up(int((head - host.head).max()) + 1, replay.rows)
-    host.write(head, jax.device_get(rows_from(replay, ring, host.head.astype(np.int32), size)))
+    """Returns rows of one ring, or of several; see :func:`rejeu.buffers.device.written`."""
+    if first.ndim == 1:
+        return written(replay, ring, first, size)
+    return jax.vmap(lambda ring, first: written(replay, ring, first, size))(ring, first)
 
 
 def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:

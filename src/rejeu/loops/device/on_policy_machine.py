@@ -14,7 +14,7 @@ from rejeu.core import Clock, Rollout
 from rejeu.loops.device.driver import Stops, capacity_of
 from rejeu.loops.device.machine import Machine
 from rejeu.loops.device.on_policy import Carry, Counts, OnPolicyProgram, Steps, rollout_of
-from rejeu.loops.device.transfer import copies, players_of
+from rejeu.loops.device.transfer import copies, players_of, unstacked
 from rejeu.loops.device.variants import Variants
 from rejeu.loops.learner import Learner
 from rejeu.loops.run import Run
@@ -86,7 +86,17 @@ class OnPolicyMachine(Machine):
             carry=carry,
         )
 
-    def put(self, run: Run, carry: Any, store: Steps) -> None:
+    def begin(self, runs: Sequence[Run]) -> None:
+        """Does nothing: rollouts are fetched as a whole."""
+
+    def fetch(self, carries: Sequence[Any]) -> list[Any]:
+        if carries[0].counts.length:
+            return unstacked(jax.device_get(self.store), self.n)
+        beginnings = jax.device_get((self.store.started, self.store.carry))
+        return [self.store._replace(started=a, carry=b) for a, b in unstacked(beginnings, self.n)]
+
+    def put(self, run: Run, carry: Any, experience: Any) -> None:
+        store: Steps = experience
         buffer, n = run.replay, int(carry.counts.length)
         buffer.length = n
         if n:

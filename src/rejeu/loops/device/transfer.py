@@ -32,15 +32,14 @@ def players_of(run: Run) -> Players:
     )
 
 
-def put_players(run: Run, players: Any, vstate: Any) -> None:
+def put_players(run: Run, players: Any) -> None:
     """Puts the environments and their episodes into a run, as the host's loops leave them.
 
     Args:
         run: mutated.
-        players: :class:`Players` with arrays on the host.
-        vstate: the state of the environments, on the device.
+        players: :class:`Players` with arrays on the host, apart from the state of the environments.
     """
-    run.env.state = vstate
+    run.env.state = players.env
     run.obs = players.obs
     run.ended = players.ended
     run.episode_return = players.value.astype(np.float64)

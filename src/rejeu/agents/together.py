@@ -1,0 +1,266 @@
+"""Several runs in one program: seeds, and values of numeric hyperparameters.
+
+The runs are ordinary agents with environments, histories, callbacks and files of their own. Only the chunks of turns between
+callbacks are computed together, by ``jax.vmap`` over the runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from typing import Any, TypeVar
+
+import jax
+
+from rejeu.agents import device, training
+from rejeu.agents.agent import Agent
+from rejeu.agents.base import whole_seed
+from rejeu.callbacks.base import Callback
+from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.envs.functional.registry import is_functional
+from rejeu.exploration import explorer as exploration
+from rejeu.interrupt import Interrupt
+from rejeu.loops import finite
+from rejeu.loops.device import loops
+from rejeu.loops.device.driver import Stops
+from rejeu.loops.device.variants import Variants
+from rejeu.loops.nonfinite import NonFiniteUpdate
+from rejeu.loops.training_call import TrainingCall
+from rejeu.reporting.logging import Sink
+
+A = TypeVar("A", bound=Agent)
+STATIC = ("buffer_size", "learning_starts", "batch_size", "n_steps", "n_epochs")
+"""Whole numbers on which the shapes or the course of a program depend, which runs of one program therefore share."""
+IN_REPLAY = ("gamma",)
+"""Numbers that the replay buffer on the device is compiled with."""
+
+
+def train_seeds(
+    kind: type[A],
+    policy: str,
+    env: str | FunctionalEnv,
+    total_timesteps: int | None = None,
+    *,
+    seeds: int | Sequence[int],
+    n_envs: int = 1,
+    minutes: float | None = None,
+    callback: Callable[[A], Callback | Iterable[Callback] | None] | None = None,
+    log_interval: int = 4,
+    progress_bar: bool = False,
+    **settings: Any,
+) -> list[A]:
+    """Trains independent runs in one program on the device, and returns their agents.
+
+    Every run is that of an agent with the same seed and settings that was trained alone, up to the rounding of sums, whose
+    order differs (see ``docs/device.md``).
+
+    Args:
+        kind: the class of the agents, such as ``rejeu.SAC``.
+        policy: as for the agent.
+        env: the id of an environment in JAX, or such an environment.
+        total_timesteps: environment steps of each run.
+        seeds: how many runs, with the seeds 0, 1, ...; or their seeds.
+        n_envs: environments of each run.
+        minutes: stop after this wall time.
+        callback: called with each agent before training; returns its callbacks.
+        log_interval: episodes of a run between two rows of its statistics.
+        progress_bar: show the progress of the first run, which is that of all.
+        settings: arguments of the agent. A list of numbers in place of a float hyperparameter, such as
+            ``learning_rate=[1e-4, 3e-4, 1e-3]``, trains every seed with each of them, or with each combination of several.
+
+    Returns:
+        The agents: for the first values of such hyperparameters one of each seed, then for the next.
+
+    Raises:
+        ValueError: if the environment is not one in JAX, or a setting cannot be trained on the device or cannot differ.
+
+    >>> import rejeu
+    >>> agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 60, seeds=2, learning_rate=[1e-4, 1e-3])
+    >>> [(agent.seed, agent.config.learning_rate) for agent in agents]
+    [(0, 0.0001), (1, 0.0001), (0, 0.001), (1, 0.001)]
+    """
+    if not (isinstance(env, FunctionalEnv) or is_functional(env)):
+        raise ValueError(
+            f"env={env!r}: several seeds in one program need the id of an environment in JAX, such as 'jax/Pendulum-v1', or "
+            "a FunctionalEnv; for others train one agent after the other, or use rejeu train ENV --seeds N"
+        )
+    numbers = [*range(seeds)] if isinstance(seeds, int) else [whole_seed(one) for one in seeds]
+    if not numbers:
+        raise ValueError(f"seeds={seeds!r} must be a number of at least 1, or a sequence of seeds")
+    lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
+    fixed = {name: value for name, value in settings.items() if name not in lists}
+    values = [dict(zip(lists, one, strict=True)) for one in itertools.product(*lists.values())]
+    agents: list[A] = []
+    for one in values:
+        vector = lambda seed: first_envs(kind, env, n_envs, seed)  # noqa: E731
+        first = kind(policy, vector(numbers[0]), seed=numbers[0], **fixed, **one)
+        first.made_from_id = isinstance(env, str)
+        agents += [first, *(sibling(first, vector(seed), seed) for seed in numbers[1:])]
+    calls = [training.start_call(agent, total_timesteps, None, minutes, log_interval, True) for agent in agents]
+    callbacks = [training.listed(None if callback is None else callback(agent)) for agent in agents]
+    learn_together(agents, calls, callbacks, progress_bar=progress_bar, differing=tuple(lists))
+    return agents
+
+
+def first_envs(kind: type[Agent], env: Any, n_envs: int, seed: int) -> Any:
+    """Returns the environments of a run."""
+    from rejeu.envs.make import make_vector
+
+    return make_vector(env, n_envs, seed=seed)
+
+
+def is_list_of_numbers(value: Any) -> bool:
+    """Returns whether the value of a setting is a list of numbers, one for each run.
+
+    >>> is_list_of_numbers([1e-3, 1e-4]), is_list_of_numbers((4, "step")), is_list_of_numbers([True])
+    (True, False, False)
+    """
+    is_number = lambda one: isinstance(one, int | float) and not isinstance(one, bool)  # noqa: E731
+    return isinstance(value, list) and bool(value) and all(map(is_number, value))
+
+
+def sibling(agent: A, env: Any, seed: int) -> A:
+    """Returns an agent with the same settings and compiled functions, other environments and another seed."""
+    other = object.__new__(type(agent))
+    other.configure(
+        agent.policy,
+        agent.config,
+        seed,
+        agent.verbose,
+        agent.log,
+        agent.tensorboard_log,
+        agent.stats_window_size,
+        agent.success_threshold,
+        agent.best_window,
+    )
+    other.made_from_id = agent.made_from_id
+    other.observation_space, other.action_space = agent.observation_space, agent.action_space
+    other.obs_leaves, other.learner = agent.obs_leaves, agent.learner
+    other.start_run(env)
+    return other
+
+
+def learn_together(
+    agents: Sequence[Agent],
+    calls: Sequence[TrainingCall],
+    callbacks: Sequence[Sequence[Callback]],
+    sinks: Sequence[Iterable[Sink]] | None = None,
+    progress_bar: bool = False,
+    differing: Sequence[str] = (),
+) -> None:
+    """Trains agents of equal settings in one program.
+
+    A callback of a run that returns ``False`` stops that run. Ctrl-C and SIGTERM stop all. An error of one ends all.
+
+    Args:
+        agents: with the same environment, number of environments and settings, apart from seeds and ``differing``.
+        calls: the limits, equal for all.
+        callbacks: of each run.
+        sinks: further outputs of each run.
+        progress_bar: show the progress of the first run.
+        differing: names of float hyperparameters whose values differ.
+
+    Raises:
+        ValueError: if the settings cannot be trained on the device, or not with such differences.
+    """
+    first = agents[0]
+    check_differing(first, differing)
+    ordered = [training.in_order(one) for one in callbacks]
+    if progress_bar:
+        ordered[0] = [*ordered[0], ProgressBar(calls[0].n_steps, calls[0].seconds)]
+    stops = common_stops(agents, calls, ordered)
+    variants = variants_of(first) if differing else None
+    hyper = [{name: float(getattr(agent.config, name)) for name in differing} for agent in agents]
+    active = [*range(len(agents))]
+    with ExitStack() as stack:
+        outputs = sinks or [()] * len(agents)
+        sessions = [
+            stack.enter_context(training.session(agent, call, one, None, more))
+            for agent, call, one, more in zip(agents, calls, ordered, outputs, strict=True)
+        ]
+        try:
+            with Interrupt() as interrupt:
+                turns = loops.together(
+                    [agent.run for agent in agents],
+                    first.learner,
+                    first.config,
+                    *training.horizon(first, calls[0]),
+                    stops,
+                    active,
+                    variants,
+                    hyper,
+                )
+                for chunk in named(turns, differing, first):
+                    over = [i for i in active if sessions[i](chunk[i])]
+                    active[:] = [i for i in active if i not in over]
+                    if not active or interrupt.requested:
+                        break
+            for agent in agents:
+                agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
+        except NonFiniteUpdate as broken:
+            raise finite.reported(agents[broken.which], broken) from None
+        finally:
+            for agent in agents:
+                agent.run.state = [jax.numpy.array(part) for part in agent.run.state]  # views until now
+                agent.run.carry = jax.tree.map(jax.numpy.array, agent.run.carry)
+
+
+def common_stops(
+    agents: Sequence[Agent], calls: Sequence[TrainingCall], callbacks: Sequence[Sequence[Callback]]
+) -> Stops:
+    """Returns where the program returns to the host: where any of the runs asks for it.
+
+    Raises:
+        ValueError: if an agent cannot train on the device, or the limit is a number of episodes.
+    """
+    found: set[int] = set()
+    for agent, call, one in zip(agents, calls, callbacks, strict=True):
+        if reason := device.reason_against(agent, one):
+            raise ValueError(f"several runs in one program are not possible: {reason}")
+        if call.n_episodes is not None:
+            raise ValueError("several runs in one program end after steps or minutes, not after episodes")
+        agent.stops = device.stops_of(agent, call, one)
+        assert agent.stops is not None
+        found |= {*agent.stops.every}
+    return Stops(tuple(sorted(found)))
+
+
+def check_differing(agent: Agent, names: Iterable[str]) -> None:
+    """Raises ``ValueError`` if hyperparameters cannot differ between the runs of one program."""
+    kinds = {field.name: str(field.type) for field in dataclasses.fields(agent.config)}
+    for name in names:
+        if name in STATIC or "float" not in kinds[name] or (name in IN_REPLAY and hasattr(agent.config, "buffer_size")):
+            raise ValueError(
+                f"{name} cannot differ between the runs of one program, which is compiled for its value; give one number, or "
+                "train one program for each"
+            )
+
+
+def variants_of(agent: Agent) -> Variants:
+    """Returns what makes the algorithm of an agent from other hyperparameters."""
+
+    def make(config: Any) -> Any:
+        algorithm = agent.algorithm_of(config)
+        return algorithm, exploration.make(algorithm, agent.make_noise())
+
+    return Variants(make)
+
+
+def named(turns: Iterator[Any], differing: Sequence[str], agent: Agent) -> Iterator[Any]:
+    """Yields ``turns``; an error that a traced hyperparameter causes says which may be the reason.
+
+    Raises:
+        ValueError: if Python code depends on the value of a hyperparameter that differs.
+    """
+    try:
+        yield from turns
+    except jax.errors.ConcretizationTypeError as error:
+        if not differing:
+            raise
+        raise ValueError(
+            f"{agent.name} decides by the value of one of {', '.join(differing)} what it computes, so it cannot differ "
+            f"between the runs of one program; give one number ({str(error).splitlines()[0][:120]})"
+        ) from None

@@ -1,0 +1,119 @@
+"""Several runs in one program: each is the run that would have been trained alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.callbacks import Evaluate
+from tests.jax_environments import Reach
+from tests.sharing import shared_learners
+
+SMALL: dict[str, Any] = {
+    "buffer_size": 200,
+    "learning_starts": 20,
+    "batch_size": 8,
+    "policy_kwargs": {"net_arch": [8]},
+}
+ON_POLICY: dict[str, Any] = {"n_steps": 16, "batch_size": 16, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
+
+
+def assert_same_runs(together: Any, alone: Any) -> None:
+    """Asserts that two agents have the same episodes, counters and, up to rounding, parameters."""
+    np.testing.assert_array_equal(together.history.table()[:, [0, 1, 3]], alone.history.table()[:, [0, 1, 3]])
+    assert together.num_timesteps == alone.num_timesteps
+    assert together.n_updates == alone.n_updates
+    for name, value in together.get_parameters().items():
+        np.testing.assert_allclose(value, alone.get_parameters()[name], rtol=1e-3, atol=1e-4, err_msg=name)
+
+
+def train_alone(kind: Any, env: Any, n_steps: int, n_envs: int, seed: int, settings: dict[str, Any]) -> Any:
+    """Returns an agent that was trained alone."""
+    policy = "MultiInputPolicy" if isinstance(env, Reach) else "MlpPolicy"
+    with shared_learners():
+        return kind(policy, rejeu.make_vector(env, n_envs), seed=seed, **settings).learn(n_steps)
+
+
+@pytest.mark.parametrize(
+    ("kind", "env", "settings", "differing"),
+    [
+        (rejeu.DQN, "jax/CartPole-v1", SMALL, {"learning_rate": [1e-4, 1e-3]}),
+        (rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}),
+        pytest.param(rejeu.SAC, "jax/Pendulum-v1", SMALL, {"tau": [0.01, 0.1]}, marks=pytest.mark.exhaustive),
+        pytest.param(
+            rejeu.DDPG,
+            Reach(),
+            {**SMALL, "replay_buffer_class": "HerReplayBuffer", "action_noise": 0.3},
+            {},
+            marks=pytest.mark.exhaustive,
+        ),
+        pytest.param(
+            rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {"ent_coef": [0.0, 0.1], "vf_coef": [0.5, 0.1]},
+            marks=pytest.mark.exhaustive,
+        ),
+    ],
+)  # fmt: skip
+def test_each_run_equals_the_one_trained_alone(
+    kind: Any, env: Any, settings: dict[str, Any], differing: dict[str, list[float]]
+) -> None:
+    policy = "MultiInputPolicy" if isinstance(env, Reach) else "MlpPolicy"
+    agents = rejeu.train_seeds(kind, policy, env, 120, seeds=[4, 9], n_envs=2, **settings, **differing)
+    assert len(agents) == 2 * int(np.prod([len(values) for values in differing.values()], dtype=int))
+    for agent in agents[-2:]:
+        values = {name: getattr(agent.config, name) for name in differing}
+        assert_same_runs(agent, train_alone(kind, env, 120, 2, agent.seed, {**settings, **values}))
+
+
+def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any) -> None:
+    evaluations: dict[int, Evaluate] = {}
+
+    def callbacks(agent: Any) -> list[Any]:
+        evaluations[agent.seed] = Evaluate(
+            "jax/CartPole-v1", every=50, episodes=2, best_path=tmp_path / f"{agent.seed}"
+        )
+        return [evaluations[agent.seed], lambda agent, progress: agent.seed != 1 or progress.step < 50]
+
+    agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 120, seeds=3, callback=callbacks, **SMALL)
+    assert [agent.num_timesteps for agent in agents] == [120, 50, 120]
+    assert [result.step for result in evaluations[2].results] == [50, 100]
+    loaded = rejeu.load(agents[2].save(tmp_path / "agent"))
+    for name, value in agents[2].get_parameters().items():
+        np.testing.assert_array_equal(value, loaded.get_parameters()[name])
+    assert agents[1].learn(20, reset_num_timesteps=False).num_timesteps == 70
+
+
+@pytest.mark.parametrize(
+    ("env", "settings", "message"),
+    [
+        ("CartPole-v1", {}, "environment in JAX"),
+        ("jax/CartPole-v1", {"gamma": [0.9, 0.99]}, "gamma cannot differ"),
+        ("jax/CartPole-v1", {"batch_size": [8, 16]}, "batch_size cannot differ"),
+        ("jax/CartPole-v1", {"priorities": {}}, "prioritized replay"),
+    ],
+)
+def test_what_cannot_be_one_program_is_refused(env: str, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rejeu.train_seeds(rejeu.DQN, "MlpPolicy", env, 60, seeds=2, **{**SMALL, **settings})
+
+
+def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
+    def callbacks(agent: Any) -> list[Any]:
+        agent.report_folder = tmp_path / str(agent.config.learning_rate)
+        return []
+
+    with pytest.raises(rejeu.NonFiniteError) as raised:
+        rejeu.train_seeds(
+            rejeu.DQN,
+            "MlpPolicy",
+            "jax/CartPole-v1",
+            120,
+            seeds=1,
+            learning_rate=[1e-3, 1e30],
+            callback=callbacks,
+            **SMALL,
+        )
+    assert raised.value.batch is not None
+    assert raised.value.batch.parent == tmp_path / "1e+30"
