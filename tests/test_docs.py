@@ -217,6 +217,14 @@ def test_the_home_page_links_to_every_page_on_an_algorithm():
     assert [page for page in pages if f"(algorithms/{page})" not in index] == []
 
 
+@pytest.mark.parametrize("name", ["llms.txt", "docs/index.md"])
+def test_overviews_link_to_every_page(name):
+    overview = (ROOT / name).read_text(encoding="utf-8")
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md", "changelog.md"}
+    assert len(pages) > 20
+    assert [page for page in sorted(pages) if not re.search(rf"\((docs/)?{page}\)", overview)] == []
+
+
 def test_the_settings_of_the_page_on_rl_zoo_exist():
     page = (ROOT / "docs" / "coming-from-rl-zoo.md").read_text(encoding="utf-8")
     spans = re.findall(r"`((?:rejeu train [^`]*)?--set [^`]+)`", page)

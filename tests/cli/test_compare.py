@@ -2,12 +2,15 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
 
 from rejeu import cli
 from tests.reporting.test_comparison import HOSTILE, write_run
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -33,6 +36,11 @@ def test_compare_as_json(runs, capsys):
     content = json.loads(capsys.readouterr().out)
     assert [(group["group"], group["runs"]) for group in content["groups"]] == [("CartPole-v1", 6)]
     assert content["groups"][0]["mean"] == pytest.approx(0.17)
+    row = next(
+        line for line in (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").split("\n") if "| `compare` |" in line
+    )
+    documented = set(re.findall(r"`(\w+)`", row)) - {"compare", "steps_to_threshold"}
+    assert documented == {*content, *content["groups"][0], "label", "other", "env_id", "probability", "low", "high"}
 
 
 @pytest.mark.parametrize(
