@@ -277,6 +277,45 @@ def backends() -> str:
     return table(("environment", "`n_envs`", *(f"`{name}`" for name in names)), rows)
 
 
+def functional_equality() -> str:
+    """Largest differences between the environments in JAX and those that they reproduce."""
+    rows = []
+    for row in load("functional_equality.json")["results"]:
+        double, single = row["float64"], row["float32"]
+        cells = (
+            f"{found[key]:.0e}" if found[key] else "0" for found in (double, single) for key in ("state", "reward")
+        )
+        wrong = double["n_terminated"] + single["n_terminated"]
+        rows.append(
+            (f"`{row['env']}`", row["peer"], f"{row['steps']:,}", f"{row['n_terminated']:,}", *cells, str(wrong))
+        )
+    header = (
+        "environment",
+        "compared with",
+        "steps",
+        "terminal",
+        "state, float64",
+        "reward, float64",
+        "state, float32",
+        "reward, float32",
+        "wrong ends",
+    )
+    return table(header, rows)
+
+
+def functional() -> str:
+    """Steps per second of the environments in JAX and of their counterparts."""
+    names = ("program", "vector", "gymnasium", "envpool")
+    rows = []
+    for entry in load("functional.json")["results"]:
+        rates = [entry["steps_per_second"].get(name) for name in names]
+        cells = ("" if rate is None else f"{rate:,.0f}" for rate in rates)
+        rows.append((f"`{entry['env']}`", f"{entry['n_envs']:,}", *cells, f"{entry['compile_seconds']:.1f} s"))
+    return table(
+        ("environment", "`n_envs`", "in a program", "`make_vector`", "Gymnasium", "EnvPool", "compilation"), rows
+    )
+
+
 def overlap() -> str:
     """Learning with and without the overlap of environments and updates."""
     rows = []
@@ -373,6 +412,8 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "parking": parking,
     "speed": speed,
     "backends": backends,
+    "functional": functional,
+    "functional-equality": functional_equality,
     "mountain-car": mountain_car,
     "overlap": overlap,
     "lunar-lander": lunar_lander,

@@ -92,10 +92,10 @@ def _check_obs(said: str, space: spaces.Space, obs: Any) -> None:
 
 
 def _check_state(said: str, before: Any, after: Any) -> None:
-    if jax.tree.structure(before) != jax.tree.structure(after):
+    trees: list[Any] = [jax.tree.structure(before), jax.tree.structure(after)]
+    if trees[0] != trees[1]:
         raise BadEnvironmentError(
-            f"{said} returned a state of another structure than reset: {jax.tree.structure(after)}, expected "
-            f"{jax.tree.structure(before)}"
+            f"{said} returned a state of another structure than reset: {trees[1]}, expected {trees[0]}"
         )
     pairs = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
     for (path, old), new in pairs:

@@ -6,6 +6,7 @@ Each environment has its own stream of random numbers. Environment ``i`` of ``re
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -100,14 +101,26 @@ def _next_keys(keys: Array, counts: Array) -> Array:
     return jax.vmap(prng.nth)(keys, counts)
 
 
-@eqx.filter_jit
-def _reset_streams(env: FunctionalEnv, keys: Array) -> VectorState:
-    return reset_streams(env, keys)
+def split(env: FunctionalEnv) -> tuple[Any, Any]:
+    """Returns the arrays of an environment, and the rest as a static argument that equal environments share."""
+    arrays, rest = eqx.partition(env, eqx.is_array)
+    leaves, tree = jax.tree.flatten(rest)
+    return arrays, (tuple(leaves), tree)
 
 
-@eqx.filter_jit
-def _step(env: FunctionalEnv, vstate: VectorState, action: Any, active: Any) -> Any:
-    after, _, reward, terminated, truncated, success = step_all(env, vstate, action)
+def _env(static: tuple[tuple[Any, ...], Any], arrays: Any) -> FunctionalEnv:
+    leaves, tree = static
+    return eqx.combine(arrays, jax.tree.unflatten(tree, leaves))
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset_streams(static: Any, arrays: Any, keys: Array) -> VectorState:
+    return reset_streams(_env(static, arrays), keys)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(static: Any, arrays: Any, vstate: VectorState, action: Any, active: Any) -> Any:
+    after, _, reward, terminated, truncated, success = step_all(_env(static, arrays), vstate, action)
     if active is not None:
         after = select(active, after, vstate)
         reward = jnp.where(active, reward, jnp.zeros_like(reward))
@@ -115,9 +128,9 @@ def _step(env: FunctionalEnv, vstate: VectorState, action: Any, active: Any) -> 
     return after, (after.obs, reward, terminated, truncated, success)
 
 
-@eqx.filter_jit
-def _reset_done(env: FunctionalEnv, vstate: VectorState, done: Any) -> VectorState:
-    return reset_done(env, vstate, done)[0]
+@partial(jax.jit, static_argnums=0)
+def _reset_done(static: Any, arrays: Any, vstate: VectorState, done: Any) -> VectorState:
+    return reset_done(_env(static, arrays), vstate, done)[0]
 
 
 class JaxVector(VectorEnv):
@@ -166,6 +179,7 @@ class JaxVector(VectorEnv):
         self.state: VectorState | None = None
         """The state of the environments; None before the first reset."""
         self._leaves = leaves(self.observation_space)
+        self._arrays, self._static = split(env)
         self._seed = seed
 
     def reset(self, seed: Seed = None) -> Any:
@@ -173,7 +187,7 @@ class JaxVector(VectorEnv):
         self._seed = None
         if seed is None and self.state is not None:
             return self.reset_done(np.ones(self.n_envs, bool))
-        self.state = _reset_streams(self.env, streams_of(seed, self.n_envs))
+        self.state = _reset_streams(self._static, self._arrays, streams_of(seed, self.n_envs))
         return self._observe()
 
     def _step_all(self, action: np.ndarray) -> Step:
@@ -181,13 +195,13 @@ class JaxVector(VectorEnv):
 
     def _step_some(self, action: np.ndarray, active: np.ndarray | None) -> Step:
         action = np.asarray(action, self._action_dtype)
-        self.state, results = _step(self.env, self._running(), action, active)
-        obs, reward, terminated, truncated, success = jax.device_get(results)
+        self.state, results = _step(self._static, self._arrays, self._running(), action, active)
+        obs, reward, terminated, truncated, success = jax.tree.map(np.asarray, results)
         obs = self._obs = cast(self.observation_space, self._leaves, obs)
         return Step(obs, np.asarray(reward, np.float32), terminated, truncated, success)
 
     def reset_done(self, done: np.ndarray) -> Any:
-        self.state = _reset_done(self.env, self._running(), np.asarray(done, bool))
+        self.state = _reset_done(self._static, self._arrays, self._running(), np.asarray(done, bool))
         return self._observe()
 
     def success(self, step: Step, env: int) -> float:
@@ -229,7 +243,7 @@ class JaxVector(VectorEnv):
         return self.state
 
     def _observe(self) -> Any:
-        self._obs = cast(self.observation_space, self._leaves, jax.device_get(self._running().obs))
+        self._obs = cast(self.observation_space, self._leaves, jax.tree.map(np.asarray, self._running().obs))
         return self._obs
 
 
