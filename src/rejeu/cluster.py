@@ -18,6 +18,8 @@ from typing import Any
 
 from rejeu.errors import ClusterError, MissingExtra
 
+LOOPBACK = "127.0.0.1"
+"""Address of a cluster that is started for this process: other machines cannot connect to it."""
 REACH_SECONDS = 10.0
 """Seconds that a cluster has to accept a connection."""
 MATCHING = ("rejeu", "gymnasium", "numpy")
@@ -77,6 +79,7 @@ def connect(address: str | None = None, purpose: str = "backend='ray'") -> Conne
                 ray.init(
                     given,
                     include_dashboard=None if given else False,
+                    _node_ip_address=None if given else LOOPBACK,
                     logging_level=logging.ERROR,
                     configure_logging=False,
                 )
