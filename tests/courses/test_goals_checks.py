@@ -15,6 +15,21 @@ def language():
     checks.speak("en")
 
 
+@pytest.mark.parametrize(
+    ("test", "answers"),
+    [
+        (check.future, [lambda *_: [[1], [1, 2]]]),
+        (check.steps_needed, [10**400]),
+        (check.saving, [None, None, None, None]),
+    ],
+)
+def test_an_answer_of_another_kind_gives_one_line(test, answers, capsys):
+    assert not test(*answers)
+    printed = capsys.readouterr().out
+    assert "the check cannot use your answer (" in printed
+    assert printed.count("\n") == 1
+
+
 def compute_reward(achieved, desired, info):
     return np.where(np.all(achieved == desired, axis=-1), 0.0, -1.0)
 

@@ -89,15 +89,25 @@ def exercise(check: Callable[..., None]) -> Callable[..., Verdict]:
     def checked(*args: Any, **kwargs: Any) -> Verdict:
         try:
             check(*args, **kwargs)
-        except Wrong as error:
+        except Exception as error:
+            text = error.text if isinstance(error, Wrong) else _unusable(error)
             SESSION.passed.discard(name)
-            print(f"{SESSION.say(Text('Not yet', 'Pas encore'))} - {name}{_colon()} {SESSION.say(error.text)}")
+            print(f"{SESSION.say(Text('Not yet', 'Pas encore'))} - {name}{_colon()} {SESSION.say(text)}")
             return Verdict(False)
         SESSION.passed.add(name)
         print(f"OK - {name}")
         return Verdict(True)
 
     return checked
+
+
+def _unusable(error: Exception) -> Text:
+    """Returns what to say if an answer is of a kind that the check cannot even look at."""
+    what = f"{type(error).__name__}: {_short(error)}"
+    return Text(
+        f"the check cannot use your answer ({what}). Is it of the kind that the exercise asks for?",
+        f"la vérification ne peut pas utiliser votre réponse ({what}). Est-elle de la sorte que demande l'exercice ?",
+    )
 
 
 def require(*names: str) -> None:
