@@ -24,6 +24,8 @@ def folder(tmp_path_factory):
     (folder / "cut.safetensors").write_bytes(data[: len(data) // 2])
     (folder / "empty.safetensors").write_bytes(b"")
     (folder / "flipped.safetensors").write_bytes(data[:-20] + bytes([data[-20] ^ 255]) + data[-19:])
+    (folder / "second" / "checkpoints").mkdir()
+    (folder / "second" / "checkpoints" / "run_000000000000.safetensors").write_bytes(b"")
     (folder / "notes.txt").write_text("not a model", encoding="utf-8")
     return folder
 

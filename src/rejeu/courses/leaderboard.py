@@ -73,12 +73,15 @@ class Leaderboard:
 def models(folder: Path) -> list[Path]:
     """Returns the model files in a folder and the folders in it, sorted; symbolic links are not followed.
 
+    The checkpoints of a run folder are no models.
+
     Raises:
         FileNotFoundError: if there is no such folder, or no model in it.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
-    found = sorted(path for path in folder.rglob("*.safetensors") if path.is_file() and not path.is_symlink())
+    files = (path for path in folder.rglob("*.safetensors") if path.is_file() and not path.is_symlink())
+    found = sorted(path for path in files if path.parent.name != "checkpoints")
     if not found:
         raise FileNotFoundError(f"{folder} holds no .safetensors files; agent.save(name) writes them")
     return found
