@@ -67,6 +67,15 @@ def test_two_algorithms(runs):
     assert comparison.notes == ()
 
 
+def test_steps_to_the_threshold_are_the_median_of_the_runs(tmp_path):
+    for seed, level in enumerate((10.0, 20.0)):
+        write_run(tmp_path / str(seed), seed=seed, level=level)
+    one, other = (compare(tmp_path / str(seed), threshold=9.0, samples=10).groups[0].reached[1] for seed in range(2))
+    assert compare(tmp_path, threshold=9.0, samples=10).groups[0].reached == (2, (one + other) / 2, 9.0)
+    assert other < one
+    assert compare(tmp_path, threshold=15.0, samples=10).groups[0].reached == (1, math.inf, 15.0)
+
+
 def test_curve_is_a_moving_mean_of_the_returns(tmp_path):
     run = write_run(tmp_path / "run")
     (group,) = compare([run], samples=10).groups

@@ -10,7 +10,7 @@ import numpy as np
 from rejeu.cli.commands import Status
 from rejeu.cli.jsonout import emit
 from rejeu.reporting import run_list
-from rejeu.reporting.runs import Run
+from rejeu.reporting.runs import Run, best_row
 from rejeu.reporting.text import counted
 
 WINDOW = 100
@@ -62,18 +62,12 @@ def describe(run: Run) -> dict[str, Any]:
 
 
 def best_evaluation(run: Run) -> dict[str, float] | None:
-    """Returns the best evaluation, by success rate and then by mean return; None if there is none."""
-    table = run.evaluations
-    value, success = table.column("mean_return"), table.column("success_rate")
-    rows = np.flatnonzero(np.isfinite(value))
-    if not len(rows):
+    """Returns the best evaluation; None if there is none."""
+    row = best_row(run.evaluations)
+    if row is None:
         return None
-    row = max(rows, key=lambda one: (-1.0 if math.isnan(success[one]) else success[one], value[one]))
-    return {
-        "step": int(table.column("step")[row]),
-        "mean_return": float(value[row]),
-        "success_rate": float(success[row]),
-    }
+    step, value, success = (run.evaluations.column(name)[row] for name in ("step", "mean_return", "success_rate"))
+    return {"step": int(step), "mean_return": float(value), "success_rate": float(success)}
 
 
 def best_text(best: dict[str, float] | None) -> str:

@@ -597,7 +597,7 @@ def make_group(
         x=grid,
         profile=np.stack([statistics.above(scores, levels), *statistics.interval(statistics.above(samples, levels).T)]),
         levels=levels,
-        reached=(int(np.isfinite(times).sum()), float(np.sort(times)[len(times) // 2]), threshold),
+        reached=(int(np.isfinite(times).sum()), float(np.median(times)), threshold),
     )
 
 

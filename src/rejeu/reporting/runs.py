@@ -234,6 +234,13 @@ def newest_inside(folder: Path) -> str:
     return f"; the newest of the {len(runs)} in it is {max(runs, key=lambda run: (run / CONFIG).stat().st_mtime)}"
 
 
+def best_row(evaluations: Table) -> int | None:
+    """Returns the row of the best evaluation, by success rate and then by mean return; None if there is none."""
+    mean, rate = evaluations.column("mean_return"), evaluations.column("success_rate")
+    known = np.flatnonzero(np.isfinite(mean)).tolist()
+    return max(known, key=lambda row: (np.nan_to_num(rate[row], nan=-1.0), mean[row]), default=None)
+
+
 def statistics_rows(table: Table) -> Table:
     """Returns a table of metrics under their present names, without the rows of evaluations, which have no time.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rejeu.io.records import shown
 from rejeu.reporting.report import curves, videos
-from rejeu.reporting.runs import Run, flat
+from rejeu.reporting.runs import Run, best_row, flat
 from rejeu.reporting.text import counted
 
 LAST = 100
@@ -198,7 +198,7 @@ def duration(seconds: float) -> str:
 def tiles(run: Run) -> list[Tile]:
     """Returns the figures of the headline."""
     mean, found = run.evaluations.column("mean_return"), []
-    best = best_row(run)
+    best = best_row(run.evaluations)
     if best is not None:
         found += evaluation_tiles(run, "Best evaluation", best)
         found += evaluation_tiles(run, "Final evaluation", int(np.flatnonzero(np.isfinite(mean))[-1]))
@@ -211,13 +211,6 @@ def tiles(run: Run) -> list[Tile]:
         Tile("Environment steps", f"{run.steps:,}", done),
         Tile("Training time", duration(run.seconds), time),
     ]
-
-
-def best_row(run: Run) -> int | None:
-    """Returns the row of the best evaluation, by success rate and then by mean return; None if there is none."""
-    mean, rate = run.evaluations.column("mean_return"), run.evaluations.column("success_rate")
-    known = np.flatnonzero(np.isfinite(mean)).tolist()
-    return max(known, key=lambda row: (np.nan_to_num(rate[row], nan=-1.0), mean[row]), default=None)
 
 
 def evaluation_tiles(run: Run, title: str, row: int) -> list[Tile]:
@@ -261,7 +254,7 @@ def evaluation_rows(run: Run) -> list[dict[str, Any]]:
     """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
     table = run.evaluations
     (low, high), (least, most) = curves.interval(table, "return"), curves.interval(table, "success")
-    best = best_row(run)
+    best = best_row(table)
     return [
         {
             "step": number(table.column("step")[row], 0),
