@@ -75,7 +75,8 @@ class Train(EnvironmentOptions):
     seed: Count = None
     """Seeds everything; by default a random one."""
     seeds: Count = None
-    """Train this many seeds, from --seed on, each in a process and a folder of its own, and compare them at the end."""
+    """Train this many seeds, from --seed on, each in a folder of its own, and compare them at the end. In JAX environments one
+    program trains all of them; elsewhere, and with --jobs, each has a process of its own."""
     jobs: Count = None
     """With --seeds: how many are trained at once; by default half as many as there are cores."""
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()

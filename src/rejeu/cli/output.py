@@ -39,8 +39,8 @@ def header(config: RunConfig, environment: Environment, backend: str, folder: Ru
     )
 
 
-def reporter(agent: Agent, table: Sink) -> Callable[[Evaluated, bool], None]:
-    """Returns a function that prints an evaluation and adds it to a table."""
+def reporter(agent: Agent, table: Sink, label: str = "") -> Callable[[Evaluated, bool], None]:
+    """Returns a function that prints an evaluation, after ``label``, and adds it to a table."""
 
     def report(result: Evaluated, is_best: bool) -> None:
         evaluation = result.evaluation
@@ -57,7 +57,9 @@ def reporter(agent: Agent, table: Sink) -> Callable[[Evaluated, bool], None]:
             },
         )
         success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
-        echo(f"step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}")
+        echo(
+            f"{label}step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}"
+        )
 
     return report
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ from rejeu.interrupt import Interrupt, leaving
 from rejeu.loops.run import Progress
 from rejeu.reporting import plots
 from rejeu.reporting.history import EpisodeTable
-from rejeu.reporting.logging import CsvFile, RetryingSink, guarded, open_log
+from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
 from rejeu.reporting.report import write_report
 from rejeu.reporting.trackers import Background
 from rejeu.reporting.video import record_video
@@ -59,6 +60,23 @@ class Stopwatch:
         return time.perf_counter() - self._began, xla.seconds() - self._compiled
 
 
+class Learning(NamedTuple):
+    """What a session gives to ``learn``."""
+
+    evaluate: Evaluate
+    callbacks: list[Any]
+    """All of them, with ``evaluate``."""
+    outputs: list[RetryingSink | Background]
+    """Of the rows of statistics, and of the video."""
+    sinks: list[Sink]
+    """The same, and the table of episodes."""
+
+    def close(self) -> None:
+        """Closes the outputs."""
+        for output in self.outputs:
+            output.close()
+
+
 class Session(NamedTuple):
     """One ``rejeu train`` or ``rejeu resume`` of a run."""
 
@@ -74,6 +92,10 @@ class Session(NamedTuple):
     """Whether ``report.html`` is written at the end."""
     has_video: bool = True
     """Whether a video is recorded at the end."""
+    backend: str = ""
+    """Description of the backend."""
+    label: str = ""
+    """What the lines about its evaluations begin with, where several runs are trained together."""
 
     @property
     def is_over(self) -> bool:
@@ -86,18 +108,38 @@ class Session(NamedTuple):
         The status is 0, 2 if something could not be written, 130 after Ctrl-C and 143 after SIGTERM. Until the models are
         saved, signals are requests to stop after the current step; afterwards they end the process at once.
         """
-        agent, folder = self.agent, self.folder
-        outputs = self.outputs()
+        with self.training(stop) as learning:
+            if self.is_over:
+                restore_callbacks(self.agent, learning.callbacks)
+            else:
+                self.agent.learn(
+                    self.limits.steps,
+                    learning.callbacks,
+                    log_interval=self.log_interval,
+                    reset_num_timesteps=self.is_new,
+                    progress_bar=True,
+                    minutes=self.limits.minutes,
+                    sinks=learning.sinks,
+                )
+        return self.finish(learning, stop, stopwatch)
+
+    @property
+    def log_interval(self) -> int:
+        """Episodes between two rows of statistics."""
+        return 4 * self.config.n_envs
+
+    def finish(self, learning: Learning, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
+        """Evaluates, plots and records a video after training; prints a summary, and returns what :meth:`run` does."""
+        agent, folder, evaluate = self.agent, self.folder, learning.evaluate
+        is_complete = not stop.requested and has_reached_goal(agent)
         try:
-            with noted_in(folder.warnings):
-                evaluate, is_complete = self.train(stop, outputs)
             agent.failed_writes.retry()
             if is_complete:
                 with leaving(f"interrupted after training; the models are saved in {folder.path}"):
                     evaluate_now(evaluate, agent)
                     self.plot_curve(evaluate)
                     if self.has_video:
-                        self.record_video(outputs)
+                        self.record_video(learning.outputs)
             else:
                 self.plot_curve(evaluate)
                 options = self.environment.options()
@@ -106,8 +148,7 @@ class Session(NamedTuple):
             self.write_report()
             raise
         finally:
-            for output in outputs:
-                output.close()
+            learning.close()
         self.write_report()
         seconds = stopwatch.seconds()
         echo(summary(agent, folder, self.environment, evaluate, stop.signal, is_complete, *seconds))
@@ -127,38 +168,39 @@ class Session(NamedTuple):
         ]
         return [guarded(sink, agent.failed_writes, closes=True) for sink in sinks]
 
-    def train(self, stop: Interrupt, outputs: list[RetryingSink | Background]) -> tuple[Evaluate, bool]:
-        """Trains and saves; returns the evaluations, and whether the goal was reached.
+    @contextmanager
+    def training(self, stop: Interrupt) -> Iterator[Learning]:
+        """Context in which the agent learns, with what ``learn`` is to be given; on exit models and tables are written.
 
-        Models and tables are written also after an error of the environment or of the numbers.
+        They are written also after an error of the environment or of the numbers. After an error the outputs are closed.
         """
-        agent, folder, limits = self.agent, self.folder, self.limits
+        agent, folder = self.agent, self.folder
+        outputs = self.outputs()
         agent.report_folder = folder.path
         evaluate, callbacks = self.callbacks(stop)
         episodes = EpisodeTable(lambda: agent.history, folder.episodes)
+        learning = Learning(evaluate, callbacks, outputs, [*outputs, RetryingSink(episodes, agent.failed_writes)])
         try:
-            if self.is_over:
-                restore_callbacks(agent, callbacks)
-            else:
-                agent.learn(
-                    limits.steps,
-                    callbacks,
-                    log_interval=4 * self.config.n_envs,
-                    reset_num_timesteps=self.is_new,
-                    progress_bar=True,
-                    minutes=limits.minutes,
-                    sinks=[*outputs, RetryingSink(episodes, agent.failed_writes)],
-                )
-            save(agent, folder.agent)
-            if not evaluate.results:
-                save(agent, folder.best)
-        except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
-            save(agent, folder.agent)
+            with noted_in(folder.warnings):
+                try:
+                    yield learning
+                    save(agent, folder.agent)
+                    if not evaluate.results:
+                        save(agent, folder.best)
+                except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
+                    save(agent, folder.agent)
+                    raise
+                finally:
+                    self.write_arrivals()
+                    write = lambda: agent.history.write_csv(folder.episodes)  # noqa: E731
+                    agent.failed_writes.attempt(f"table {folder.episodes}", write)
+        except Exception:
+            self.write_report()
+            learning.close()
             raise
-        finally:
-            self.write_arrivals()
-            agent.failed_writes.attempt(f"table {folder.episodes}", lambda: agent.history.write_csv(folder.episodes))
-        return evaluate, not stop.requested and has_reached_goal(agent)
+        except BaseException:
+            learning.close()
+            raise
 
     def write_arrivals(self) -> None:
         """Writes the order in which the results of environments were taken, if they did not wait for each other."""
@@ -171,7 +213,7 @@ class Session(NamedTuple):
         """Returns the callback that evaluates, and all callbacks of the run."""
         agent, config, folder = self.agent, self.config, self.folder
         table = CsvFile(folder.evaluations, None if self.is_new else agent.num_timesteps)
-        report = reporter(agent, RetryingSink(table, agent.failed_writes))
+        report = reporter(agent, RetryingSink(table, agent.failed_writes), self.label)
         every, episodes = config.evaluate_every, config.evaluate_episodes
         evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
         is_pause_due = pause(agent, self.limits)
@@ -221,7 +263,7 @@ class Session(NamedTuple):
 def make_evaluation_env(config: RunConfig, environment: Environment) -> VectorEnv:
     """Returns up to 16 environments like those of training, with other seeds."""
     seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
-    backend = "envpool" if config.backend == "envpool" else "gymnasium"
+    backend = config.backend if config.backend in ("envpool", "jax") else "gymnasium"
     return environment.vector(min(config.evaluate_episodes, 16), backend, seed)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
-from contextlib import closing
+from contextlib import ExitStack, closing
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,13 @@ from gymnasium import spaces
 
 from rejeu import presets, validation
 from rejeu.agents import AGENTS, agent_of_file, find_agent
+from rejeu.agents.together import sibling
 from rejeu.algorithms import config as configs
-from rejeu.cli import environment, jsonout, run_folder, seeds, settings
+from rejeu.cli import environment, jsonout, run_folder, seeds, settings, together
 from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo, header
-from rejeu.cli.run_folder import RunConfig
+from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
 from rejeu.envs.make import VectorEnv, WorkerOptions
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
@@ -29,43 +32,62 @@ from rejeu.reporting.logging import check_logs, require
 
 def run(arguments: Train) -> int:
     """Trains and returns the exit status: 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
-    if arguments.seeds is not None:
-        return seeds.run(arguments)
-    return jsonout.run(train, arguments)
+    if arguments.seeds is None:
+        return jsonout.run(train, arguments)
+    if together.is_possible(arguments):
+        return jsonout.run(lambda arguments: together.train_all(arguments, begin), arguments)
+    return seeds.run(arguments)
 
 
 def train(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
+    run_folder.check_free(arguments.out)
+    seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
+    with ExitStack() as stack:
+        session, stop = begin(arguments, seed, None, stack), stack.enter_context(Interrupt())
+        folder = run_folder.create(arguments.out, session.config.env, session.config.algorithm, seed)
+        session = session._replace(folder=folder)
+        run_folder.write_config(folder, session.config)
+        echo(header(session.config, session.environment, session.backend, folder))
+        return session.run(stop, stopwatch)
+
+
+def begin(arguments: Train, seed: int, first: Session | None, stack: ExitStack) -> Session:
+    """Returns the session of a new run, for which there is no folder yet.
+
+    Args:
+        arguments: the command line.
+        seed: of the run.
+        first: another run of the same command line, whose compiled functions the agent shares; None for none.
+        stack: closes the environments.
+    """
     logs = check_logs("--log", chain.from_iterable(arguments.log))
     require(logs)
-    run_folder.check_free(arguments.out)
     algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
-    made = environment.from_arguments(arguments.env, arguments)
+    made = environment.from_arguments(arguments.env, arguments) if first is None else first.environment
     preset = find_preset(arguments, made, algorithm)
-    seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
-    with closing(make_env(arguments, made, preset, seed)) as env:
+    env = stack.enter_context(closing(make_env(arguments, made, preset, seed)))
+    if first is None:
         config = make_config(arguments, made, preset, algorithm or choose_algorithm(preset, env), env, seed, logs)
         agent = AGENTS[config.algorithm](
             config.policy, env, seed=seed, success_threshold=config.success_threshold, **config.hyperparameters
         )
-        with closing(make_evaluation_env(config, made)) as evaluation_env, Interrupt() as stop:
-            folder = run_folder.create(arguments.out, config.env, config.algorithm, seed)
-            run_folder.write_config(folder, config)
-            echo(header(config, made, describe_backend(env, made, preset), folder))
-            limits = Limits(config.steps, config.minutes)
-            session = Session(
-                agent,
-                config,
-                folder,
-                made,
-                evaluation_env,
-                limits,
-                is_new=True,
-                has_report=not arguments.no_report,
-                has_video=not arguments.no_video,
-            )
-            return session.run(stop, stopwatch)
+    else:
+        config = dataclasses.replace(first.config, seed=seed)
+        agent = sibling(first.agent, env, seed)
+    return Session(
+        agent,
+        config,
+        RunFolder(Path()),
+        made,
+        stack.enter_context(closing(make_evaluation_env(config, made))),
+        Limits(config.steps, config.minutes),
+        is_new=True,
+        has_report=not arguments.no_report,
+        has_video=not arguments.no_video,
+        backend=describe_backend(env, made, preset),
+    )
 
 
 def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:

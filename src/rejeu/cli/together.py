@@ -1,0 +1,100 @@
+"""``rejeu train jax/ENV --seeds N``: several seeds in one program on the device, and the comparison of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from rejeu.agents import training
+from rejeu.agents.device import reason_against
+from rejeu.agents.together import learn_together
+from rejeu.cli import run_folder, seeds, sweep
+from rejeu.cli.commands import Train
+from rejeu.cli.output import echo, header
+from rejeu.cli.run_folder import RunFolder
+from rejeu.cli.session import Session, Stopwatch
+from rejeu.envs.functional.registry import is_functional
+from rejeu.interrupt import NAMES, Interrupt
+from rejeu.sweeps.folder import Sweep, SweepFolder, open_folder
+from rejeu.sweeps.jobs import Code
+from rejeu.sweeps.processes import threads_of
+
+Begin = Callable[[Train, int, Session | None, ExitStack], Session]
+"""Makes the session of a seed; see :func:`rejeu.cli.train.begin`."""
+
+
+def is_possible(arguments: Train) -> bool:
+    """Returns whether seeds are trained in one program: in a JAX environment without wrappers, and without ``--jobs``."""
+    return is_functional(arguments.env) and not arguments.wrapper and arguments.jobs is None
+
+
+def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
+    """Trains all seeds and compares them; returns the exit status and the result.
+
+    Settings that cannot be trained on the device are trained in processes.
+    """
+    stopwatch, jobs = Stopwatch(), seeds.make_jobs(arguments)
+    path = seeds.choose_folder(arguments)
+    with ExitStack() as stack:
+        first = begin(arguments, jobs[0].seed, None, stack)
+        if reason := reason_against(first.agent, ()):
+            echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
+            return seeds.train_all(arguments)
+        code = Code(env=arguments.env, wrappers=arguments.wrapper, imports=arguments.imports)
+        folder = open_folder(path, Sweep(jobs=jobs, threads=threads_of(1)), None, code)
+        sessions = [first, *(begin(arguments, job.seed, first, stack) for job in jobs[1:])]
+        sessions = [named(session, folder, job) for session, job in zip(sessions, jobs, strict=True)]
+        echo(
+            header(
+                first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)
+            )
+        )
+        for job in jobs:
+            claim = folder.claim(job)
+            assert claim is not None, "another process uses a new folder"
+            stack.callback(claim.release)
+        with Interrupt() as stop:
+            statuses = train(sessions, stop, stopwatch)
+        if stop.signal is None:
+            for job, status in zip(jobs, statuses, strict=True):
+                folder.write_exit(job, status)
+    comparison = sweep.summarize(path)
+    runs = [
+        {"seed": job.seed, "path": folder.run(job), "exit_status": status}
+        for job, status in zip(jobs, statuses, strict=True)
+    ]
+    result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
+    if stop.signal is not None:
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {path} continues, each seed in a process of its own")
+        return 128 + stop.signal, result
+    return max(statuses), result
+
+
+def named(session: Session, folder: SweepFolder, job: Any) -> Session:
+    """Returns a session with its new run folder."""
+    path = folder.run(job)
+    path.mkdir(parents=True, exist_ok=True)
+    session = session._replace(folder=RunFolder(path), label=f"seed {job.seed}: ")
+    run_folder.write_config(session.folder, session.config)
+    return session
+
+
+def train(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatch) -> list[int]:
+    """Trains the runs together and finishes each; returns their exit statuses."""
+    agents = [session.agent for session in sessions]
+    with ExitStack() as stack:
+        learnings = [stack.enter_context(session.training(stop)) for session in sessions]
+        calls = [
+            training.start_call(one.agent, one.limits.steps, None, one.limits.minutes, one.log_interval, True)
+            for one in sessions
+        ]
+        learn_together(
+            agents,
+            calls,
+            [learning.callbacks for learning in learnings],
+            [learning.sinks for learning in learnings],
+            progress_bar=True,
+        )
+    finished = zip(sessions, learnings, strict=True)
+    return [session.finish(learning, stop, stopwatch)[0] for session, learning in finished]

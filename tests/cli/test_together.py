@@ -1,0 +1,45 @@
+"""``rejeu train jax/ENV --seeds N``: the seeds are trained in one program."""
+
+import json
+
+import pytest
+
+from rejeu import cli
+from rejeu.cli import together
+from rejeu.cli.commands import Train
+
+TINY = ["--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=20", "buffer_size=200"]
+
+
+@pytest.mark.exhaustive
+def test_seeds_in_one_program_write_a_run_folder_each_and_a_comparison(tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["train", "jax/CartPole-v1", "--algo", "DQN", "--seeds", "2", "--seed", "3", "--steps", "120", "--no-video"]
+    words += ["--evaluate-every", "60", "--evaluate-episodes", "2", "--out", str(out), "--json", *TINY]
+    assert cli.main(words) == 0
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert [(run["seed"], run["exit_status"]) for run in result["runs"]] == [(3, 0), (4, 0)]
+    assert "2 seeds in one program" in printed.err
+    for seed in (3, 4):
+        folder = out / f"seed_{seed}"
+        assert {
+            "agent.safetensors",
+            "best.safetensors",
+            "config.json",
+            "curve.png",
+            "episodes.csv",
+            "evaluations.csv",
+        } <= {path.name for path in folder.iterdir()}
+        assert json.loads((folder / "config.json").read_text())["seed"] == seed
+        assert len((folder / "evaluations.csv").read_text().splitlines()) == 3
+    assert (out / "compare.html").is_file()
+    assert cli.main(["resume", str(out / "seed_3"), "--steps", "40", "--no-video"]) == 0
+    assert len((out / "seed_3" / "evaluations.csv").read_text().splitlines()) == 4
+
+
+def test_seeds_are_trained_in_one_program_unless_processes_are_asked_for():
+    assert together.is_possible(Train("jax/CartPole-v1", seeds=2))
+    assert not together.is_possible(Train("jax/CartPole-v1", seeds=2, jobs=2))
+    assert not together.is_possible(Train("CartPole-v1", seeds=2))
+    assert not together.is_possible(Train("jax/CartPole-v1", seeds=2, wrapper=("my_env:Shaped",)))
