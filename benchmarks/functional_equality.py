@@ -67,7 +67,12 @@ def lot(n: int) -> dict[str, Any]:
         }
         if x64:
             unstable = [parking.is_unstable(recorded, i, found.after[i]) for i in np.flatnonzero(far)]
-            row["n_unstable"], row["n_unexplained"] = sum(unstable), len(unstable) - sum(unstable)
+            row["unstable"] = {
+                "n": sum(unstable),
+                "n_unexplained": len(unstable) - sum(unstable),
+                "position": float(np.abs(found.after[far, :2] - recorded.next_state[far, :2]).max()),
+                "reward": float(found.reward[far].max()),
+            }
     return row
 
 

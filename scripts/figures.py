@@ -303,6 +303,16 @@ def functional_equality() -> str:
     return table(header, rows)
 
 
+def functional_unstable() -> str:
+    """The steps of parking that are left out of the comparison."""
+    row = next(row for row in load("functional_equality.json")["results"] if "unstable" in row)
+    found = row["unstable"]
+    return (
+        f"{found['n']} of the {row['n_crashes']:,} steps with a crash, in which the final position differs by up to "
+        f"{found['position']:.1f} m and\nthe reward by up to {found['reward']:.2f}."
+    )
+
+
 def functional() -> str:
     """Steps per second of the environments in JAX and of their counterparts."""
     names = ("program", "vector", "gymnasium", "envpool")
@@ -414,6 +424,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "backends": backends,
     "functional": functional,
     "functional-equality": functional_equality,
+    "functional-unstable": functional_unstable,
     "mountain-car": mountain_car,
     "overlap": overlap,
     "lunar-lander": lunar_lander,
