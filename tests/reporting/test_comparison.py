@@ -135,6 +135,7 @@ def test_groups_by_the_settings_that_differ(tmp_path):
         ("DQN, gamma=0.99", 1),
     ]
     assert "1 of 2 groups have one run" in comparison.notes[0]
+    assert f"<p>note: {comparison.notes[0]}</p>" in comparison._repr_html_()
 
 
 def test_settings_whose_labels_begin_alike_are_different_groups(tmp_path):

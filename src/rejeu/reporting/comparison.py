@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import itertools
 import json
 import math
@@ -253,7 +254,8 @@ class Comparison:
     def _repr_html_(self) -> str:
         from rejeu.reporting.comparison_page import table_html
 
-        return table_html(self)
+        lines = [self.definition, *(f"note: {one}" for one in self.notes)]
+        return table_html(self) + "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
 
 def compare(
