@@ -250,6 +250,7 @@ def test_outputs(runs, tmp_path):
     table = list(csv.DictReader(io.StringIO(comparison.to_csv())))
     assert [row["group"] for row in table] == ["DQN", "PPO"]
     assert "| DQN | CartPole-v1 | 5 |" in comparison.to_markdown()
+    assert "(5 of 5 reach 12)" in comparison.to_markdown()
     content = json.loads(comparison.to_json())
     assert content["groups"][0]["curve"]["value"][0] is None
     assert len(list(csv.DictReader(io.StringIO(comparison.curves_csv())))) == 202

@@ -28,6 +28,7 @@ from rejeu.reporting.tabular import (
     interval_text,
     markdown_table,
     number,
+    reached_text,
     without_nan,
 )
 
@@ -144,7 +145,7 @@ class Comparison:
                 f"{number(group.score[0])} ({number(group.score[1])} to {number(group.score[2])})",
                 number(group.mean),
                 number(group.median),
-                f"{number(group.reached[1])} to {number(group.reached[2])} ({group.reached[0]} of {len(group.runs)})",
+                reached_text(group),
             ]
             for group in self.groups
         ]

@@ -7,7 +7,7 @@ from typing import Any
 
 from rejeu.reporting.plots.comparison import NAMES
 from rejeu.reporting.report.curves import plain
-from rejeu.reporting.tabular import improvement_row, number
+from rejeu.reporting.tabular import improvement_row, number, reached_text
 from rejeu.reporting.text import counted
 
 COLORS = (
@@ -95,10 +95,8 @@ def table_html(comparison: Any) -> str:
     lines = ["".join(f"<th{' class=text' * (i < 2)}>{escape(name)}</th>" for i, name in enumerate(head))]
     for group in comparison.groups:
         value, low, high = map(number, group.score)
-        count, time, level = group.reached
-        reached = f"{number(time)} ({count} of {len(group.runs)} reach {number(level)})"
         cells = [group.label, group.env_id, str(len(group.runs)), value, f"{low} to {high}"]
-        cells += [number(group.mean), number(group.median), reached]
+        cells += [number(group.mean), number(group.median), reached_text(group)]
         lines.append("".join(f"<td{' class=text' * (i < 2)}>{escape(one)}</td>" for i, one in enumerate(cells)))
     body = "".join(f"<tr>{line}</tr>" for line in lines[1:])
     return f'<div class="scroll"><table class="numbers"><thead><tr>{lines[0]}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -24,6 +24,12 @@ def interval_text(group: Any) -> str:
     return f"IQM {value} (95 % interval {low} to {high}), {len(group.runs)} run{'s' * (len(group.runs) != 1)}"
 
 
+def reached_text(group: Any) -> str:
+    """Returns the steps, or the time, to the threshold as text, with the number of runs that reached it."""
+    count, time, level = group.reached
+    return f"{number(time)} ({count} of {len(group.runs)} reach {number(level)})"
+
+
 def number(value: float) -> str:
     """Returns a number for a table, with four significant digits; ``-`` if it is not finite.
 
