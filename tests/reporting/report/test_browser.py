@@ -151,10 +151,16 @@ def test_live_page_follows_the_run(browser, tmp_path):
     server, address = make_server([folder])
     threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     with server, Opened(browser, address) as opened:
+        page = opened.page
+        with (folder / "evaluations.csv").open("a", encoding="utf-8") as file:
+            file.writelines(f"{3001 + i},35.0,1.0,111.0,1.0,222.0,20,1\n" for i in range(40))
+        page.locator("td", has_text="3,040").wait_for(timeout=60_000)
+        page.evaluate("document.querySelector('.tall').scrollTop = 100")
         with (folder / "evaluations.csv").open("a", encoding="utf-8") as file:
             file.write("3500,35.0,1.0,222.0,1.0,222.0,20,1\n")
-        page = opened.page
         page.locator("td", has_text="222.00").wait_for(timeout=60_000)
+        assert page.evaluate("document.querySelector('.tall').scrollTop") == 100
+        assert page.locator(".tall").bounding_box()["height"] <= 480
         time.sleep(0.5)
         assert opened.messages == []
         server.shutdown()

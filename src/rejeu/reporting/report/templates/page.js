@@ -218,7 +218,10 @@
     }
     data = news;
     for (const element of all("[data-part]")) {
-      if (element.dataset.part in news.parts) element.innerHTML = news.parts[element.dataset.part]; // escaped by the server
+      if (!(element.dataset.part in news.parts)) continue;
+      const top = one(".tall", element)?.scrollTop;
+      element.innerHTML = news.parts[element.dataset.part]; // escaped by the server
+      if (top) one(".tall", element).scrollTop = top;
     }
     draw();
   }
