@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from random import SystemRandom
@@ -236,3 +237,11 @@ class Gated(Losable):
     def wait(self, gate):
         while self.is_first and gate.exists():
             time.sleep(0.01)
+
+
+def process_id(env):
+    return os.getpid()
+
+
+def imports_jax(env):
+    return "jax" in sys.modules

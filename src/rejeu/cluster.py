@@ -11,6 +11,7 @@ import platform
 import signal
 import socket
 import threading
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
@@ -75,7 +76,9 @@ def connect(address: str | None = None, purpose: str = "backend='ray'") -> Conne
             check_reachable(given)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster that is started here reports nothing
         try:
-            with signals_kept():
+            with signals_kept(), warnings.catch_warnings():
+                # Ray starts its own programs so, at once and without Python in between.
+                warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
                 ray.init(
                     given,
                     include_dashboard=None if given else False,

@@ -44,6 +44,13 @@ def vector(env_id, n_envs=3, backend="gymnasium"):
     return lambda: rejeu.make_vector(env_id, n_envs, backend, seed=1)
 
 
+def first_of_n():
+    """Returns environments that do not wait for each other, with an order of arrival in place of chance."""
+    rng = np.random.default_rng(0)
+    order = [np.sort(rng.choice(3, 2, replace=False)) for _ in range(200)]
+    return rejeu.make_vector("Pendulum-v1", 3, "gymnasium-async", seed=1, wait_for=2, arrivals=order)
+
+
 CASES = {
     **{
         name: (kind.name, vector("MountainCar-v0" if kind.discrete else "Pendulum-v1", 1), OFF)
@@ -61,6 +68,8 @@ CASES = {
     "EnvPool, PPO": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "EnvPool, whole episodes": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
     "worker processes": ("SAC", vector("Pendulum-v1", 2, "gymnasium-async"), OFF),
+    "first of n": ("SAC", first_of_n, OFF),
+    "first of n, noise": ("DDPG", first_of_n, {**OFF, "action_noise": "ou(0.2)", "normalize": True}),
     "PPO": ("PPO", vector("CartPole-v1"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "PPO, normalised": ("PPO", vector("Pendulum-v1"), {**SMALL, "n_steps": 16, "batch_size": 16, "normalize": True}),
     "PPO, whole episodes": ("PPO", vector("rejeu/Ball-v0"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
@@ -72,6 +81,7 @@ CASES = {
 DEFAULT_CASES = {
     *("SAC", "DDPG, Discrete", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO, normalised", "A2C", "RecurrentPPO"),
     *("priorities, n steps", "episodes", "normalised", "EnvPool", "worker processes", "EnvPool, whole episodes"),
+    "first of n",
     next(case for case in CASES if case.endswith(" noise")),
 }
 """Each algorithm, backend and kind of loop once; the others are exhaustive."""

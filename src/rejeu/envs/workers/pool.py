@@ -65,6 +65,8 @@ class Workers:
         self._makes, self._starter = list(makes), starter
         self.timeout = timeout
         self.restarts_left = self._restarts = restarts
+        self._look_at = 0.0
+        """When :meth:`first` looks next for workers that hang or are gone, in the time of ``time.monotonic``."""
         self.workers: list[Worker] = []
         self._finalizer = weakref.finalize(self, _end, self.workers, starter)
         try:
@@ -131,12 +133,12 @@ class Workers:
         waiting = {self.workers[number].pipe: number for number in numbers}
         found: dict[int, Any] = {}
         while not found:
-            oldest = min(self.workers[number].asked_at for number in numbers)
-            deadline = None if self.timeout is None else oldest + self.timeout
-            ready = connection.wait([*waiting], seconds_until(deadline, LOOK_SECONDS))
+            ready = connection.wait([*waiting], seconds_until(self._look_at, LOOK_SECONDS))
             found = {waiting[pipe]: self._answer(waiting[pipe], None) for pipe in ready}  # type: ignore[index]
-            if not found:
-                found = {number: self._answer(number, 0.0) for number in numbers if self._is_overdue(number)}
+            if time.monotonic() >= self._look_at:
+                overdue = [number for number in numbers if number not in found and self._is_overdue(number)]
+                found |= {number: self._answer(number, 0.0) for number in overdue}
+                self._look_at = time.monotonic() + LOOK_SECONDS
         return self._without_lost(found)
 
     def _is_overdue(self, number: int) -> bool:
@@ -151,13 +153,18 @@ class Workers:
             return lost
 
     def _without_lost(self, found: dict[int, Any]) -> dict[int, Any]:
-        for number, answer in found.items():
-            if isinstance(answer, Lost):
-                found[number] = self._replaced(number, answer)
-        return found
+        lost = {number: answer for number, answer in found.items() if isinstance(answer, Lost)}
+        replaced = {number: self._replaced(number, answer) for number, answer in lost.items()}
+        try:
+            for number in replaced:
+                self._made(self.workers[number])
+        except BaseException:
+            self.end()
+            raise
+        return found | replaced
 
     def _replaced(self, number: int, lost: Lost) -> Restarted:
-        """Restarts a worker. Raises ``WorkerError`` if no restarts are left."""
+        """Starts a worker again. Raises ``WorkerError`` if no restarts are left."""
         worker = self.workers[number]
         why, advice = str(lost), "what it printed may say why"
         if worker.alive:
@@ -176,7 +183,6 @@ class Workers:
         )
         try:
             self.workers[number] = self._starter.start(number, self._makes[number])
-            self._made(self.workers[number])
         except BaseException:
             self.end()
             raise

@@ -29,6 +29,8 @@ from rejeu.errors import WorkerError
 
 SLOW_START_SECONDS = 30.0
 """Seconds after which a warning says that a worker still waits for its place on the cluster."""
+MAX_TRIES = 5
+"""Actors that are started for a worker before it counts as one that cannot be started."""
 TOKEN_SECONDS = 5.0
 """Seconds that a connection has to present its token."""
 
@@ -99,12 +101,16 @@ class Actors(Starter):
         """Workers that have not connected yet, by their tokens."""
 
     def start(self, number: int, make: Callable[[], gym.Env]) -> ActorWorker:
+        return ActorWorker(number, make, self)
+
+    def launch(self, worker: ActorWorker) -> tuple[Any, Any]:
+        """Makes the actor of a worker, which will connect; returns it, and the reference to the end of its only task."""
+        self.forget(worker)
         token = secrets.token_bytes(TOKEN_BYTES)
         # Ray would restart a lost actor by itself, but with an environment that nobody has seeded.
         actor = self._class.options(max_restarts=0, max_task_retries=0, **self.options.reserved()).remote()
-        worker = ActorWorker(number, make, self, actor, actor.serve.remote(self._server.getsockname()[:2], token))
         self._waiting[token] = worker
-        return worker
+        return actor, actor.serve.remote(self._server.getsockname()[:2], token)
 
     def accept(self, seconds: float) -> None:
         """Waits for one connection, for at most so many seconds. Those without a token that is expected are closed."""
@@ -134,12 +140,14 @@ class Actors(Starter):
 class ActorWorker(Worker):
     """A handle of a worker in an actor of a Ray cluster."""
 
-    def __init__(self, number: int, make: Callable[[], gym.Env], actors: Actors, actor: Any, served: Any) -> None:
-        """Takes an actor, and the reference to the end of its only task."""
+    def __init__(self, number: int, make: Callable[[], gym.Env], actors: Actors) -> None:
+        """Starts the actor."""
         super().__init__(number, None)
-        self._make, self._actors, self._actor, self._served = CloudpickleWrapper(make), actors, actor, served
+        self._make, self._actors = CloudpickleWrapper(make), actors
         self._node, self._ended = "", ""
         self._is_connected = False
+        self._n_tries = 1
+        self._actor, self._served = actors.launch(self)
 
     @property
     def place(self) -> str:
@@ -160,7 +168,7 @@ class ActorWorker(Worker):
             if self._is_connected:
                 break
             if not self.alive:
-                raise WorkerError(f"{self.place} could not be started: {self.end()}")
+                self._try_again()
             if deadline is not None and time.monotonic() >= deadline:
                 raise WorkerError(f"{self.place} found no place on the cluster, {self._needs()}: {self.end()}")
             if not is_told and time.monotonic() - began > SLOW_START_SECONDS:
@@ -177,6 +185,19 @@ class ActorWorker(Worker):
             raise
         self.asked, self.asked_at = "make", time.monotonic()
         process.send(self.pipe, (self._make, ToLeaves()))
+
+    def _try_again(self) -> None:
+        """Starts another actor, because Ray may place one on a node that it does not know yet to be lost.
+
+        Raises:
+            WorkerError: if the actor has raised an error, or after :data:`MAX_TRIES`.
+        """
+        why, is_error = self._how_it_ended()
+        if is_error or self._n_tries == MAX_TRIES:
+            self.end()
+            raise WorkerError(f"{self.place} could not be started: {why}")
+        self._n_tries += 1
+        self._actor, self._served = self._actors.launch(self)
 
     def _needs(self) -> str:
         given = {key: value for key, value in self._actors.options.reserved().items() if value}
@@ -197,23 +218,23 @@ class ActorWorker(Worker):
         if self._is_connected:
             self.pipe.close()
         self._actors.forget(self)
-        self._ended = self._how_it_ended()
+        self._ended, _ = self._how_it_ended()
         with suppress(Exception):  # Ray may be gone already
             self._actors.ray.kill(self._actor, no_restart=True)
         return self._ended
 
-    def _how_it_ended(self) -> str:
-        """Returns the error of an actor that has ended by itself, on one line."""
+    def _how_it_ended(self) -> tuple[str, bool]:
+        """Returns how an actor has ended, on one line, and whether by an error that it has raised."""
         ray = self._actors.ray
         if not ray.is_initialized():
-            return "Ray was shut down"
+            return "Ray was shut down", False
         try:
             ray.get(self._served, timeout=0.5)
         except ray.exceptions.GetTimeoutError:
-            return "it was ended"
+            return "its connection has ended", False
         except ray.exceptions.RayTaskError as error:
-            return f"{type(error.cause).__name__}: {cluster.one_line(error.cause)}"
+            return f"{type(error.cause).__name__}: {cluster.one_line(error.cause)}", True
         except ray.exceptions.RayError as error:
-            reason = str(error).strip().splitlines()
-            return cluster.one_line(reason[-1].partition(" Some common causes")[0]) if reason else type(error).__name__
-        return "it has returned"
+            *_, reason = ["", *str(error).strip().splitlines()]
+            return cluster.one_line(reason.partition(" Some common causes")[0]) or type(error).__name__, False
+        return "it has returned", True
