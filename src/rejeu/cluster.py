@@ -12,7 +12,7 @@ import signal
 import socket
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from typing import Any
@@ -72,8 +72,10 @@ def connect(address: str | None = None, purpose: str = "backend='ray'") -> Conne
         raise MissingExtra(purpose, "ray", "ray") from error
     if not ray.is_initialized():
         given = address or os.environ.get("RAY_ADDRESS") or None
+        if given == "auto":
+            given = os.environ.get("RAY_ADDRESS") or current_address() or "auto"
         if given is not None and given != "auto":
-            check_reachable(given)
+            check_reachable(as_ray_resolves(given, ray))
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster that is started here reports nothing
         try:
             with signals_kept(), warnings.catch_warnings():
@@ -91,6 +93,22 @@ def connect(address: str | None = None, purpose: str = "backend='ray'") -> Conne
             raise ClusterError(f"cannot connect to {where}: {one_line(error)}") from error
         _is_ours = True
     return Connection(ray)
+
+
+def current_address() -> str | None:
+    """Returns the address of the cluster that this machine belongs to, None if there is none or Ray does not say."""
+    try:
+        from ray._private.utils import read_ray_address  # there is no public way to ask
+    except ImportError:
+        return None
+    found = read_ray_address()
+    return found or None
+
+
+def as_ray_resolves(address: str, ray: Any) -> str:
+    """Returns an address as Ray uses it, which replaces the loopback address by that of this machine in the network."""
+    host, _, port = address.rpartition(":")
+    return f"{ray.util.get_node_ip_address()}:{port}" if host in ("127.0.0.1", "localhost") else address
 
 
 def check_reachable(address: str) -> None:
@@ -130,10 +148,14 @@ def signals_kept() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
-def versions() -> dict[str, str]:
-    """Returns the versions that must be the same on all machines; empty for a package that has none."""
+def versions(more: Iterable[str] = ()) -> dict[str, str]:
+    """Returns the versions that must be the same on all machines; empty for a package that has none.
+
+    Args:
+        more: further packages.
+    """
     found = {"Python": ".".join(platform.python_version_tuple()[:2])}
-    for package in MATCHING:
+    for package in (*MATCHING, *more):
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
@@ -141,9 +163,15 @@ def versions() -> dict[str, str]:
     return found
 
 
-def check_versions(there: Mapping[str, str], where: str) -> None:
-    """Raises ``ClusterError`` if the versions of another machine, called ``where``, differ from :func:`versions` here."""
-    here = versions()
+def check_versions(there: Mapping[str, str], where: str, here: Mapping[str, str] | None = None) -> None:
+    """Raises ``ClusterError`` if the versions of another machine, called ``where``, differ from those here.
+
+    Args:
+        there: its versions.
+        where: what it is called in the message.
+        here: by default those of :func:`versions`.
+    """
+    here = versions() if here is None else here
     wrong = [
         f"{name} {there.get(name) or 'of no version'} and not {own}"
         for name, own in here.items()

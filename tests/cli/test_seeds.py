@@ -9,7 +9,7 @@ import pytest
 from rejeu import cli
 from rejeu.cli import seeds
 from rejeu.cli.commands import Train
-from rejeu.sweeps import processes
+from rejeu.sweeps import process, processes
 from rejeu.sweeps.jobs import Code, Options
 from tests.reporting.test_comparison import write_run
 
@@ -29,7 +29,7 @@ def other_program(monkeypatch):
         return start(self, words, run, log, lock)
 
     monkeypatch.setattr(processes.LocalLauncher, "start", start_other)
-    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-c", PROGRAM, *words])
+    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-c", PROGRAM, *words])
 
 
 def test_a_seed_that_fails_keeps_its_log_and_does_not_stop_the_others(tmp_path, other_program, capsys):

@@ -64,8 +64,8 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
     assert arguments.seeds is not None
     first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Options)}
-    preset = None if arguments.preset is None else str(arguments.preset)
-    options = Options(**{**given, "preset": preset, "log": tuple(chain.from_iterable(arguments.log))})
+    paths = {key: None if given[key] is None else str(given[key]) for key in ("preset", "arrivals")}
+    options = Options(**{**given, **paths, "log": tuple(chain.from_iterable(arguments.log))})
     words = [*chain.from_iterable(arguments.assignments)]
     settings.apply(words, {})
     return tuple(

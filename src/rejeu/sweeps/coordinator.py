@@ -15,7 +15,7 @@ from rejeu.interrupt import Interrupt
 from rejeu.supervised import TAKEN
 from rejeu.sweeps.folder import State, SweepFolder
 from rejeu.sweeps.jobs import Code, Job
-from rejeu.sweeps.processes import LOST, last_line
+from rejeu.sweeps.process import LOST, last_line
 
 POLL = 0.2
 """Seconds between two looks at the processes."""
@@ -40,8 +40,9 @@ class Handle(Protocol):
 class Launcher(Protocol):
     """What starts runs."""
 
-    capacity: int
-    """Runs at once."""
+    @property
+    def capacity(self) -> int:
+        """Runs at once; may change."""
 
     def start(self, words: Sequence[str], run: Path, log: Path, lock: Path) -> Handle:
         """Starts a run with the command line ``rejeu WORDS``."""

@@ -24,6 +24,8 @@ MAX_JOBS = 10_000
 """Most runs of a sweep."""
 MAX_NAME = 150
 """Most characters of the name of a job, which is also that of a folder."""
+AGAIN = ("restart_workers", "ray", "env_cpus", "no_report", "no_video")
+"""Options that a run does not keep, so that ``rejeu resume`` needs them again."""
 Name = Annotated[str, Meta(pattern=rf"^\w[\w.-]{{0,{MAX_NAME - 1}}}\Z")]
 Setting = Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]{0,199}\Z")]
 
@@ -39,6 +41,12 @@ class Options:
     envs: int | None = None
     backend: str | None = None
     restart_workers: int = 0
+    wait_for: int | None = None
+    arrivals: str | None = None
+    """Path of the record of an earlier run."""
+    ray: str | None = None
+    """Address of a Ray cluster for environments with ``backend="ray"``."""
+    env_cpus: float = 1.0
     success_threshold: float | None = None
     video_every: int | None = None
     checkpoint_minutes: float = 5.0
@@ -51,13 +59,17 @@ class Options:
     def __post_init__(self) -> None:
         for key in ("steps", "envs", "video_every", "evaluate_every", "evaluate_episodes"):
             coerce(self, key, whole, optional=True, least=INTEGERS[key][0], most=INTEGERS[key][1])
+        coerce(self, "wait_for", whole, optional=True, least=1)
+        coerce(self, "env_cpus", number, least=0, most=10_000)
         coerce(self, "restart_workers", whole, least=0)
         coerce(self, "minutes", number, optional=True, above=0)
         coerce(self, "success_threshold", number, optional=True)
         coerce(self, "checkpoint_minutes", number, least=0)
         coerce(self, ("no_report", "no_video"), flag)
-        if self.preset is not None and (not isinstance(self.preset, str) or self.preset.startswith("-")):
-            raise ValueError(f"preset={self.preset!r} must be the path of a file")
+        for key in ("preset", "arrivals", "ray"):
+            value = getattr(self, key)
+            if value is not None and (not isinstance(value, str) or not value or value.startswith("-")):
+                raise ValueError(f"{key}={value!r} must be {'an address' if key == 'ray' else 'the path of a file'}")
         coerce(self, "backend", choice, optional=True, among=BACKENDS)
         if not isinstance(self.log, str | list | tuple) or not all(isinstance(one, str) for one in self.log):
             raise TypeError(f"log={self.log!r} must be a list of names")
@@ -127,8 +139,8 @@ class Job:
     def resume_words(self, run: str, code: Code) -> list[str]:
         """Returns the command line that continues the run, or completes its files, without ``rejeu``."""
         words = ["resume", run, "--finish", *code.words()]
-        words += ["--no-report"] if self.options.no_report else []
-        words += ["--no-video"] if self.options.no_video else []
+        again = {name: getattr(self.options, name) for name in AGAIN}
+        words += option_words(Options(**again))
         return [*words, "--env", self.env, *self.environment_words()] if self.names_code else words
 
     def check_code(self, code: Code, where: object) -> None:

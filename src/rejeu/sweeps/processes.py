@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
-from rejeu import supervised, xla
+from rejeu import xla
+from rejeu.sweeps.process import Process
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-LOST = -1
-"""Exit status of a process that vanished."""
 
 
 def default_workers() -> int:
@@ -30,72 +26,6 @@ def environment(threads: int) -> dict[str, str]:
     """Returns the environment variables of a process that uses so many threads."""
     found = {**os.environ, **{name: os.environ.get(name, str(threads)) for name in THREADS}}
     return {**found, xla.CORES: str(threads)}
-
-
-class Process:
-    """A process that trains, supervised by this one: it stops, with a checkpoint, when this one does. Mutable."""
-
-    def __init__(self, words: Sequence[str], log: Path, lock: Path, environ: dict[str, str]) -> None:
-        """Starts it.
-
-        Args:
-            words: command line after ``rejeu``.
-            log: file to which what it prints is appended.
-            lock: file that it keeps locked while it lives.
-            environ: its environment variables.
-
-        Raises:
-            OSError: if the log cannot be written.
-        """
-        with log.open("ab") as file:
-            self._process = subprocess.Popen(
-                program(words),
-                stdin=subprocess.PIPE,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env={**environ, supervised.LOCK: str(lock)},
-                process_group=0 if os.name == "posix" else None,  # Ctrl-C reaches it once, through stop
-            )
-
-    @property
-    def pid(self) -> int:
-        """Id of the process."""
-        return self._process.pid
-
-    def poll(self) -> int | None:
-        """Returns the exit status, negative if a signal ended it; None while it runs."""
-        status = self._process.poll()
-        if status is not None:
-            self.stop()
-        return status
-
-    def stop(self) -> None:
-        """Asks it to stop after the current step, with a checkpoint."""
-        if self._process.stdin is not None:
-            with suppress(OSError):
-                self._process.stdin.close()
-
-    def kill(self) -> None:
-        """Ends it at once and waits for its end."""
-        self._process.kill()
-        self._process.wait()
-        self.stop()
-
-
-def program(words: Sequence[str]) -> list[str]:
-    """Returns the command line of a process."""
-    return [sys.executable, "-m", "rejeu", *words]
-
-
-def last_line(log: Path) -> str:
-    """Returns the last line of a log that is not empty."""
-    try:
-        with log.open("rb") as file:
-            file.seek(max(log.stat().st_size - 4096, 0))
-            lines = file.read().decode("utf-8", "replace").split("\n")
-    except OSError:
-        return "there is no log"
-    return next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
 
 
 class LocalLauncher:

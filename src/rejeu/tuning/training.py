@@ -11,7 +11,7 @@ from typing import Any
 
 from rejeu.reporting.runs import EVALUATIONS, read_run
 from rejeu.reporting.tables import read_table
-from rejeu.sweeps.processes import Process, last_line
+from rejeu.sweeps.process import Process, last_line
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,6 @@ def env_options(
     for option, names in (("--wrapper", wrappers), ("--import", imports)):
         words += [word for name in names for word in (option, name)]
     return tuple(words)
-
-
-def settings_options(hyperparameters: Mapping[str, Any]) -> list[str]:
-    """Returns the words of a command line that set hyperparameters.
-
-    >>> settings_options({"gamma": 0.9})
-    ['--set', 'gamma=0.9']
-    """
-    return ["--set", *(f"{name}={json.dumps(value)}" for name, value in hyperparameters.items())]
 
 
 class Training:
