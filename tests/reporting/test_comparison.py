@@ -138,6 +138,22 @@ def test_groups_by_the_settings_that_differ(tmp_path):
     assert f"<p>note: {comparison.notes[0]}</p>" in comparison._repr_html_()
 
 
+def test_labels_have_the_settings_in_which_runs_of_the_same_algorithm_differ(tmp_path):
+    for i, gamma in enumerate((0.9, 0.99)):
+        write_run(tmp_path / f"dqn{i}", seed=i, hyperparameters={"gamma": gamma, "tau": 1.0})
+        write_run(tmp_path / f"ppo{i}", "PPO", seed=i, hyperparameters={"gamma": 0.9, "n_epochs": 4})
+    comparison = compare(tmp_path, "setting", samples=10)
+    assert [group.label for group in comparison.groups] == ["DQN, gamma=0.9", "DQN, gamma=0.99", "PPO"]
+
+
+def test_settings_that_differ_between_environments_are_no_groups_by_default(tmp_path):
+    for env, gamma in (("A-v0", 0.9), ("B-v0", 0.99)):
+        write_run(tmp_path / env, env=env, hyperparameters={"gamma": gamma})
+    assert compare(tmp_path, samples=10).by == "env"
+    write_run(tmp_path / "more", env="B-v0", hyperparameters={"gamma": 0.9})
+    assert compare(tmp_path, samples=10).by == "setting"
+
+
 def test_settings_whose_labels_begin_alike_are_different_groups(tmp_path):
     for i, last in enumerate((0.1, 0.2)):
         noise = {"noise": "normal", "mean": [0.0] * 100, "sigma": [0.0] * 100 + [last]}

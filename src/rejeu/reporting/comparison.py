@@ -428,26 +428,46 @@ def cut_to_shortest(curves: list[Curve], axis: Axis, notes: list[str]) -> None:
 def group_labels(runs: Sequence[Run], by: By | None) -> tuple[By, list[str]]:
     """Returns what makes a group, and the label of the group of each run."""
     labels: dict[By, list[str]] = {
-        "algorithm": [run.algorithm or run.path.parent.name for run in runs],
+        "algorithm": [algorithm_label(run) for run in runs],
         "setting": settings(runs),
         "env": [env_label(run) for run in runs],
     }
-    differing = (kind for kind in labels if len({*labels[kind]}) > 1)
-    chosen: By = by if by is not None else next(differing, "algorithm")
+    # tuned settings differ from environment to environment, and are then nothing to compare
+    settings_differ = len({*zip(labels["env"], labels["setting"], strict=True)}) > len({*labels["env"]})
+    usual: By = "env" if len({*labels["env"]}) > 1 else "algorithm"
+    if len({*labels["algorithm"]}) > 1:
+        usual = "algorithm"
+    elif settings_differ:
+        usual = "setting"
+    chosen = usual if by is None else by
     return chosen, labels[chosen]
 
 
 def settings(runs: Sequence[Run]) -> list[str]:
-    """Returns for each run the algorithm and the settings in which the runs differ."""
+    """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
     values = [dict(flat(run.hyperparameters)) | {"n_envs": run.n_envs} for run in runs]
     written = [{name: whole_text(value) for name, value in one.items()} for one in values]
-    names = sorted({name for one in written for name in one})
-    differing = [name for name in names if len({one.get(name, "") for one in written}) > 1]
+    members: dict[str, list[dict[str, str]]] = {}
+    for run, one in zip(runs, written, strict=True):
+        members.setdefault(algorithm_label(run), []).append(one)
+    differing = {algorithm: differing_names(ones) for algorithm, ones in members.items()}
     labels = []
     for run, one in zip(runs, written, strict=True):
-        parts = [run.algorithm or run.path.parent.name, *(f"{name}={one[name]}" for name in differing if name in one)]
+        algorithm = algorithm_label(run)
+        parts = [algorithm, *(f"{name}={one[name]}" for name in differing[algorithm] if name in one)]
         labels.append(shortened(", ".join(parts)))
     return labels
+
+
+def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
+    """Returns the names whose values are not all the same."""
+    names = sorted({name for one in settings for name in one})
+    return [name for name in names if len({one.get(name, "") for one in settings}) > 1]
+
+
+def algorithm_label(run: Run) -> str:
+    """Returns the algorithm of a run; of one that does not say, the name of the folder above."""
+    return run.algorithm or run.path.parent.name
 
 
 def env_label(run: Run) -> str:
