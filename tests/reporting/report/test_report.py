@@ -165,6 +165,10 @@ def test_million_episodes_are_binned(tmp_path):
     assert max(map(len, histogram["rows"])) == curves.LISTED
 
 
+def test_legend_and_note_name_the_same_number_of_episodes():
+    assert f"about {curves.window_of(4571)}" in curves.binned_note(4571)
+
+
 def test_moving_average_and_its_interval():
     values = np.array([1.0, 3.0, 2.0, 6.0, np.nan, 4.0])
     episodes = Episodes(np.arange(6.0), *[np.zeros(6)] * 5)

@@ -72,7 +72,7 @@ def window_of(n: int) -> int:
     >>> [window_of(n) for n in (4, 100, 1500, 1_000_000)]
     [3, 20, 50, 2500]
     """
-    return math.ceil(n / MAX_POINTS) if n > MAX_DOTS else min(max(n // 5, 3), 50)
+    return round(n / MAX_POINTS) if n > MAX_DOTS else min(max(n // 5, 3), 50)
 
 
 def smooth(episodes: Episodes, values: np.ndarray, is_rate: bool = False) -> Binned:
