@@ -15,6 +15,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -133,13 +134,26 @@ class Run:
         default, value = dict(flat(defaults)), dict(flat(self.hyperparameters))
         return {name: (value[name], default.get(name)) for name in value if value[name] != default.get(name)}
 
+    @property
+    def env_argument(self) -> str:
+        """The environment as it was named on the command line."""
+        return text(self.config.get("env_argument")) or self.env_id
+
+    @property
+    def env_words(self) -> list[str]:
+        """The options of a command line that make the environment: keyword arguments and wrappers."""
+        pairs = [f"{name}={assigned(value)}" for name, value in self.env_kwargs.items()]
+        wrappers = self.config.get("wrappers")
+        named = [["--wrapper", text(one)] for one in (wrappers if isinstance(wrappers, list) else ())]
+        return [*(["--env-kwargs", *pairs] if pairs else []), *chain.from_iterable(named)]
+
     @cached_property
     def command(self) -> str:
         """The command that repeats the run, made from its configuration; empty if that is not known."""
         if self.format != "rejeu" or not (self.config and self.env_id and self.algorithm):
             return ""
         config = self.config
-        words = ["rejeu", "train", text(config.get("env_argument")) or self.env_id, "--algo", self.algorithm]
+        words = ["rejeu", "train", self.env_argument, "--algo", self.algorithm]
         limit = ["--minutes", f"{self.minutes_asked:g}"] if self.minutes_asked else ["--steps", str(self.steps_asked)]
         words += limit if self.minutes_asked or self.steps_asked else []
         options = {"seed": self.seed, "envs": self.n_envs, "backend": config.get("backend")}
@@ -147,10 +161,7 @@ class Run:
         options |= {name: config.get(name) for name in others}
         for name, value in options.items():
             words += [] if value is None else [f"--{name.replace('_', '-')}", text(value)]
-        if self.env_kwargs:
-            words += ["--env-kwargs", *(f"{name}={text(value)}" for name, value in self.env_kwargs.items())]
-        for wrapper in config.get("wrappers") if isinstance(config.get("wrappers"), list) else ():
-            words += ["--wrapper", text(wrapper)]
+        words += self.env_words
         preset = presets.find(self.env_id, self.algorithm)
         usual = default_hyperparameters(self.algorithm, preset.hyperparameters if preset else {})
         taken = dict(flat(usual))  # by rejeu train if nothing is set

@@ -17,7 +17,7 @@ from rejeu.loops.run import Episode
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.report import curves, page, write_report
 from rejeu.reporting.runs import Episodes
-from tests.reporting.report.folders import EVIL, MP4, write, write_hostile
+from tests.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
 
 @pytest.fixture(autouse=True)
@@ -163,6 +163,16 @@ def test_million_episodes_are_binned(tmp_path):
     histogram = curves.histogram(returns, {"episode": np.arange(n)})
     assert sum(histogram["counts"]) == n
     assert max(map(len, histogram["rows"])) == curves.LISTED
+
+
+def test_commands_of_a_page_make_the_environment_again(tmp_path):
+    made = {"env_argument": "my_env.py", "env_kwargs": {"slope": 0.2}, "wrappers": ["my_env:Shaped"]}
+    folder = write(tmp_path / "run", {**CONFIG, **made})
+    (folder / "replays.csv").write_text("seed,return,length,success\n0,5.0,5,nan\n", encoding="utf-8")
+    command = data_of(text_of(folder))["histograms"]["run0-replays"]["command"]
+    assert command.endswith(
+        "--which last --seed N --episodes 1 --env my_env.py --env-kwargs slope=0.2 --wrapper my_env:Shaped"
+    )
 
 
 def test_legend_and_note_name_the_same_number_of_episodes():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 
 from rejeu.io.records import shown
 from rejeu.reporting.report import curves, videos
-from rejeu.reporting.runs import Run, best_row, flat
+from rejeu.reporting.runs import MAX_WORD, Run, best_row, flat
 from rejeu.reporting.text import counted
 
 LAST = 100
@@ -152,7 +153,7 @@ def describe(
         "warnings": [*run.warnings],
         "notes": [*run.notes, *notes],
         "command": run.command,
-        "replay_command": f"rejeu report {quoted(run.path)} --replay 100"
+        "replay_command": f"rejeu report {quoted(run.path)} --replay 100{env_options(run)}"
         if run.format == "rejeu" and run.models
         else "",
     }
@@ -321,13 +322,19 @@ def replay_command(run: Run) -> str:
     if run.format != "rejeu" or not run.models:
         return ""
     which = "" if "best.safetensors" in run.models else " --which last"
-    return f"rejeu watch {quoted(run.path)}{which} --seed N --episodes 1"
+    return f"rejeu watch {quoted(run.path)}{which} --seed N --episodes 1{env_options(run)}"
+
+
+def env_options(run: Run) -> str:
+    """Returns what commands about the run need to make its environment again; empty if its id is enough."""
+    words = run.env_words
+    if not words and run.env_argument == run.env_id:
+        return ""
+    return " " + shlex.join(shown(word, MAX_WORD) for word in ["--env", run.env_argument, *words])
 
 
 def quoted(path: Path) -> str:
     """Returns a path for a shell, relative to the current folder if it is inside."""
-    import shlex
-
     here = Path.cwd()
     text = str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
     text = shown(text, 500)
