@@ -1,4 +1,7 @@
-"""Stands in for ``rejeu train``: writes the files of a run whose return depends on the learning rate and the seed."""
+"""Stands in for ``rejeu train`` and ``rejeu resume``: writes the files of a run whose return grows with the steps taken.
+
+It grows by 1 over the whole run with the learning rate 1e-3, and by 1 less for each order of magnitude away from it.
+"""
 
 import json
 import math
@@ -16,40 +19,57 @@ def stop_at_end():
     os._exit(143)
 
 
+def option(words, name):
+    """Returns the word after an option, None without the option."""
+    return words[words.index(name) + 1] if name in words else None
+
+
+def rate_of(value):
+    return float(value.removeprefix("lin_")) if isinstance(value, str) else value
+
+
 def main(words):
     threading.Thread(target=stop_at_end, daemon=True).start()
-    command = words[0]
-    path = Path(words[1] if command == "resume" else words[words.index("--out") + 1])
-    source = path / "preset.json" if command == "resume" else Path(words[words.index("--preset") + 1])
-    preset = json.loads(source.read_text())
-    path.mkdir(parents=True, exist_ok=True)
-    (path / "preset.json").write_text(json.dumps(preset))
-    (path / "checkpoints").mkdir(exist_ok=True)
-    (path / "checkpoints" / "newest").write_text("")
+    is_new = words[0] == "train"
+    path = Path(option(words, "--out") if is_new else words[1])
+    if is_new:
+        preset = json.loads(Path(option(words, "--preset")).read_text())
+        state = {"step": 0, "weight": 0.0, "seed": int(option(words, "--seed")), "preset": preset}
+        state["rate"] = rate_of(preset["hyperparameters"].get("learning_rate", 1e-3))
+    else:
+        state = json.loads(max((path / "checkpoints").glob("run_*.safetensors")).read_text())
+        preset = state["preset"]
+        for word in words:
+            if word.startswith("learning_rate="):
+                state["rate"] = rate_of(json.loads(word.partition("=")[2]))
+    (path / "checkpoints").mkdir(parents=True, exist_ok=True)
     with (path.parent / "commands.txt").open("a") as file:
-        print(command, path.name, file=file)
-    seed = int(path.name.removeprefix("seed_"))
+        print(words[0], path.name, file=file)
     steps, every = preset["total_steps"], preset["evaluate_every"]
-    rate = preset["hyperparameters"].get("learning_rate", 1e-3)
-    config = {"env": preset["env_id"], "algorithm": preset["algorithm"], "seed": seed, "steps": steps, "n_envs": 1}
-    config["hyperparameters"] = preset["hyperparameters"]
-    (path / "config.json").write_text(json.dumps(config))
+    pause = option(words, "--pause") if is_new else option(words, "--steps")
+    end = steps if pause is None else min(state["step"] + int(pause), steps)
+    config = {"env": preset["env_id"], "algorithm": preset["algorithm"], "seed": state["seed"], "steps": steps}
+    (path / "config.json").write_text(json.dumps({**config, "hyperparameters": preset["hyperparameters"]}))
     table = path / "evaluations.csv"
     rows = table.read_text().splitlines()[1:] if table.exists() else []
-    done = int(rows[-1].split(",")[0]) if rows else 0
-    if not rows:
-        table.write_text(HEADER + "\n")
-    for step in range(done + every, steps + 1, every):
-        value = step / steps - abs(math.log10(rate) + 3) + (seed % 7) / 100
-        if rate > 5e-3:
+    rows = [row for row in rows if int(row.split(",")[0]) <= state["step"]]
+    table.write_text("\n".join([HEADER, *rows]) + "\n")
+    while state["step"] < end:
+        if state["rate"] > 5e-3:
             print("rejeu: error: at step 20: the loss is NaN", flush=True)
             sys.exit(2)
+        state["step"] += every
+        state["weight"] += (1 - abs(math.log10(state["rate"]) + 3)) * every / steps
+        value = state["weight"] + (state["seed"] % 7) / 100
         with table.open("a") as file:
-            file.write(f"{step},{step / 100},nan,{value},0,1,3,0\n")
+            file.write(f"{state['step']},{state['step'] / 100},nan,{value},0,1,3,0\n")
+        checkpoint = path / "checkpoints" / f"run_{state['step']:012d}.safetensors"
+        checkpoint.with_suffix(".tmp").write_text(json.dumps(state))
+        checkpoint.with_suffix(".tmp").replace(checkpoint)
         time.sleep(0.02)
-    episodes = [f"{step},0,{value},1,nan,{step / 100}" for step in range(1, steps + 1)]
+    episodes = [f"{step},0,{state['weight']},1,nan,{step / 100}" for step in range(1, state["step"] + 1)]
     (path / "episodes.csv").write_text("\n".join(["step,env,return,length,success,seconds", *episodes]) + "\n")
-    (path / "agent.safetensors").write_bytes(b"")
+    (path / "agent.safetensors").write_text(json.dumps(state))
 
 
 main(sys.argv[1:])

@@ -58,6 +58,8 @@ class Train(EnvironmentOptions):
     """Environment steps to take, over all environments; by default the preset's, else 100000."""
     minutes: Minutes = None
     """Train for this long instead."""
+    pause: Count = None
+    """Pause after so many environment steps; rejeu resume continues to the goal."""
     envs: Count = None
     """Environments stepped at once; by default the preset's, else 1."""
     backend: Name = None
@@ -126,7 +128,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Resume(RunOptions):
-    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a study of rejeu tune, or a sweep.
+    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a sweep, a study or a population.
 
     Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
     """
@@ -136,13 +138,15 @@ class Resume(RunOptions):
     finish: Annotated[bool, FlagCreatePairsOff] = False
     """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
     workers: Count = None
-    """Of a sweep or a study: runs or trials at once; by default half as many as there are cores."""
+    """Of a sweep, a study or a population: runs at once; by default half as many as there are cores."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
     """Of a sweep, or of a run with --backend ray: use this Ray cluster, auto or HOST:PORT."""
     steps: Count = None
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
     minutes: Minutes = None
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
+    assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
+    """Hyperparameters to change from here on, as for rejeu train; those that change shapes cannot be changed."""
     restart_workers: Annotated[int, arg(metavar="N")] = 0
     """As for rejeu train; for this part of the run."""
     env_cpus: Annotated[float, arg(metavar="N", help_behavior_hint="(default: 1)")] = 1.0
@@ -202,6 +206,51 @@ class Tune(EnvironmentOptions):
     """Trials at once; by default half as many as there are cores."""
     out: Folder = None
     """Study folder; an existing one is continued or joined. By default a new one under runs."""
+    json: Json = False
+    """Print the result as one JSON document, and messages to standard error."""
+
+
+@dataclass(frozen=True)
+class Pbt(EnvironmentOptions):
+    """Trains a population: after each round the worst members copy the best, and their hyperparameters are perturbed.
+
+    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu pbt Pendulum-v1 --algo SAC --members 8 --round-steps 5000
+    """
+
+    env: EnvironmentId
+    """Id of an environment, as for rejeu train."""
+    algo: Name = None
+    """Algorithm; by default that of the preset."""
+    members: Annotated[int, arg(metavar="K")] = 8
+    """Agents that are trained."""
+    rounds: Annotated[int, arg(metavar="N")] = 10
+    """Rounds of training."""
+    round_steps: Annotated[int, arg(metavar="N")] = 10_000
+    """Environment steps of each member in a round."""
+    envs: Count = None
+    """Environments that each member steps at once; by default the preset's, else 1."""
+    backend: Name = None
+    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto."""
+    preset: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Hyperparameters that do not change; by default those of rejeu's preset, else the algorithm's defaults."""
+    assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
+    """Hyperparameters to set instead of changing them, as for rejeu train."""
+    search: Annotated[Assignments, UseAppendAction, arg(metavar="NAME=LOW..HIGH ...")] = ()
+    """Other ranges, or further hyperparameters, as for rejeu tune."""
+    only: Annotated[Assignments, UseAppendAction, arg(metavar="NAME ...")] = ()
+    """Change these hyperparameters and no others."""
+    measure: Literal["return", "success"] = "return"
+    """Compare members by the mean return of the evaluation at the end of a round, or by its success rate."""
+    evaluate_episodes: Count = None
+    """Episodes of each evaluation; by default the preset's, else 20."""
+    checkpoint_minutes: Annotated[float, arg(metavar="M", help_behavior_hint="(default: 5)")] = 5.0
+    """Minutes between two checkpoints within a round."""
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Determines all hyperparameters and the seeds of all members."""
+    workers: Count = None
+    """Members trained at once; by default half as many as there are cores."""
+    out: Folder = None
+    """Folder of the population, new or empty; by default a new one under runs."""
     json: Json = False
     """Print the result as one JSON document, and messages to standard error."""
 
@@ -429,6 +478,7 @@ class Status:
 COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "tune": Tune,
+    "pbt": Pbt,
     "resume": Resume,
     "sweep": Sweep,
     "evaluate": Evaluate,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from contextlib import closing
+from itertools import chain
 from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
-from rejeu.cli import jsonout, run_folder, sweep, tune
+from rejeu.algorithms import config as configs
+from rejeu.cli import jsonout, pbt, run_folder, settings, sweep, tune
 from rejeu.cli.commands import Resume
 from rejeu.cli.output import echo
-from rejeu.cli.run_folder import RunFolder
+from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
 from rejeu.envs.make import WorkerOptions
 from rejeu.interrupt import Interrupt
@@ -29,6 +32,8 @@ def run(arguments: Resume) -> int:
         return jsonout.run(sweep.resume, arguments)
     if StudyFolder(arguments.run).plan.is_file():
         return jsonout.run(tune.resume, arguments)
+    if (arguments.run / pbt.FILE).is_file():
+        return jsonout.run(pbt.resume, arguments)
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
     return jsonout.run(resume, arguments)
@@ -49,7 +54,10 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
-            agent = kind.resume(folder.checkpoints, env)
+            agent = kind.resume(folder.checkpoints, env, **changes(arguments, config))
+        if arguments.assignments:
+            config = dataclasses.replace(config, hyperparameters=configs.to_json(agent.config))
+            run_folder.write_config(folder, config)
         limits = choose_limits(agent, arguments)
         echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
         echo(f"checkpoint    {agent.resumed}")
@@ -66,6 +74,13 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
                 has_video=not arguments.no_video,
             )
             return session.run(stop, stopwatch)
+
+
+def changes(arguments: Resume, config: RunConfig) -> dict[str, Any]:
+    """Returns the hyperparameters that ``--set`` changes."""
+    given = [*chain.from_iterable(arguments.assignments)]
+    names = {assignment.partition("=")[0].strip().split(".")[0] for assignment in given}
+    return {name: value for name, value in settings.apply(given, config.hyperparameters).items() if name in names}
 
 
 def choose_limits(agent: Agent, arguments: Resume) -> Limits:

@@ -14,6 +14,10 @@ MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
 INTEGERS = {
     "steps": (1, 2**63 - 1),
+    "pause": (1, 2**63 - 1),
+    "members": (2, 1000),
+    "rounds": (1, 100_000),
+    "round_steps": (1, 2**62),
     "envs": (1, MAX_ENVS),
     "episodes": (1, 2**63 - 1),
     "evaluate_every": (1, 2**63 - 1),
@@ -35,6 +39,8 @@ def check_values(arguments: Any) -> None:
     given = {key: value for key, value in vars(arguments).items() if value is not None}
     if {"steps", "minutes"} <= given.keys():
         raise ValueError("--steps and --minutes exclude each other; give one of them")
+    if {"pause", "seeds"} <= given.keys():
+        raise ValueError("--pause is for a single run; leave it out, or --seeds")
     if "jobs" in given and "seeds" not in given:
         raise ValueError("--jobs is for several seeds; give --seeds N too")
     for key, value in given.items():

@@ -82,7 +82,7 @@ def begin(arguments: Train, seed: int, first: Session | None, stack: ExitStack) 
         RunFolder(Path()),
         made,
         stack.enter_context(closing(make_evaluation_env(config, made))),
-        Limits(config.steps, config.minutes),
+        Limits(config.steps, config.minutes, pause_steps=arguments.pause),
         is_new=True,
         has_report=not arguments.no_report,
         has_video=not arguments.no_video,

@@ -10,7 +10,7 @@ from rejeu import presets, tuning
 from rejeu.agents import AGENTS, agent_of_file, find_agent
 from rejeu.algorithms.search import Dimension
 from rejeu.cli import environment, jsonout, settings
-from rejeu.cli.commands import Resume, Tune
+from rejeu.cli.commands import Pbt, Resume, Tune
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
 from rejeu.interrupt import NAMES, Interrupt
@@ -83,7 +83,7 @@ def make_plan(arguments: Tune, made: Environment) -> Plan:
     )
 
 
-def algorithm_of(arguments: Tune, made: Environment, preset: Preset | None) -> str | None:
+def algorithm_of(arguments: Tune | Pbt, made: Environment, preset: Preset | None) -> str | None:
     """Returns the name of the algorithm to tune, None if it is not known."""
     if arguments.algo is not None:
         return find_agent(arguments.algo).algorithm.Config.name

@@ -267,13 +267,25 @@ def read(path: Path) -> Plan:
         if len(data) > MAX_BYTES:
             raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
         plan = convert(parse_json(data), Plan)
-        config_class = agent_of_file(plan.algorithm, path).algorithm.Config
-        for name, dimension in plan.search_space.items():
-            for value in dimension.ends():
-                validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
+        check(plan, path)
         return plan
     except (ValueError, TypeError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from None
+
+
+def check(plan: Plan, path: Path) -> None:
+    """Raises ``ValueError`` or ``TypeError`` if the algorithm of a plan from a file does not take its hyperparameters."""
+    config_class = agent_of_file(plan.algorithm, path).algorithm.Config
+    for name, dimension in plan.search_space.items():
+        for value in dimension.ends():
+            validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
+
+
+def default_values(plan: Plan) -> dict[str, Any]:
+    """Returns the values of the searched hyperparameters in the default, as far as they lie in the search space."""
+    config = validation.build(AGENTS[plan.algorithm].algorithm.Config, plan.fixed)
+    values = spaces.values_at(configs.to_json(config), plan.search_space)
+    return {name: value for name, value in values.items() if plan.search_space[name].contains(value)}
 
 
 def difference(plan: Plan, other: Plan) -> str:

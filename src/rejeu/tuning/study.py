@@ -24,9 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from filelock import FileLock, Timeout
 
-from rejeu import presets, validation
-from rejeu.agents import AGENTS
-from rejeu.algorithms import config as configs
+from rejeu import presets
 from rejeu.errors import CheckpointError, MissingExtra
 from rejeu.io import atomic
 from rejeu.presets import Preset
@@ -234,8 +232,7 @@ def create(folder: StudyFolder, plan: Plan) -> Study:
     with folder.lock():
         study = connect(folder, plan)
         if not study.get_trials(deepcopy=False):
-            config = validation.build(AGENTS[plan.algorithm].algorithm.Config, plan.fixed)
-            values = spaces.values_at(configs.to_json(config), plan.search_space)
+            values = plans.default_values(plan)
             study.enqueue_trial(spaces.encoded(plan.search_space, values), user_attrs={INDEX: 0})
         plans.write(plan, folder.plan)
     return Study(folder, plan, study)

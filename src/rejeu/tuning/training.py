@@ -53,6 +53,15 @@ def env_options(
     return tuple(words)
 
 
+def settings_options(hyperparameters: Mapping[str, Any]) -> list[str]:
+    """Returns the words of a command line that set hyperparameters.
+
+    >>> settings_options({"gamma": 0.9})
+    ['--set', 'gamma=0.9']
+    """
+    return ["--set", *(f"{name}={json.dumps(value)}" for name, value in hyperparameters.items())]
+
+
 class Training:
     """One training. Mutable."""
 

@@ -211,7 +211,10 @@ class JaxVector(VectorEnv):
         return goal_functions(self.env)
 
     def snapshot(self) -> list[np.ndarray] | None:
-        return None if self.state is None else [np.asarray(leaf) for leaf in jax.tree.leaves(self.state)]
+        arrays = jax.tree.leaves(self.state)
+        if not arrays or any(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in arrays):
+            return None
+        return [np.asarray(leaf) for leaf in arrays]
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
         template = jax.eval_shape(lambda: reset_all(self.env, jax.random.key(0), self.n_envs))
