@@ -7,20 +7,21 @@ import time
 import warnings
 import weakref
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from multiprocessing import connection
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 
 from rejeu.envs.workers.local import check_sendable
 from rejeu.envs.workers.process import Description, Failure
-from rejeu.envs.workers.worker import CLOSE_SECONDS, LOOK_SECONDS, Lost, Starter, Worker, seconds_until
+from rejeu.envs.workers.worker import CLOSE_SECONDS, LOOK_SECONDS, Listener, Lost, Starter, Worker, seconds_until
 from rejeu.errors import WorkerError
 
 TIMEOUT = 300.0
 """Default timeout of a step or a reset, in seconds."""
 START_SECONDS = 600.0
 """Minimum timeout for making an environment, in seconds. It does not apply if there is no timeout."""
+IDLE_SECONDS = 0.001
+"""Pause where only workers are ready that nothing was asked of, in seconds."""
 RESTARTED = "worker_restarted"
 """Key of ``info`` with the reason why the worker of an environment was restarted."""
 
@@ -65,10 +66,11 @@ class Workers:
         self._makes, self._starter = list(makes), starter
         self.timeout = timeout
         self.restarts_left = self._restarts = restarts
+        self._listener = Listener()
         self._look_at = 0.0
-        """When :meth:`first` looks next for workers that hang or are gone, in the time of ``time.monotonic``."""
+        """When it is checked next whether workers hang or are gone, in the time of ``time.monotonic``."""
         self.workers: list[Worker] = []
-        self._finalizer = weakref.finalize(self, _end, self.workers, starter)
+        self._finalizer = weakref.finalize(self, _end, self.workers, starter, self._listener)
         try:
             for number, make in enumerate(self._makes):
                 self.workers.append(starter.start(number, make))
@@ -121,34 +123,44 @@ class Workers:
         Raises:
             WorkerError: if a worker was lost and cannot be replaced. All workers are then terminated.
         """
-        deadline = None if self.timeout is None else time.monotonic() + self.timeout
-        # all answers, otherwise the next request would receive the remaining ones
-        return self._without_lost({number: self._answer(number, deadline) for number in numbers})
+        waiting, found = {*numbers}, dict[int, Any]()
+        while waiting:  # all answers, otherwise the next request would receive the remaining ones
+            found |= self._arrived(waiting)
+            waiting -= found.keys()
+        return self._without_lost(found)
 
     def first(self, numbers: Collection[int]) -> dict[int, Any]:
         """Waits until one of these workers has answered, and returns what has arrived, in any order.
 
-        The answers and errors are those of :meth:`answers`. Each request has the timeout for itself.
+        The answers and errors are those of :meth:`answers`.
         """
-        waiting = {self.workers[number].pipe: number for number in numbers}
         found: dict[int, Any] = {}
         while not found:
-            ready = connection.wait([*waiting], seconds_until(self._look_at, LOOK_SECONDS))
-            found = {waiting[pipe]: self._answer(waiting[pipe], None) for pipe in ready}  # type: ignore[index]
-            if time.monotonic() >= self._look_at:
-                overdue = [number for number in numbers if number not in found and self._is_overdue(number)]
-                found |= {number: self._answer(number, 0.0) for number in overdue}
-                self._look_at = time.monotonic() + LOOK_SECONDS
+            found = self._arrived(numbers)
         return self._without_lost(found)
+
+    def _arrived(self, numbers: Collection[int]) -> dict[int, Any]:
+        """Returns the answers that arrive within :data:`LOOK_SECONDS`, and :class:`Lost` for workers without one."""
+        ready = self._listener.ready(self.workers, seconds_until(self._look_at, LOOK_SECONDS))
+        found = {number: self._answer(number) for number in ready if number in numbers}
+        if ready and not found:  # those that have ended while nothing was asked of them would be ready for ever
+            time.sleep(IDLE_SECONDS)
+        if time.monotonic() >= self._look_at:
+            overdue = [number for number in numbers if number not in found and self._is_overdue(number)]
+            found |= {number: self._answer(number, 0.0) for number in overdue}
+            self._look_at = time.monotonic() + LOOK_SECONDS
+        return found
 
     def _is_overdue(self, number: int) -> bool:
         worker = self.workers[number]
         late = self.timeout is not None and time.monotonic() >= worker.asked_at + self.timeout
         return late or not worker.alive
 
-    def _answer(self, number: int, deadline: float | None) -> Any:
+    def _answer(self, number: int, deadline: float | None = None) -> Any:
+        """Returns the answer of a worker, which has arrived if there is no deadline."""
+        worker = self.workers[number]
         try:
-            return self.workers[number].answer(deadline)
+            return worker.receive() if deadline is None else worker.answer(deadline)
         except Lost as lost:
             return lost
 
@@ -206,7 +218,8 @@ class Workers:
         self._finalizer()
 
 
-def _end(workers: Sequence[Worker], starter: Starter) -> None:
+def _end(workers: Sequence[Worker], starter: Starter, listener: Listener) -> None:
+    listener.close()
     for worker in workers:
         worker.stop()
     for worker in workers:

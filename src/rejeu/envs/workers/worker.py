@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import selectors
+import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from multiprocessing import connection
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -86,16 +89,52 @@ class Worker(ABC):
                     raise EOFError
                 if deadline is not None and time.monotonic() >= deadline:
                     raise Lost(f"{self.place} gave no answer to {self.asked!r}")
+        except (EOFError, OSError):
+            raise self._lost() from None
+        return self.receive()
+
+    def receive(self) -> Any:
+        """Returns the answer, which has arrived; errors are those of :meth:`answer`."""
+        try:
             answer = process.receive(self.pipe)
         except (EOFError, OSError):
-            raise Lost(f"{self.place} ended by itself at {self.asked!r} ({self.end()})") from None
-        except Lost:
-            raise
+            raise self._lost() from None
         except Exception as error:  # unpickling an object of an unknown class can raise anything
             self.asked = None
             raise WorkerError(f"what environment {self.number} sent cannot be read in this process: {error}") from error
         self.asked = None
         return answer
+
+    def _lost(self) -> Lost:
+        return Lost(f"{self.place} ended by itself at {self.asked!r} ({self.end()})")
+
+
+class Listener:
+    """Waits for the first of several workers to answer. Mutable: connections stay registered between calls."""
+
+    def __init__(self) -> None:
+        self._pipes: list[Connection] = []
+        self._selector: selectors.BaseSelector | None = None
+
+    def ready(self, workers: Sequence[Worker], seconds: float) -> list[int]:
+        """Waits for at most so many seconds, and returns the indices of workers whose connection has an answer, or an end."""
+        pipes = [worker.pipe for worker in workers]
+        if sys.platform == "win32":  # where selectors take sockets only
+            found = {*connection.wait(pipes, seconds)}
+            return [i for i, pipe in enumerate(pipes) if pipe in found]
+        if pipes != self._pipes or self._selector is None:
+            self.close()
+            self._pipes, self._selector = pipes, selectors.DefaultSelector()
+            for i, pipe in enumerate(pipes):
+                if not pipe.closed:
+                    self._selector.register(pipe, selectors.EVENT_READ, i)
+        return [key.data for key, _ in self._selector.select(seconds)]
+
+    def close(self) -> None:
+        """Forgets the connections."""
+        if self._selector is not None:
+            self._selector.close()
+        self._selector = None
 
 
 class Starter(ABC):
