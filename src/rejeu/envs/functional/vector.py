@@ -103,7 +103,7 @@ def _next_keys(keys: Array, counts: Array) -> Array:
 
 def split(env: FunctionalEnv) -> tuple[Any, Any]:
     """Returns the arrays of an environment, and the rest as a static argument that equal environments share."""
-    arrays, rest = eqx.partition(env, eqx.is_array)
+    arrays, rest = eqx.partition(env, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
     leaves, tree = jax.tree.flatten(rest)
     return arrays, (tuple(leaves), tree)
 
