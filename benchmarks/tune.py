@@ -1,7 +1,7 @@
 """Tunes SAC on Pendulum-v1 and PPO on LunarLanderContinuous-v3, interrupts both studies, and records what was found.
 
     python benchmarks/tune.py
-    python benchmarks/tune.py pendulum --trials 6 --steps 2000 --final-seeds 2 --out /tmp/tune.json
+    python benchmarks/tune.py pendulum --trials 6 --steps 2000 --final-seeds 3 --out /tmp/tune.json
 
 Each study is a ``rejeu tune`` command. After a third of its trials it is stopped by Ctrl-C, after two thirds it is killed, and
 each time ``rejeu resume`` continues it. The result has the winner against the default on fresh seeds, the numbers of complete,

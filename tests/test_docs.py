@@ -22,7 +22,7 @@ import rejeu
 from rejeu import cli, validation
 from rejeu.algorithms import ppo, sac
 from rejeu.cli import settings
-from rejeu.sweeps import processes
+from rejeu.sweeps import process
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -110,7 +110,7 @@ def trainings_pretend(monkeypatch):
     """Lets the trainings of a study run a program that pretends."""
     pytest.importorskip("optuna")
     fake = Path(__file__).parent / "tuning" / "fake_training.py"
-    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(fake), *words])
+    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(fake), *words])
 
 
 @pytest.fixture

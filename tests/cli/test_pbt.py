@@ -11,7 +11,7 @@ import pytest
 
 import rejeu
 from rejeu import cli
-from rejeu.sweeps import processes
+from rejeu.sweeps import process
 
 FAKE = Path(__file__).parents[1] / "tuning" / "fake_training.py"
 SMALL = ["--algo", "SAC", "--members", "4", "--rounds", "2", "--round-steps", "10", "--only", "learning_rate"]
@@ -21,7 +21,7 @@ SMALL += ["--search", "learning_rate=1e-5..4e-3"]
 @pytest.fixture
 def pretend(monkeypatch):
     """Lets trainings run a program that pretends."""
-    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
+    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
     monkeypatch.setattr("rejeu.tuning.members.POLL", 0.03)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rejeu import cli
-from rejeu.sweeps import processes
+from rejeu.sweeps import process
 
 optuna = pytest.importorskip("optuna")
 FAKE = Path(__file__).parents[1] / "tuning" / "fake_training.py"
@@ -21,7 +21,7 @@ SMALL = ["--steps", "40", "--evaluate-every", "10", "--only", "learning_rate", "
 @pytest.fixture
 def pretend(monkeypatch):
     """Lets trainings run a program that pretends."""
-    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
+    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
     monkeypatch.setattr("rejeu.tuning.search.POLL", 0.03)
 
 
@@ -37,6 +37,17 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
     assert "trials        3 complete" in printed
     assert f"preset        {tmp_path / 'study' / 'preset.json'}" in printed
     assert (tmp_path / "study" / "study.html").is_file()
+
+
+def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeypatch):
+    from rich.console import Console
+
+    monkeypatch.setattr(Console, "is_terminal", True)
+    assert tune("--trials", "2", "--final-seeds", "0", out=tmp_path / "study") == 0
+    printed = capsys.readouterr().out
+    assert "1 of 2 trials have ended, best return" in printed
+    assert "hyperparameters" in printed
+    assert "trial   1  complete" in printed
 
 
 def test_result_as_json_and_continuation(pretend, tmp_path, capsys):
@@ -115,12 +126,12 @@ def command(*words):
 @pytest.mark.exhaustive
 def test_the_preset_of_a_real_study_trains(tmp_path):
     out = tmp_path / "study"
-    words = [*REAL, "--trials", 3, "--steps", 2000, "--final-seeds", 2, "--trial-seeds", 2, "--out", out, "--json"]
+    words = [*REAL, "--trials", 3, "--steps", 2000, "--final-seeds", 3, "--trial-seeds", 2, "--out", out, "--json"]
     done = subprocess.run(command(*words), capture_output=True, text=True, check=True)
     result = json.loads(done.stdout)
     assert [one["state"] for one in result["trials"]] == ["complete"] * 3
     assert result["verdict"] in ("better", "worse", "no difference found")
-    assert [row["runs"] for row in result["comparison"]] == [2, 2]
+    assert [row["runs"] for row in result["comparison"]] == [3, 3]
     words = ["train", "CartPole-v1", "--preset", out / "preset.json", "--out", tmp_path / "run", "--no-video"]
     subprocess.run(command(*words), capture_output=True, check=True)
 

@@ -50,6 +50,7 @@ def test_hindsight_is_searched_where_it_is_used():
         ),
         ({"fixed": {"lr": 1}}, TypeError, "the step size is called learning_rate"),
         ({"trials": 0}, ValueError, "trials=0"),
+        ({"final_seeds": 2}, ValueError, "final_seeds=2 cannot tell luck from a difference; give 3 or more, or 0"),
         ({"trial_seeds": 0}, ValueError, "trial_seeds=0"),
         ({"pruner": "hyperband"}, ValueError, "pruner='hyperband'"),
         ({"seed": -1}, ValueError, "seed=-1"),

@@ -11,7 +11,7 @@ import pytest
 from rejeu.algorithms.search import Choice, Integers, LogUniform, NearOne, Uniform
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.interrupt import Interrupt
-from rejeu.sweeps import processes
+from rejeu.sweeps import process, processes
 from rejeu.tuning import members as trained, population as populations
 from rejeu.tuning.members import Members
 from rejeu.tuning.training import Command
@@ -31,7 +31,7 @@ SPACE = {
 @pytest.fixture(autouse=True)
 def pretend(monkeypatch):
     """Lets trainings run the program that pretends."""
-    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
+    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
     monkeypatch.setattr("rejeu.tuning.members.POLL", 0.03)
 
 
@@ -97,8 +97,7 @@ def test_a_copy_has_weights_of_its_source_and_perturbed_hyperparameters(tmp_path
     assert (members.run(worst) / "checkpoints" / "mine").exists()
 
 
-@pytest.mark.parametrize("workers", [1, 4])
-def test_a_population_that_is_interrupted_goes_on_as_it_would_have(tmp_path, workers):
+def test_a_population_that_is_interrupted_goes_on_as_it_would_have(tmp_path):
     undisturbed = trained.create(tmp_path / "undisturbed", make())
     assert train(undisturbed)
     members = trained.create(tmp_path / "population", make())
@@ -107,10 +106,10 @@ def test_a_population_that_is_interrupted_goes_on_as_it_would_have(tmp_path, wor
     def interrupt(text):
         stop.signal = 2
 
-    assert not train(members, workers, stop, interrupt)
+    assert not train(members, 4, stop, interrupt)
     assert members.n_decided() == 1
     other = Members(tmp_path / "population", populations.read(tmp_path / "population" / "population.json"))
-    assert train(other, workers)
+    assert train(other, 1)
     assert other.history() == undisturbed.history()
 
 

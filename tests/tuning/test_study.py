@@ -10,7 +10,7 @@ import pytest
 from rejeu import presets, tuning
 from rejeu.errors import CheckpointError
 from rejeu.interrupt import Interrupt
-from rejeu.sweeps import processes
+from rejeu.sweeps import process, processes
 from rejeu.tuning import LogUniform, final, plan as plans, study as studies
 from rejeu.tuning.search import Search
 from rejeu.tuning.study import StudyFolder
@@ -25,7 +25,7 @@ RATE = {"learning_rate": LogUniform(1e-5, 4e-3)}
 @pytest.fixture(autouse=True)
 def pretend(monkeypatch):
     """Lets trainings run the program that pretends."""
-    monkeypatch.setattr(processes, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
+    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
     monkeypatch.setattr("rejeu.tuning.search.POLL", 0.03)
     monkeypatch.setattr("rejeu.tuning.final.POLL", 0.03)
 
@@ -35,7 +35,7 @@ def make_plan(**changes):
         "trials": 4,
         "steps": 40,
         "evaluate_every": 10,
-        "final_seeds": 2,
+        "final_seeds": 3,
         "only": ("learning_rate",),
         "search": RATE,
     }
@@ -79,7 +79,7 @@ def test_a_study_with_one_worker_is_reproducible_and_another_seed_differs(tmp_pa
 
 
 def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(tmp_path):
-    plan = make_plan(steps=200, final_seeds=0)
+    plan = make_plan(trials=3, steps=200, final_seeds=0)
     undisturbed = run(tuning.open_study(plan, tmp_path / "undisturbed"))
     stop = Interrupt()
 
@@ -93,7 +93,7 @@ def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(tmp_pa
     second = run(studies.join(StudyFolder(tmp_path / "study")))
     assert facts(second) == facts(undisturbed)
     begun = commands(tmp_path / "study")
-    assert sorted(word for word, _ in begun) == ["resume", "train", "train", "train", "train"]
+    assert sorted(word for word, _ in begun) == ["resume", "train", "train", "train"]
 
 
 def test_a_trial_whose_process_was_killed_is_entered_again_with_its_parameters(tmp_path):
@@ -150,7 +150,7 @@ def test_a_trial_is_the_mean_over_its_seeds(tmp_path):
 
 def test_a_failed_trial_keeps_its_reason_and_does_not_stop_the_study(tmp_path):
     rates = {"learning_rate": LogUniform(6e-3, 1e-2)}
-    result = run(tuning.open_study(make_plan(trials=3, search=rates, final_seeds=2), tmp_path / "study"))
+    result = run(tuning.open_study(make_plan(trials=3, search=rates, final_seeds=3), tmp_path / "study"))
     assert [one.state for one in result.trials] == ["failed"] * 3
     assert all(one.reason.endswith("exit status 2: at step 20: the loss is NaN") for one in result.trials)
     assert (result.best, result.final, result.preset) == (None, None, None)

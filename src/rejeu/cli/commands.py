@@ -189,7 +189,7 @@ class Tune(EnvironmentOptions):
     trial_seeds: Annotated[int, arg(metavar="K")] = 1
     """Seeds of each trial, trained at once, whose evaluations are averaged."""
     final_seeds: Annotated[int, arg(metavar="K")] = 5
-    """Fresh seeds on which the winner is compared with the default; 0 for no comparison."""
+    """Fresh seeds on which the winner is compared with the default, at least 3; 0 for no comparison."""
     pruner: Literal["median", "halving", "none"] = "median"
     """Stop trials that are below the median of the others, or by successive halving, or none."""
     measure: Literal["return", "success"] = "return"

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from rich.markup import escape
 
 from rejeu import presets, tuning
 from rejeu.agents import AGENTS, agent_of_file, find_agent
@@ -15,11 +20,17 @@ from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.presets import Preset
+from rejeu.reporting.report.sections import duration
+from rejeu.reporting.tabular import number
 from rejeu.reporting.text import counted
 from rejeu.tuning import plan as plans, space, study as studies
 from rejeu.tuning.plan import Plan
-from rejeu.tuning.study import Study, StudyFolder
+from rejeu.tuning.search import Watch
+from rejeu.tuning.study import Outcome, Study, StudyFolder
 from rejeu.tuning.training import env_options
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 def run(arguments: Tune) -> int:
@@ -106,8 +117,8 @@ def complete(
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
     options = env_options(made.kwargs, made.wrapper_names, imports)
-    with Interrupt() as stop:
-        result = tuning.run(study, made.typed, options, workers, stop, tuning.lines(echo, study), echo)
+    with Interrupt() as stop, display(study) as watch:
+        result = tuning.run(study, made.typed, options, workers, stop, watch, echo)
     echo()
     if stop.signal is not None:
         again = "".join(f" --import {name}" for name in imports)
@@ -116,6 +127,64 @@ def complete(
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()
     return (0 if result.complete and result.best is not None else 2), result.to_dict()
+
+
+@contextmanager
+def display(study: Study) -> Iterator[Watch]:
+    """Returns a function that prints a line for each trial that has ended and, on a terminal, a table of those that run."""
+    from rich.console import Console
+    from rich.live import Live
+
+    lines, console = tuning.lines(echo, study), Console()
+    if not console.is_terminal:
+        yield lines
+        return
+    began, before = time.monotonic(), sum(is_ended(one) for one in study.outcomes())
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+
+        def watch(outcomes: list[Outcome]) -> None:
+            lines(outcomes)
+            ended = sum(is_ended(one) for one in outcomes)
+            pace = (time.monotonic() - began) / (ended - before) if ended > before else math.nan
+            live.update(table(outcomes, study.plan, pace * (study.plan.trials - ended)), refresh=True)
+
+        yield watch
+
+
+def is_ended(outcome: Outcome) -> bool:
+    """Returns whether a trial has ended."""
+    return outcome.state in ("complete", "pruned", "failed")
+
+
+def table(outcomes: list[Outcome], plan: Plan, seconds_left: float) -> Table:
+    """Returns the trials that run, with the state of the study below."""
+    from rich import box
+    from rich.table import Table
+
+    found = Table(box=box.SIMPLE, caption=progress(outcomes, plan, seconds_left), caption_justify="left")
+    for name in ("trial", "step", plan.measure):
+        found.add_column(name, justify="right")
+    found.add_column("hyperparameters", overflow="fold")
+    for one in outcomes:
+        if one.state == "running":
+            values = " ".join(f"{name}={tuning.short(value)}" for name, value in one.values.items())
+            step = f"{max(one.evaluations, default=0):,} of {plan.steps:,}"
+            found.add_row(str(one.index), step, number(one.value), escape(values))
+    return found
+
+
+def progress(outcomes: list[Outcome], plan: Plan, seconds_left: float) -> str:
+    """Returns how far a study is.
+
+    >>> progress([], plans.make("Pendulum-v1"), math.nan)
+    '0 of 30 trials have ended'
+    """
+    parts = [f"{sum(is_ended(one) for one in outcomes)} of {plan.trials} trials have ended"]
+    if (best := studies.best_of(outcomes)) is not None:
+        parts.append(f"best {plan.measure} {number(best.value)} (trial {best.index})")
+    if math.isfinite(seconds_left):
+        parts.append(f"about {duration(seconds_left)} left")
+    return ", ".join(parts)
 
 
 def header(study: Study, made: Environment) -> list[str]:

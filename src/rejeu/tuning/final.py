@@ -19,7 +19,7 @@ from rejeu.presets import Preset
 from rejeu.reporting import statistics
 from rejeu.reporting.comparison import Comparison, compare
 from rejeu.reporting.runs import Run, read_run
-from rejeu.tuning.plan import Measure
+from rejeu.tuning.plan import MIN_FINAL_SEEDS, Measure
 from rejeu.tuning.search import IDLE, POLL
 from rejeu.tuning.study import Outcome, Study, hold
 from rejeu.tuning.training import Command, Training
@@ -133,7 +133,7 @@ def result(study: Study, best: Outcome, failed: list[str]) -> Final:
         return Final("the default itself", None, None, ())
     runs = {name: finished(study.folder.final / name) for name in (winner_name(best), DEFAULT)}
     labels = {winner_name(best): f"winner (trial {best.index})", DEFAULT: DEFAULT}
-    if not all(runs.values()):
+    if min(map(len, runs.values())) < MIN_FINAL_SEEDS:
         return Final("not compared", None, None, tuple(failed))
     labeled = [dataclasses.replace(run, algorithm=labels[name]) for name, found in runs.items() for run in found]
     comparison = compare(labeled, "algorithm", score="evaluation", seed=study.plan.seed)

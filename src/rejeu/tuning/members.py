@@ -36,7 +36,7 @@ from rejeu.interrupt import Interrupt
 from rejeu.io import atomic
 from rejeu.reporting.runs import EVALUATIONS
 from rejeu.reporting.tables import read_table
-from rejeu.sweeps.processes import Process, last_line
+from rejeu.sweeps.process import Process, last_line
 from rejeu.tuning import population as populations
 from rejeu.tuning.population import DECISIONS, Decision, Population
 from rejeu.tuning.training import Command, settings_options
@@ -173,13 +173,9 @@ class Members:
 
 
 def create(path: Path, population: Population) -> Members:
-    """Returns the members of a new folder, with their presets."""
-    members = Members(path, population)
-    for member, values in enumerate(population.initial()):
-        preset = population.plan.preset(populations.hyperparameters(population, values), f"rejeu pbt, member {member}")
-        presets.write(preset, members.run(member).with_name("preset.json"))
+    """Returns the members of a new folder."""
     populations.write(population, path / "population.json")
-    return members
+    return Members(path, population)
 
 
 def train(members: Members, command: Command, workers: int, stop: Interrupt, echo: Echo) -> bool:
@@ -241,15 +237,15 @@ def train_round(members: Members, number: int, command: Command, workers: int, s
 def begin(members: Members, member: int, values: Mapping[str, Any], target: int, command: Command) -> Process:
     """Starts the process that trains a member to a step."""
     plan, run = members.population.plan, members.run(member)
+    complete = populations.hyperparameters(members.population, values)
     step = members.step(member)
     if step < 0:
         if run.exists():
             shutil.rmtree(run)  # it was killed before its first checkpoint
-        preset, seed = run.with_name("preset.json"), plan.seeds(member)[0]
-        words = [*command.train(preset, seed, run, plan.checkpoint_minutes), "--pause", str(target)]
+        preset = presets.write(plan.preset(complete, f"rejeu pbt, member {member}"), run.with_name("preset.json"))
+        words = [*command.train(preset, plan.seeds(member)[0], run, plan.checkpoint_minutes), "--pause", str(target)]
     else:
         given = {name.split(".")[0]: None for name in values}
-        complete = populations.hyperparameters(members.population, values)
         words = [*command.resume(run), *settings_options({name: complete[name] for name in given})]
         words += ["--steps", str(target - step)] if target > step else []
     lock = run.with_name("process.lock")
@@ -277,8 +273,8 @@ def best_member(members: Members) -> int:
 
 def line(number: int, decisions: list[Decision], population: Population) -> str:
     """Returns what a round found on one line."""
-    scores = np.array([one.score for one in decisions if one.score is not None])
-    best = max(range(len(decisions)), key=lambda i: -math.inf if decisions[i].score is None else decisions[i].score)
+    known = {i: one.score for i, one in enumerate(decisions) if one.score is not None}
+    scores, best = np.array([*known.values()]), max(known, key=lambda i: known[i])
     copies = ", ".join(f"{i} copies {one.parent}" for i, one in enumerate(decisions) if one.parent is not None)
     found = f"round {number:>3}  step {population.step(number + 1):>9,}  {population.plan.measure} "
     return found + f"{scores.mean():,.4g} (best {scores.max():,.4g}, member {best})" + f"  {copies}" * bool(copies)

@@ -25,6 +25,8 @@ from rejeu.tuning import space as spaces
 MAX_BYTES = 2**20
 """Upper limit on the size of a ``study.json``."""
 MAX_TRIALS = 100_000
+MIN_FINAL_SEEDS = 3
+"""Least number of seeds of a comparison; the interval of fewer is too narrow."""
 EVALUATIONS = 10
 """Evaluations of a trial, unless their interval is given."""
 SAMPLING, TRIALS, FINAL = range(3)
@@ -173,6 +175,10 @@ def make(
     fixed = {key: configs.value_to_json(value) for key, value in (fixed or {}).items()}
     values = {**base.hyperparameters, **fixed}
     space = choose_space(name, values, fixed, search or {}, only)
+    if 0 < final_seeds < MIN_FINAL_SEEDS:
+        raise ValueError(
+            f"final_seeds={final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
+        )
     total = validation.whole("steps", steps or base.total_steps, least=1)
     plan = Plan(
         env_id=env_id,
