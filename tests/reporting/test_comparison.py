@@ -174,6 +174,16 @@ def test_groups_that_mix_settings_get_a_note(tmp_path):
     )
 
 
+def test_runs_of_the_same_seed_get_a_note(tmp_path):
+    for i, (algorithm, seed) in enumerate((("DQN", 0), ("DQN", 0), ("PPO", 0), ("PPO", 1))):
+        write_run(tmp_path / str(i), algorithm, seed=seed)
+    note = "DQN: runs of this group have the same seed; they count as several, but are not independent"
+    assert compare(tmp_path, samples=10).notes[0] == note
+    others = compare([tmp_path / "1", tmp_path / "2"], "env", samples=10)  # of two algorithms
+    assert len(others.groups[0].runs) == 2
+    assert not any("same seed" in one for one in others.notes)
+
+
 def test_runs_of_the_same_name_get_that_of_the_folder_above(tmp_path):
     for parent in ("a", "b"):
         write_run(tmp_path / parent / "seed_0")

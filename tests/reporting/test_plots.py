@@ -114,6 +114,7 @@ def test_evaluations_stand_at_their_time_when_drawn_against_seconds():
 @pytest.mark.parametrize("n", [0, 1])
 def test_a_run_of_hardly_any_episodes_can_be_drawn(tmp_path, n):
     learning_curve(history(n, success=1.0), tmp_path / "curve.png", evaluations=[evaluated(1_000, 1.0)])
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_nothing_of_matplotlibs_global_state_is_touched():

@@ -7,6 +7,7 @@ import html
 import itertools
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -329,14 +330,23 @@ def compare(
 
 
 def warnings_of(curves: Sequence[Curve]) -> list[str]:
-    """Returns a note about groups that mix settings, and one about runs whose episodes are not known."""
+    """Returns notes about groups that mix settings, seeds that occur twice, and runs whose episodes are not known."""
     groups: dict[tuple[str, str], list[Run]] = {}
     for one in curves:
         groups.setdefault((one.label, one.env), []).append(one.run)
-    mixed = [label for (label, _), runs in groups.items() if len({*settings(runs)}) > 1]
+    mixed, repeated = [], []
+    for (label, _), runs in groups.items():
+        named = settings(runs)
+        mixed += [label] if len({*named}) > 1 else []
+        seeds = Counter((run.seed, setting) for run, setting in zip(runs, named, strict=True) if run.seed is not None)
+        repeated += [label] if seeds and max(seeds.values()) > 1 else []
     notes = [
         f"{shown(label, 100)}: the runs of this group differ in their settings; --by setting separates them"
         for label in dict.fromkeys(mixed)
+    ]
+    notes += [
+        f"{shown(label, 100)}: runs of this group have the same seed; they count as several, but are not independent"
+        for label in dict.fromkeys(repeated)
     ]
     means = sum(not len(one.run.episodes) for one in curves)
     if means:
