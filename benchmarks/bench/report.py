@@ -50,6 +50,8 @@ IN_THE_WAY = (
     "by itself, and 102 to 126 us after a step.",
     "**Parking on highway-env is limited by the environment**, which takes 90 % of the training time.",
     "**PPO on Gymnasium is limited by the environments.** The ratio at the limit is below 4 with 16 environments.",
+    "**Calls of compiled code and environments on the host** are no limit where both are one program: see [Training on the "
+    "device](device.md).",
 )
 """Profiling results on the machine of the report."""
 

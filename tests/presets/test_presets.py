@@ -52,3 +52,11 @@ def test_result_shows_mean_interval_and_seeds():
 def test_first_result_is_of_the_preset_as_it_is():
     assert presets.find_result("CartPole-v1", "PPO").setting == ""
     assert presets.find_result("Taxi-v3", "DQN") is None
+
+
+def test_environments_in_jax_have_the_presets_of_their_twins():
+    preset, twin = presets.find("jax/Parking-v0"), presets.find("parking-v0")
+    assert dict(preset.hyperparameters) == dict(twin.hyperparameters)
+    assert (preset.env_id, preset.backend, preset.n_envs) == ("jax/Parking-v0", "jax", twin.n_envs)
+    assert presets.find("jax/Parking-v0", "DQN") is None
+    assert {*presets.TWINS.values()} <= {preset.env_id for preset in presets.ALL}

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from rejeu.presets import ball, box2d, classic_control, parking, robotics
 from rejeu.presets.files import read, write
 from rejeu.presets.preset import Preset
@@ -16,6 +18,15 @@ ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PR
 
 registered: dict[str, tuple[Preset, ...]] = {}
 """Presets of algorithms that are not rejeu's, by the name of the algorithm; see :func:`register`."""
+
+TWINS = {
+    "jax/Parking-v0": "parking-v0",
+    "jax/Ball-v0": "rejeu/Ball-v0",
+    "jax/CartPole-v1": "CartPole-v1",
+    "jax/Pendulum-v1": "Pendulum-v1",
+    "jax/MountainCar-v0": "MountainCar-v0",
+}
+"""Environments in JAX that are equal to another environment, whose presets they have."""
 
 ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "MultiBinary": "PPO"}
 """The default algorithm of an environment without a preset, by the class of its action space."""
@@ -46,8 +57,18 @@ def default(env_id: str, algorithm: str) -> Preset:
 
 
 def find(env_id: str, algorithm: str | None = None) -> Preset | None:
-    """Returns the preset of an environment, the first one or that of ``algorithm``, or None if there is none."""
-    return next((p for p in every() if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
+    """Returns the preset of an environment, the first one or that of ``algorithm``, or None if there is none.
+
+    An environment in JAX that equals another one has its presets.
+
+    >>> find("jax/Parking-v0").backend
+    'jax'
+    """
+    found = next((p for p in every() if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
+    if found is not None or env_id not in TWINS:
+        return found
+    twin = find(TWINS[env_id], algorithm)
+    return twin and dataclasses.replace(twin, env_id=env_id, backend="jax", source=f"the preset of {twin.env_id}")
 
 
 __all__ = [
