@@ -79,7 +79,10 @@ SCALED = ("ppo", "parking", "parking, 1 update in 16 steps")
 
 
 def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
-    """Returns one measurement; ``kind`` is ``device``, ``host`` (the peer) or ``host jax`` (the host's loop in JAX)."""
+    """Returns one measurement; ``kind`` is ``device``, ``host`` (the peer) or ``host jax`` (the host's loop in JAX).
+
+    Several seeds on the host are those of ``train_seeds``, whose environments are Gymnasium's.
+    """
     import jax
 
     import rejeu
@@ -107,7 +110,7 @@ def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> di
         train_seeds(
             algorithm,
             policy,
-            case.env,
+            case.peer if kind == "host" else case.env,
             10**9,
             seeds=n_seeds,
             n_envs=n_envs,
@@ -150,6 +153,9 @@ def plan(cases: list[str], seeds: list[int], envs: list[int]) -> list[tuple[str,
         case = CASES[name]
         found += [(name, kind, case.n_envs, 1) for kind in ("device", "host", "host jax")]
         found += [(name, "device", case.n_envs, n) for n in seeds if n > 1 and name in SEEDED]
+        found += [
+            (name, "host", case.n_envs, n) for n in seeds if 1 < n <= 8 and name in SEEDED and case.algorithm != "PPO"
+        ]
         found += [(name, "device", n, 1) for n in envs if n != case.n_envs and name in SCALED]
     return found
 
@@ -161,7 +167,8 @@ def table(results: list[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for one in results:
-        base = next((r for r in results if r["case"] == one["case"] and r["kind"] == "host" and "error" not in r), None)
+        same = [r for r in results if r["case"] == one["case"] and r["n_seeds"] == 1 and "error" not in r]
+        base = next((r for r in same if r["kind"] == "host"), None)
         if "error" in one:
             cells = ["-", "-", one["error"][:60]]
         else:

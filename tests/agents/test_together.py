@@ -42,6 +42,9 @@ def train_alone(kind: Any, env: Any, n_steps: int, n_envs: int, seed: int, setti
     [
         (rejeu.DQN, "jax/CartPole-v1", SMALL, {"learning_rate": [1e-4, 1e-3]}),
         (rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}),
+        (rejeu.DQN, "CartPole-v1", {**SMALL, "priorities": {}}, {}),
+        pytest.param(rejeu.TD3, "Pendulum-v1", {**SMALL, "normalize": True, "action_noise": 0.1, "overlap": False}, {},
+                     marks=pytest.mark.exhaustive),
         pytest.param(rejeu.SAC, "jax/Pendulum-v1", SMALL, {"tau": [0.01, 0.1]}, marks=pytest.mark.exhaustive),
         pytest.param(
             rejeu.DDPG,
@@ -88,7 +91,8 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any) -> Non
 @pytest.mark.parametrize(
     ("env", "settings", "message"),
     [
-        ("CartPole-v1", {}, "environment in JAX"),
+        ("CartPole-v1", {"learning_rate": [1e-3, 1e-4]}, "in JAX environments only"),
+        ("CartPole-v1", {"train_freq": [1, "episode"]}, "updates depend on episodes"),
         ("jax/CartPole-v1", {"gamma": [0.9, 0.99]}, "gamma cannot differ"),
         ("jax/CartPole-v1", {"batch_size": [8, 16]}, "batch_size cannot differ"),
         ("jax/CartPole-v1", {"priorities": {}}, "prioritized replay"),
@@ -117,3 +121,19 @@ def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
         )
     assert raised.value.batch is not None
     assert raised.value.batch.parent == tmp_path / "1e+30"
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("normalize", [False, True])
+def test_an_error_of_one_run_on_the_host_names_its_batch(tmp_path: Any, normalize: bool) -> None:
+    def callbacks(agent: Any) -> list[Any]:
+        agent.report_folder = tmp_path
+        agents.append(agent)
+        return []
+
+    agents: list[Any] = []
+    settings = {**SMALL, "learning_rate": 1e30, "normalize": normalize}
+    with pytest.raises(rejeu.NonFiniteError) as raised:
+        rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "CartPole-v1", 120, seeds=2, callback=callbacks, **settings)
+    assert raised.value.batch is not None
+    assert all(np.isfinite(value).all() for value in agents[0].get_parameters().values())

@@ -30,8 +30,7 @@ def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[Any]) -> 
         return None
     reason = reason_against(agent, callbacks)
     if reason is None:
-        every = tuple(sorted({one.every for one in callbacks if isinstance(one, Periodic) and one.every is not None}))
-        return Stops(every, at_episodes=call.n_episodes is not None)
+        return stops_at(call, callbacks)
     if agent.on_device:
         raise ValueError(
             f"on_device=True is not possible: {reason}; leave it at None to train with the loop of the host"
@@ -46,19 +45,30 @@ def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[Any]) -> 
     return None
 
 
+def stops_at(call: TrainingCall, callbacks: Sequence[Any]) -> Stops:
+    """Returns where limits and callbacks need the program to return to the host."""
+    every = tuple(sorted({one.every for one in callbacks if isinstance(one, Periodic) and one.every is not None}))
+    return Stops(every, at_episodes=call.n_episodes is not None)
+
+
 def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
     """Returns why an agent cannot train on the device, None if it can."""
     run, config = agent.run, agent.config
     if not isinstance(run.env, JaxVector):
         return f"the backend of {run.env.env_id} is {run.env.backend!r}, not 'jax'"
-    for callback in callbacks:
-        if isinstance(callback, TrainingCallback) and callback.every_step:
-            return f"the callback {type(callback).__name__} must be called after every step"
+    if reason := reason_against_callbacks(callbacks):
+        return reason
     if isinstance(config, OffPolicyConfig):
         return reason_against_replay(run.replay, config)
     if agent.takes_masks:
         return "action masks exist on the host only"
     return None if config.n_episodes is None else "rollouts of n_episodes whole episodes exist on the host only"
+
+
+def reason_against_callbacks(callbacks: Sequence[Any]) -> str | None:
+    """Returns which callback must be called after every step, None if there is none."""
+    named = [type(one).__name__ for one in callbacks if isinstance(one, TrainingCallback) and one.every_step]
+    return f"the callback {named[0]} must be called after every step" if named else None
 
 
 def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:

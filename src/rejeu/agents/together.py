@@ -14,13 +14,14 @@ from typing import Any, TypeVar
 
 import jax
 
+from rejeu import xla
 from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
 from rejeu.agents.base import whole_seed
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.envs.functional.registry import is_functional
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt
 from rejeu.loops import finite
@@ -32,6 +33,8 @@ from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Sink
 
 A = TypeVar("A", bound=Agent)
+MANY = 8
+"""Number of runs from which on their layers are large enough for several threads."""
 STATIC = ("buffer_size", "learning_starts", "batch_size", "n_steps", "n_epochs")
 """Whole numbers on which the shapes or the course of a program depend, which runs of one program therefore share."""
 IN_REPLAY = ("gamma",)
@@ -52,7 +55,7 @@ def train_seeds(
     progress_bar: bool = False,
     **settings: Any,
 ) -> list[A]:
-    """Trains independent runs in one program on the device, and returns their agents.
+    """Trains independent runs together, in JAX environments in one program on the device, and returns their agents.
 
     Every run is that of an agent with the same seed and settings that was trained alone, up to the rounding of sums, whose
     order differs (see ``docs/device.md``).
@@ -60,7 +63,8 @@ def train_seeds(
     Args:
         kind: the class of the agents, such as ``rejeu.SAC``.
         policy: as for the agent.
-        env: the id of an environment in JAX, or such an environment.
+        env: an id, or an environment in JAX. Other environments are stepped on the host, those of one run after those of
+            another, and one call acts or updates for all runs; that is possible for off-policy agents.
         total_timesteps: environment steps of each run.
         seeds: how many runs, with the seeds 0, 1, ...; or their seeds.
         n_envs: environments of each run.
@@ -75,17 +79,16 @@ def train_seeds(
         The agents: for the first values of such hyperparameters one of each seed, then for the next.
 
     Raises:
-        ValueError: if the environment is not one in JAX, or a setting cannot be trained on the device or cannot differ.
+        ValueError: if the environment is an object that runs would share, or a setting is not supported or cannot differ.
 
     >>> import rejeu
     >>> agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 60, seeds=2, learning_rate=[1e-4, 1e-3])
     >>> [(agent.seed, agent.config.learning_rate) for agent in agents]
     [(0, 0.0001), (1, 0.0001), (0, 0.001), (1, 0.001)]
     """
-    if not (isinstance(env, FunctionalEnv) or is_functional(env)):
+    if not isinstance(env, str | FunctionalEnv):
         raise ValueError(
-            f"env={env!r}: several seeds in one program need the id of an environment in JAX, such as 'jax/Pendulum-v1', or "
-            "a FunctionalEnv; for others train one agent after the other, or use rejeu train ENV --seeds N"
+            f"env={env!r}: every run needs environments of its own; give an id, such as 'Pendulum-v1', or a FunctionalEnv"
         )
     numbers = [*range(seeds)] if isinstance(seeds, int) else [whole_seed(one) for one in seeds]
     if not numbers:
@@ -93,6 +96,7 @@ def train_seeds(
     lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
     fixed = {name: value for name, value in settings.items() if name not in lists}
     values = [dict(zip(lists, one, strict=True)) for one in itertools.product(*lists.values())]
+    start_device(len(numbers) * len(values))
     agents: list[A] = []
     for one in values:
         vector = lambda seed: first_envs(kind, env, n_envs, seed)  # noqa: E731
@@ -103,6 +107,12 @@ def train_seeds(
     callbacks = [training.listed(None if callback is None else callback(agent)) for agent in agents]
     learn_together(agents, calls, callbacks, progress_bar=progress_bar, differing=tuple(lists))
     return agents
+
+
+def start_device(n_runs: int) -> None:
+    """Starts JAX's device for so many runs in one program: with all threads if they are many."""
+    if n_runs >= MANY:
+        xla.start_device(xla.cores())
 
 
 def first_envs(kind: type[Agent], env: Any, n_envs: int, seed: int) -> Any:
@@ -218,19 +228,36 @@ def common_stops(
     """
     found: set[int] = set()
     for agent, call, one in zip(agents, calls, callbacks, strict=True):
-        if reason := device.reason_against(agent, one):
-            raise ValueError(f"several runs in one program are not possible: {reason}")
+        if reason := reason_against(agent, one):
+            raise ValueError(
+                f"several runs in one program are not possible: {reason}; use rejeu train --seeds N --jobs M"
+            )
         if call.n_episodes is not None:
             raise ValueError("several runs in one program end after steps or minutes, not after episodes")
-        agent.stops = device.stops_of(agent, call, one)
-        assert agent.stops is not None
+        agent.stops = device.stops_at(call, one)
         found |= {*agent.stops.every}
     return Stops(tuple(sorted(found)))
+
+
+def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
+    """Returns why an agent cannot be trained with others in one program, None if it can."""
+    assert agent.env is not None
+    if agent.env.backend == "jax":
+        return device.reason_against(agent, callbacks)
+    if not isinstance(agent.config, OffPolicyConfig):
+        return f"{agent.name} is on-policy, and the backend of {agent.env.env_id} is {agent.env.backend!r}, not 'jax'"
+    if not isinstance(agent.config.train_freq, int):
+        return f"updates depend on episodes (train_freq={agent.config.train_freq!r})"
+    return device.reason_against_callbacks(callbacks)
 
 
 def check_differing(agent: Agent, names: Iterable[str]) -> None:
     """Raises ``ValueError`` if hyperparameters cannot differ between the runs of one program."""
     kinds = {field.name: str(field.type) for field in dataclasses.fields(agent.config)}
+    if [*names] and (agent.env is None or agent.env.backend != "jax"):
+        raise ValueError(
+            f"{', '.join(names)}: hyperparameters can differ between the runs of one program in JAX environments only"
+        )
     for name in names:
         if name in STATIC or "float" not in kinds[name] or (name in IN_REPLAY and hasattr(agent.config, "buffer_size")):
             raise ValueError(

@@ -8,7 +8,7 @@ from typing import Any
 
 from rejeu.agents import training
 from rejeu.agents.device import reason_against
-from rejeu.agents.together import learn_together
+from rejeu.agents.together import learn_together, start_device
 from rejeu.cli import run_folder, seeds, sweep
 from rejeu.cli.commands import Train
 from rejeu.cli.output import echo, header
@@ -36,6 +36,7 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
     """
     stopwatch, jobs = Stopwatch(), seeds.make_jobs(arguments)
     path = seeds.choose_folder(arguments)
+    start_device(len(jobs))
     with ExitStack() as stack:
         first = begin(arguments, jobs[0].seed, None, stack)
         if reason := reason_against(first.agent, ()):

@@ -50,7 +50,7 @@ def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
     ("n_envs", "settings"),
     [
         (1, {}),
-        (3, {"train_freq": 4, "gradient_steps": 2, "n_steps": 2}),
+        pytest.param(3, {"train_freq": 4, "gradient_steps": 2, "n_steps": 2}, marks=pytest.mark.exhaustive),
         pytest.param(2, {"train_freq": (2, "episode"), "gradient_steps": 3}, marks=pytest.mark.exhaustive),
         pytest.param(2, {"overlap": False, "gradient_steps": -1}, marks=pytest.mark.exhaustive),
     ],
@@ -71,7 +71,7 @@ def test_dqn_equals_the_loop_of_the_host(n_envs: int, settings: dict[str, Any]) 
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
-        (rejeu.SAC, {"normalize": True, "action_noise": 0.1}),
+        pytest.param(rejeu.SAC, {"normalize": True, "action_noise": 0.1}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.TD3, {"action_noise": "ou(0.2)"}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.CrossQ, {}, marks=pytest.mark.exhaustive),
     ],

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.loops.checks import check_state
-from rejeu.loops.device.machine import Machine
 from rejeu.loops.device.turns import NO_LIMIT, Limits
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import NonFiniteUpdate
@@ -35,7 +34,7 @@ class Stops(NamedTuple):
 
 
 def train(
-    machine: Machine,
+    machine: Any,
     runs: Sequence[Run],
     learner: Learner,
     n_steps: int | None,
@@ -47,7 +46,7 @@ def train(
     """Trains runs of equal settings for exactly ``n_steps`` environment steps each; yields after every chunk.
 
     Args:
-        machine: the program.
+        machine: the program, a :class:`rejeu.loops.device.machine.Machine` or one with its methods.
         runs: mutated; consistent whenever the generator has yielded.
         learner: the algorithm.
         n_steps: over all environments of a run; None: until the caller stops.
@@ -105,7 +104,7 @@ def train(
         yield turns
 
 
-def raise_fault(machine: Machine, which: int, run: Run, limits: Limits) -> None:
+def raise_fault(machine: Any, which: int, run: Run, limits: Limits) -> None:
     """Raises the error of a run in a chunk; an error of an update says which run it is."""
     try:
         machine.raise_fault(run, limits)

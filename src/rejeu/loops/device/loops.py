@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.loops.device.driver import Stops, train
+from rejeu.loops.device.host_machine import HostMachine
 from rejeu.loops.device.off_policy_machine import OffPolicyMachine
 from rejeu.loops.device.on_policy_machine import OnPolicyMachine
 from rejeu.loops.device.variants import Variants
@@ -76,6 +77,11 @@ def together(
         variants: what makes the algorithm, if hyperparameters differ.
         hyper: those that differ, by run.
     """
+    if runs[0].env.backend != "jax":
+        assert isinstance(config, OffPolicyConfig)
+        host = HostMachine(runs, learner, config)
+        yield from train(host, runs, learner, n_steps, progress, stops, begin_episodes, active)
+        return
     differing = [{}] * len(runs) if hyper is None else hyper
     if isinstance(config, OnPolicyConfig):
         on = OnPolicyMachine(runs, learner, config, stops, variants, differing)
