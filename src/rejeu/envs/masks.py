@@ -17,6 +17,9 @@ from gymnasium import spaces
 
 from rejeu.core import Masked
 from rejeu.envs.adapters import adapter_of
+from rejeu.envs.functional import masks as functional_masks, registry as functional
+from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, check_workers, make_vector
 from rejeu.envs.registry import maker
@@ -207,6 +210,13 @@ def make_masked(
         env = make_vector(env, seed=seed)
     if isinstance(env, MaskedVector):
         return env
+    if isinstance(env, FunctionalEnv) or backend == "jax" or (backend == "auto" and functional.is_functional(env)):
+        env = make_vector(env, n_envs, "jax", seed)
+    if isinstance(env, JaxVector):
+        n = n_choices(env.action_space, env.env_id)
+        masked = MaskedVector(env.with_env(functional_masks.MaskInObservation(env.env, n), seed))
+        masked.made_from = env.made_from
+        return masked
     if isinstance(env, InProcess):
         return MaskedVector(env.with_wrapper(MaskInObservation, seed))
     if isinstance(env, VectorEnv | gym.vector.VectorEnv):

@@ -228,6 +228,13 @@ class JaxVector(VectorEnv):
         self._obs, self._seed = obs, None
         return []
 
+    def with_env(self, env: FunctionalEnv, seed: Seed = None) -> JaxVector:
+        """Returns a vector of ``env`` instead, which replaces this one and has its seeds, or else ``seed``."""
+        seed = seed if self._seed is None else self._seed
+        vector = JaxVector(env, self.n_envs, seed, env_id=self.env_id, reward_threshold=self.reward_threshold)
+        vector.seeds, vector.made_from = self.seeds, self.made_from
+        return vector
+
     def state_of(self, i: int) -> Any:
         """Returns the state of environment ``i`` as NumPy arrays, None before the first reset."""
         return None if self.state is None else jax.tree.map(lambda leaf: np.asarray(leaf[i]), self.state.env)
