@@ -52,13 +52,14 @@ class Connection:
             self.ray.shutdown()
 
 
-def connect(address: str | None = None, purpose: str = "backend='ray'") -> Connection:
+def connect(address: str | None = None, purpose: str = "backend='ray'", shows_output: bool = True) -> Connection:
     """Connects this process to a Ray cluster, or uses the connection that it has.
 
     Args:
         address: ``"HOST:PORT"`` of the cluster, or ``"auto"`` for the one that this machine belongs to. None: the one in the
             environment variable ``RAY_ADDRESS``, else one that is started on this machine for this process.
         purpose: what needs Ray, for the message if it is not installed.
+        shows_output: whether this process prints what others of the cluster print, and Ray's notices of lost nodes.
 
     Raises:
         MissingExtra: if Ray is not installed.
@@ -87,6 +88,7 @@ def connect(address: str | None = None, purpose: str = "backend='ray'") -> Conne
                     _node_ip_address=None if given else LOOPBACK,
                     logging_level=logging.ERROR,
                     configure_logging=False,
+                    log_to_driver=shows_output,
                 )
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             where = "a cluster on this machine" if given is None else f"the Ray cluster {given!r}"

@@ -23,6 +23,8 @@ REFRESH = 5.0
 """Seconds between two looks at the nodes of the cluster."""
 ANSWER = 60.0
 """Seconds that a node has to answer when the sweep begins."""
+PATIENCE = 120.0
+"""Seconds after which a run that was asked to stop, but waits for a node or hangs, is canceled."""
 END = 30.0
 """Seconds that the tasks have to end when the sweep ends early."""
 
@@ -32,12 +34,16 @@ class RayRun:
 
     def __init__(self, launcher: RayLauncher, name: str, result: Any, log: Path) -> None:
         self._launcher, self._name, self._result, self._log = launcher, name, result, log
+        self._cancel_at = math.inf
 
     def poll(self) -> int | None:
         """Returns the exit status, ``LOST`` if the node or the worker process was lost; None while it runs."""
         ray = self._launcher.ray
         ready, _ = ray.wait([self._result], timeout=0)
         if not ready:
+            if time.monotonic() > self._cancel_at:
+                self._cancel_at = math.inf
+                ray.cancel(self._result)
             return None
         try:
             return int(ray.get(self._result))
@@ -51,6 +57,7 @@ class RayRun:
     def stop(self) -> None:
         """Asks it to stop after the current step, with a checkpoint."""
         self._launcher.desk.stop.remote(self._name)
+        self._cancel_at = time.monotonic() + PATIENCE
 
     def _note(self, error: Exception) -> None:
         """Writes an error of the cluster to the log."""
@@ -73,7 +80,7 @@ class RayLauncher:
             MissingExtra: if Ray is not installed.
             ClusterError: if the cluster cannot be reached, a node has other versions, or none has room for a run.
         """
-        self._connection = cluster.connect(address, "rejeu sweep --ray")
+        self._connection = cluster.connect(address, "rejeu sweep --ray", shows_output=False)
         self.ray = self._connection.ray
         self._resources, self._workers = folder.sweep.resources, workers
         self._path = folder.path.resolve()

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from rejeu.reporting.text import counted
-from rejeu.sweeps.coordinator import Coordinator, count
+from rejeu.sweeps.coordinator import Coordinator, Outcome, count
 from rejeu.sweeps.folder import Glance, SweepFolder
 
 if TYPE_CHECKING:
@@ -75,7 +75,9 @@ class Display:
         for one in outcomes:
             if one.state == "done" and one.job.name not in self.finished:
                 self.finished[one.job.name] = self.folder.glance(one.job)
-        found = Table(box=box.SIMPLE, title=str(self.folder.path), caption=summary(coordinator, running, self.finished))
+        found = Table(
+            box=box.SIMPLE, title=str(self.folder.path), caption=summary(coordinator, outcomes, running, self.finished)
+        )
         for name in ("run", "state", "steps", "training return", "best evaluation"):
             found.add_column(name, justify="left" if name in ("run", "state") else "right")
         order = {"running": 0, "failed": 1, "stopped": 2, "done": 3, "waiting": 4}
@@ -87,9 +89,10 @@ class Display:
         return found
 
 
-def summary(coordinator: Coordinator, running: dict[str, Glance], finished: dict[str, Glance]) -> str:
+def summary(
+    coordinator: Coordinator, outcomes: list[Outcome], running: dict[str, Glance], finished: dict[str, Glance]
+) -> str:
     """Returns one line: the number of jobs in each state, the best result of each environment, the remaining time."""
-    outcomes = coordinator.outcomes()
     states = count(one.state for one in outcomes)
     parts = [f"{number} {state}" for state, number in states.items() if number]
     best: dict[str, tuple[float, str]] = {}
@@ -98,11 +101,13 @@ def summary(coordinator: Coordinator, running: dict[str, Glance], finished: dict
         if glance is not None and math.isfinite(glance.best):
             best[one.job.env] = max(best.get(one.job.env, (-math.inf, "")), (glance.best, one.job.name))
     parts += [f"best {value:,.2f} ({name})" for value, name in list(best.values())[:3]]
-    left = remaining(coordinator, running, finished)
+    left = remaining(coordinator, outcomes, running, finished)
     return ", ".join([*parts, f"about {duration(left)} left"] if math.isfinite(left) else parts)
 
 
-def remaining(coordinator: Coordinator, running: dict[str, Glance], finished: dict[str, Glance]) -> float:
+def remaining(
+    coordinator: Coordinator, outcomes: list[Outcome], running: dict[str, Glance], finished: dict[str, Glance]
+) -> float:
     """Returns the seconds that the sweep still takes, from the mean time of a step so far; NaN if that is not known.
 
     Runs of different lengths are compared by their steps. Starting a run is not counted.
@@ -111,7 +116,7 @@ def remaining(coordinator: Coordinator, running: dict[str, Glance], finished: di
     steps, seconds = sum(one.step for one in known), sum(one.seconds for one in known)
     if not steps or not coordinator.launcher.capacity:
         return math.nan
-    asked = [job.options.steps for job in coordinator.folder.jobs if job.name not in finished]
+    asked = [one.job.options.steps for one in outcomes if one.state not in ("done", "failed")]
     if any(one is None for one in asked):
         return math.nan
     left = sum(one or 0 for one in asked) - sum(one.step for one in running.values())

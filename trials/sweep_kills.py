@@ -1,0 +1,251 @@
+"""Kills runs, Ray workers, Ray nodes and sweeps at random moments, and compares the models with those of an undisturbed sweep.
+
+    python trials/sweep_kills.py --kills 30
+
+The plan has eight runs: SAC on Pendulum, DQN and PPO on CartPole. An undisturbed sweep trains it once, two runs at a
+time. Then sweeps are disturbed until there were as many kills as asked for, first with local processes, then on a Ray
+cluster of a head and two nodes on this machine. Every kill is a SIGKILL at a random moment: of a run; of the process
+``rejeu sweep`` (local), after which ``rejeu resume`` continues; of a Ray worker, or of everything that belongs to a node,
+in whose place a new one begins.
+
+Before each kill of a run the training time since its newest checkpoint is noted, which is what it loses. The others let their
+runs stop with a checkpoint. All arrays of the final models are compared bit for bit, and at the end no process may be left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+RESULT = Path(__file__).parent / "results" / "sweep_kills.json"
+LOOPBACK = {"node_ip_address": "127.0.0.1", "include_dashboard": False}
+ENVIRON = {**os.environ, "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
+PLAN = """\
+seeds = 2
+threads = 1
+steps = {steps}
+checkpoint_minutes = {minutes}
+evaluate_every = 1000000
+evaluate_episodes = 2
+no_report = true
+no_video = true
+
+[environments.Pendulum-v1]
+algorithms = ["SAC"]
+
+[environments.CartPole-v1]
+algorithms = ["DQN", "PPO"]
+
+[settings.a]
+policy_kwargs.net_arch = [32, 32]
+
+[settings.b]
+algorithms = ["SAC"]
+policy_kwargs.net_arch = [16, 16]
+"""
+
+
+class Cluster:
+    """A Ray cluster of a head that runs nothing and two nodes with one CPU each. Mutable."""
+
+    def __init__(self) -> None:
+        from ray import cluster_utils
+
+        self.cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={**LOOPBACK, "num_cpus": 0})
+        self.nodes = [self.cluster.add_node(**LOOPBACK, num_cpus=1) for _ in range(2)]
+
+    def replace_a_node(self, rng: random.Random) -> None:
+        node = self.nodes.pop(rng.randrange(2))
+        self.cluster.remove_node(node, allow_graceful=False)
+        self.nodes.append(self.cluster.add_node(**LOOPBACK, num_cpus=1))
+
+
+@contextlib.contextmanager
+def no_cluster() -> Iterator[None]:
+    yield
+
+
+@contextlib.contextmanager
+def new_cluster() -> Iterator[Cluster]:
+    os.environ.update({key: ENVIRON[key] for key in ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "RAY_USAGE_STATS_ENABLED")})
+    cluster = Cluster()
+    try:
+        yield cluster
+    finally:
+        cluster.cluster.shutdown()
+
+
+def start(words: list[str], log: Path) -> subprocess.Popen[bytes]:
+    with log.open("ab") as file:
+        return subprocess.Popen([sys.executable, "-m", "rejeu", *words], stdout=file, stderr=file, env=ENVIRON)
+
+
+def processes(folder: Path) -> list[tuple[int, int, str]]:
+    """Returns id, parent and run of the processes that train in a folder."""
+    found = subprocess.run(["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
+    rows = [line.split(None, 2) for line in found.splitlines()]
+    rows = [row for row in rows if len(row) == 3 and "-m rejeu" in row[2] and f"{folder}/" in row[2]]
+    runs = [(int(pid), int(parent), args.partition(f"{folder}/")[2].split()[0]) for pid, parent, args in rows]
+    return [row for row in runs if (folder / f"{row[2]}.log").is_file()]
+
+
+def seconds_since_checkpoint(run: Path) -> float | None:
+    """Returns the training time of the present process since the newest checkpoint; None if it does not train."""
+    folder = run / "checkpoints"
+    if (run / "agent.safetensors").is_file():  # written after the last checkpoint
+        return None
+    with contextlib.suppress(FileNotFoundError):
+        times = [path.stat().st_mtime for path in folder.glob("run_*.safetensors")]
+        if times:  # the lock is touched when training begins
+            return time.time() - max(*times, (folder / "lock").stat().st_mtime)
+    return None
+
+
+def kill(pid: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+
+
+def disturb(
+    sweep: subprocess.Popen[bytes], folder: Path, cluster: Cluster | None, rng: random.Random
+) -> tuple[str, float | None] | None:
+    """Kills something; returns what, and the seconds of training that it costs its run. None if nothing trains."""
+    running = processes(folder)
+    if not running or sweep.poll() is not None:
+        return None
+    pid, parent, name = rng.choice(running)
+    kind = rng.choices(["run", "worker", "node"] if cluster else ["run", "sweep"], [4, 3, 2] if cluster else [4, 1])[0]
+    lost = seconds_since_checkpoint(folder / name)
+    if kind == "run":
+        kill(pid)
+        return kind, lost
+    if kind == "sweep":
+        kill(sweep.pid)
+        sweep.wait()
+    elif kind == "worker":
+        kill(parent)
+    elif cluster is not None:
+        cluster.replace_a_node(rng)
+    return kind, None
+
+
+def wait_for_end(folder: Path, seconds: float = 120.0) -> float:
+    """Waits until no process trains in a folder, and returns how long that took; infinite if it takes too long."""
+    began = time.monotonic()
+    while processes(folder):
+        if time.monotonic() - began > seconds:
+            return float("inf")
+        time.sleep(0.1)
+    return time.monotonic() - began
+
+
+def models(folder: Path) -> dict[str, Any]:
+    from safetensors.numpy import load_file
+
+    return {path.parent.name: load_file(path) for path in sorted(folder.glob("*/agent.safetensors"))}
+
+
+def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Returns the names of the models whose arrays are not the same bits."""
+
+    def bits(arrays: dict[str, Any]) -> dict[str, tuple[Any, ...]]:
+        return {key: (array.dtype, array.shape, array.tobytes()) for key, array in arrays.items()}
+
+    names = one.keys() | other.keys()
+    return sorted(
+        name for name in names if name not in one or name not in other or bits(one[name]) != bits(other[name])
+    )
+
+
+def trial(
+    kills: int, plan: Path, undisturbed: dict[str, Any], root: Path, cluster: Cluster | None, rng: random.Random
+) -> dict[str, Any]:
+    """Disturbs sweeps until there were so many kills."""
+    counts: Counter[str] = Counter()
+    lost: list[float] = []
+    ends: list[float] = []
+    different: list[str] = []
+    failed = rounds = 0
+    options = ["--workers", "2"] + (["--ray", cluster.cluster.address] if cluster else [])
+    while counts.total() < kills:
+        rounds += 1
+        folder, log = root / f"{'ray' if cluster else 'local'}-{rounds}", root / "printed.log"
+        sweep = start(["sweep", str(plan), "--out", str(folder), *options], log)
+        while sweep.poll() is None:
+            time.sleep(rng.uniform(3.0, 10.0))
+            done = disturb(sweep, folder, cluster, rng) if counts.total() < kills else None
+            if done is None:
+                continue
+            kind, seconds = done
+            counts[kind] += 1
+            lost += [] if seconds is None else [seconds]
+            print(
+                f"kill {counts.total()}: {kind}" + (f", {seconds:.2f} s lost" if seconds is not None else ""),
+                flush=True,
+            )
+            if kind == "sweep":
+                ends.append(wait_for_end(folder))
+                sweep = start(["resume", str(folder), *options], log)
+        failed += sweep.returncode != 0
+        ends.append(wait_for_end(folder))
+        different += [f"{folder.name}/{name}" for name in differing(undisturbed, models(folder))]
+    if failed:
+        print((root / "printed.log").read_text(encoding="utf-8"))
+    return {
+        "kills": counts.total(),
+        **{f"kills_of_a_{kind}": number for kind, number in sorted(counts.items())},
+        "sweeps": rounds,
+        "sweeps_that_failed": failed,
+        "runs": rounds * len(undisturbed),
+        "most_seconds_of_training_lost": round(max(lost, default=0.0), 2),
+        "models_that_differ": different,
+        "most_seconds_until_no_process_was_left": round(max(ends), 2),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=30, help="of each kind of sweep")
+    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--checkpoint-seconds", type=float, default=3.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=["local", "ray"])
+    parser.add_argument("--out", type=Path, default=RESULT)
+    arguments = parser.parse_args()
+    from provenance import provenance
+
+    rng = random.Random(arguments.seed)
+    result: dict[str, Any] = {**provenance(), "checkpoint_interval_seconds": arguments.checkpoint_seconds}
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name).resolve()
+        plan = root / "plan.toml"
+        plan.write_text(PLAN.format(steps=arguments.steps, minutes=arguments.checkpoint_seconds / 60), encoding="utf-8")
+        began = time.monotonic()
+        sweep = start(["sweep", str(plan), "--out", str(root / "undisturbed"), "--workers", "2"], root / "printed.log")
+        if sweep.wait() != 0:
+            raise SystemExit((root / "printed.log").read_text(encoding="utf-8"))
+        undisturbed = models(root / "undisturbed")
+        print(f"{len(undisturbed)} runs took {time.monotonic() - began:.0f} s undisturbed", flush=True)
+        for kind, opened in (("local", no_cluster), ("ray", new_cluster)):
+            if arguments.only in (None, kind):
+                with opened() as cluster:
+                    result[kind] = trial(arguments.kills, plan, undisturbed, root, cluster, rng)
+                print(json.dumps(result[kind], indent=1), flush=True)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
