@@ -70,7 +70,8 @@ def test_each_run_equals_the_one_trained_alone(
         assert_same_runs(agent, train_alone(kind, env, 120, 2, agent.seed, {**settings, **values}))
 
 
-def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any) -> None:
+@pytest.mark.parametrize("env", ["jax/CartPole-v1", pytest.param("CartPole-v1", marks=pytest.mark.exhaustive)])
+def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: str) -> None:
     evaluations: dict[int, Evaluate] = {}
 
     def callbacks(agent: Any) -> list[Any]:
@@ -79,9 +80,10 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any) -> Non
         )
         return [evaluations[agent.seed], lambda agent, progress: agent.seed != 1 or progress.step < 50]
 
-    agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 120, seeds=3, callback=callbacks, **SMALL)
+    agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", env, 120, seeds=3, callback=callbacks, **SMALL)
     assert [agent.num_timesteps for agent in agents] == [120, 50, 120]
     assert [result.step for result in evaluations[2].results] == [50, 100]
+    assert [agent.run.replay.size() for agent in agents] == [120, 50, 120]
     loaded = rejeu.load(agents[2].save(tmp_path / "agent"))
     for name, value in agents[2].get_parameters().items():
         np.testing.assert_array_equal(value, loaded.get_parameters()[name])

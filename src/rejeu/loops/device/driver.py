@@ -67,7 +67,7 @@ def train(
         check_state(run, learner)
     timers = [Timer(run.seconds) for run in runs]
     pace = Pace(machine.capacity)
-    known: list[Any] = []
+    known, trained = list[Any](), list[int]()
     while active and (last is None or runs[active[0]].step < last):
         leader = runs[active[0]]
         for timer in timers:
@@ -75,12 +75,15 @@ def train(
         for run in runs:
             if run.obs is None or run.env.must_reset:
                 begin(run)
-        if not known or any(now is not then for now, then in zip(held(runs), known, strict=True)):
+        if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
+            trained = [*active]
             machine.push(runs, leader, progress(leader.step - first))
         for timer in timers:
             timer.lap("replay")
         step = leader.step
         n_turns = min(pace.turns, turns_left(step, n_envs, last, stops))
+        if step <= leader.learn_from:  # the turns that follow take longer
+            n_turns = min(n_turns, max(-(-(leader.learn_from - step) // n_envs), 1))
         limits = Limits(
             np.int32(n_turns),
             np.uint32(NO_LIMIT if last is None else last),
@@ -100,6 +103,8 @@ def train(
             turns[i] = machine.pull(i, runs[i])
             timers[i].lap("replay")
         pace.note(n_turns, time.perf_counter() - began)
+        if step <= leader.learn_from <= leader.step:
+            pace.turns = min(8, pace.turns)
         known = held(runs)
         yield turns
 

@@ -38,9 +38,13 @@ class HostMachine:
 
     capacity = MAX_TURNS
 
-    def __init__(self, runs: Sequence[Run], learner: Learner, config: OffPolicyConfig) -> None:
-        """Takes runs of equal settings."""
-        self.runs, self.learner, self.config = runs, learner, config
+    def __init__(self, learner: Learner, config: OffPolicyConfig, active: Sequence[int]) -> None:
+        """Takes the algorithm, its hyperparameters, and the indices of the runs that are trained, which may change."""
+        self.learner, self.config, self.active = learner, config, active
+        self.runs: list[Run] = []
+        """The runs that are trained."""
+        self.order: list[int] = []
+        """Their indices."""
         self.several = learner.several()
         self.state: PackedState = []
         """Packed states of all runs, with a leading axis."""
@@ -51,7 +55,7 @@ class HostMachine:
         self.readings: Readings | None = None
         self.n_bad: np.ndarray = np.zeros(0)
         """Bad updates of the last chunk, by run."""
-        self.in_a_row: np.ndarray = np.zeros(len(runs), np.int64)
+        self.in_a_row: np.ndarray = np.zeros(0, np.int64)
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
         """Returns False: there are no rollouts."""
@@ -59,7 +63,10 @@ class HostMachine:
 
     def push(self, runs: Sequence[Run], leader: Run, progress: float) -> None:
         """Stacks the states of the runs, and chooses first actions."""
+        self.order = [*self.active]
+        self.runs = runs = [runs[i] for i in self.order]
         self.state = [jax.numpy.asarray(part) for part in stacked([run.state for run in runs])]
+        self.in_a_row = np.zeros(len(runs), np.int64)
         clocks = [clock_of(run, progress) for run in runs]
         if any(run.action is None for run in runs):
             chosen = self.choose(clocks)
@@ -149,12 +156,13 @@ class HostMachine:
 
     def fault(self, which: int) -> bool:
         """Returns whether the last chunk left something that is not finite in a run."""
+        which = self.order.index(which)
         if self.learner.skips:
             return bool(self.in_a_row[which] >= MAX_SKIPPED)
         return bool(self.n_bad[which] or not is_finite(self.state_of(which)))
 
     def state_of(self, which: int) -> PackedState:
-        """Returns the packed state of a run."""
+        """Returns the packed state of a run by its place among those that are trained."""
         return [part[which] for part in self.state]
 
     def put_states(self) -> None:
@@ -164,6 +172,7 @@ class HostMachine:
 
     def pull(self, which: int, run: Run) -> Progress:
         """Puts what the last chunk did into a run, and returns it."""
+        which = self.order.index(which)
         run.state = self.state_of(which)
         run.monitor.n_skipped += int(self.n_bad[which]) if self.learner.skips else 0
         if self.readings is not None:

@@ -79,7 +79,7 @@ def together(
     """
     if runs[0].env.backend != "jax":
         assert isinstance(config, OffPolicyConfig)
-        host = HostMachine(runs, learner, config)
+        host = HostMachine(learner, config, active)
         yield from train(host, runs, learner, n_steps, progress, stops, begin_episodes, active)
         return
     differing = [{}] * len(runs) if hyper is None else hyper
