@@ -19,8 +19,8 @@ from typing import Any
 
 from rejeu.errors import ClusterError, MissingExtra
 
-LOOPBACK = "127.0.0.1"
-"""Address of a cluster that is started for this process: other machines cannot connect to it."""
+LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Environment variable without which Ray listens on the address of a network card, also for processes of one machine."""
 REACH_SECONDS = 10.0
 """Seconds that a cluster has to accept a connection."""
 MATCHING = ("rejeu", "gymnasium", "numpy")
@@ -67,6 +67,8 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
         ValueError: for an address of another form.
     """
     global _is_ours
+    if not (address or os.environ.get("RAY_ADDRESS")):
+        os.environ.setdefault(LOOPBACK, "0")  # read when Ray is imported, and by the processes that it starts
     try:
         import ray
     except ImportError as error:
@@ -85,7 +87,6 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
                 ray.init(
                     given,
                     include_dashboard=None if given else False,
-                    _node_ip_address=None if given else LOOPBACK,
                     logging_level=logging.ERROR,
                     configure_logging=False,
                     log_to_driver=shows_output,
