@@ -170,7 +170,22 @@ def test_a_run_that_cannot_be_started_is_one_line(tmp_path):
     launcher.start = fail_once
     states, lines = work(folder, launcher)
     assert states == {"job-0": "failed", "job-1": "done"}
-    assert "job-0 could not be started: [Errno 28] No space left on device" in lines
+    assert lines[0].startswith("job-0 could not be started: [Errno 28] No space left on device; rejeu resume")
+
+
+def test_a_job_that_cannot_be_claimed_is_one_line_and_stops_no_other(tmp_path, monkeypatch):
+    folder = make_folder(tmp_path, 2)
+    claim = type(folder).claim
+
+    def fail(self, job):
+        if job.name == "job-0":
+            raise OSError(28, "No space left on device")
+        return claim(self, job)
+
+    monkeypatch.setattr(type(folder), "claim", fail)
+    states, lines = work(folder, Launcher())
+    assert states == {"job-0": "waiting", "job-1": "done"}
+    assert "No space left" in lines[0]
 
 
 def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):

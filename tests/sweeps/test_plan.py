@@ -136,7 +136,7 @@ def test_sizes_are_limited(tmp_path):
     with pytest.raises(PlanError, match="bytes"):
         read_plan(write(tmp_path, "#" * 300_000))
     with pytest.raises(PlanError, match="lines"):
-        read_plan(write(tmp_path, "\n" * 3000))
+        read_plan(write(tmp_path, "\n" * 2000))
     with pytest.raises(PlanError, match="nested"):
         read_plan({"environments": "CartPole-v1", "settings": {"a": {"b": deep(30)}}})
     with pytest.raises(FileNotFoundError):

@@ -147,7 +147,11 @@ class Coordinator:
         held: list[Job] = []
         while self.waiting and len(self.running) < self.launcher.capacity:
             job = self.waiting.popleft()
-            claim = self.folder.claim(job)
+            try:
+                claim = self.folder.claim(job)
+            except OSError as error:
+                self._say_not_started(job, error)
+                continue
             if claim is None or self.folder.is_training(job):
                 held.append(job)
             elif self._is_open(job):
@@ -182,9 +186,14 @@ class Coordinator:
             claim.release()
             self.statuses[job.name] = 2
             self._note_exit(job, 2)
-            self.say(f"{job.name} could not be started: {' '.join(str(error).split())}")
+            self._say_not_started(job, error)
             return
         self.running.append(Attempt(job, claim, handle, first, time.monotonic()))
+
+    def _say_not_started(self, job: Job, error: OSError) -> None:
+        self.say(
+            f"{job.name} could not be started: {' '.join(str(error).split())}; rejeu resume {self.folder.path} tries again"
+        )
 
     def _end(self, attempt: Attempt, status: int) -> None:
         """Notes how a run ended: it is done, has failed, was stopped, or was lost and goes on later."""

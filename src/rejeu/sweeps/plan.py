@@ -27,9 +27,9 @@ from rejeu.sweeps.jobs import MAX_JOBS, Job, Options, flat, job_name
 from rejeu.sweeps.resources import Resources
 from rejeu.validation import unknown_name, whole
 
-MAX_BYTES = 2**18
+MAX_BYTES = 2**16
 """Upper limit on the size of a plan."""
-MAX_LINES = 2000
+MAX_LINES = 1000
 """Upper limit on the lines of a plan."""
 MAX_DEPTH = 12
 """Upper limit on nested tables and lists."""
@@ -168,7 +168,7 @@ def parse(content: Mapping[str, Any], source: Source) -> Plan:
     threads = None
     if "threads" in content:
         threads = checked(source, ("threads",), whole, "threads", content["threads"], 1, 1024)
-    count = len(environments) * len(algorithms) * len(settings) * len(seeds)
+    count = sum(len(one.algorithms) for one in environments) * len(settings) * len(seeds)
     if count > MAX_JOBS:
         raise source.error((), f"there are {count:,} runs, expected up to {MAX_JOBS:,}")
     jobs: list[Job] = []
