@@ -41,7 +41,7 @@ def train_alone(kind: Any, env: Any, n_steps: int, n_envs: int, seed: int, setti
     ("kind", "env", "settings", "differing"),
     [
         (rejeu.DQN, "jax/CartPole-v1", SMALL, {"learning_rate": [1e-4, 1e-3]}),
-        (rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}),
+        pytest.param(rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}, marks=pytest.mark.exhaustive),
         (rejeu.DQN, "CartPole-v1", {**SMALL, "priorities": {}}, {}),
         pytest.param(rejeu.TD3, "Pendulum-v1", {**SMALL, "normalize": True, "action_noise": 0.1, "overlap": False}, {},
                      marks=pytest.mark.exhaustive),
@@ -105,6 +105,7 @@ def test_what_cannot_be_one_program_is_refused(env: str, settings: dict[str, Any
         rejeu.train_seeds(rejeu.DQN, "MlpPolicy", env, 60, seeds=2, **{**SMALL, **settings})
 
 
+@pytest.mark.exhaustive
 def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
     def callbacks(agent: Any) -> list[Any]:
         agent.report_folder = tmp_path / str(agent.config.learning_rate)

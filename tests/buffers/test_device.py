@@ -96,7 +96,10 @@ def test_uniform_batches_equal_those_of_the_host(n_envs: int, n: int, n_steps: i
     assert_same_batches(device_replay(n_envs, n_steps=n_steps, each_reward=True), buffer, False, n_steps == 1)
 
 
-@pytest.mark.parametrize("strategy", ["future", "final", "episode", "random"])
+@pytest.mark.parametrize(
+    "strategy",
+    ["future", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("final", "episode", "random"))],
+)
 @pytest.mark.parametrize(
     ("n", "n_steps", "stops"),
     [(15, 1, False), (100, 1, True), (100, 3, True)],

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from rejeu.io.records import Count, Duration, Positive, Seconds, convert
 
 
@@ -50,8 +52,10 @@ class TrainingCall:
         """Total environment steps at which it ends; None if it has no limit of steps."""
         return None if self.n_steps is None else self.first_step + self.n_steps
 
-    def progress(self, step: int, episode: int) -> float:
+    def progress(self, step: Any, episode: int) -> Any:
         """Returns the progress of schedules, in [0, 1], after ``step`` environment steps and ``episode`` episodes in total.
+
+        ``step`` is a number, or an array of numbers, each of which gets its own progress.
 
         As in Stable-Baselines3, earlier steps count as done and as part of the total: with 100 steps before and 300 to
         take, progress goes from 0.25 to 1. With several limits the nearest one counts.
@@ -59,7 +63,10 @@ class TrainingCall:
         by_steps = share(self.steps_before, step - self.first_step, self.n_steps)
         by_episodes = share(self.episodes_before, episode - self.first_episode, self.n_episodes)
         by_time = share(self.seconds_before, self.elapsed, self.seconds)
-        return min(max(by_steps, by_episodes, by_time), 1.0)
+        others = max(by_episodes, by_time)
+        if isinstance(by_steps, np.ndarray):
+            return np.minimum(np.maximum(by_steps, others), 1.0)
+        return min(max(by_steps, others), 1.0)
 
     def is_over(self, step: int, episode: int) -> bool:
         """Returns whether one of its limits is reached."""
@@ -86,7 +93,7 @@ class TrainingCall:
 SAVED = [field.name for field in dataclasses.fields(TrainingCall) if field.name not in ("spent", "began")]
 
 
-def share(before: float, taken: float, limit: float | None) -> float:
+def share(before: float, taken: Any, limit: float | None) -> Any:
     """Returns the share of ``before + limit`` that is done after ``taken`` more; 0 without a limit.
 
     >>> share(100, 0, 300), share(100, 300, 300), share(100, 50, None)

@@ -103,7 +103,7 @@ def test_hindsight_equals_the_loop_of_the_host(strategy: str, stops: bool, n_ste
     assert {episode.success for episode in device.history.episodes} == ({0.0, 1.0} if stops else {0.0})
 
 
-@pytest.mark.parametrize("what", ["reward", "observation"])
+@pytest.mark.parametrize("what", ["reward", pytest.param("observation", marks=pytest.mark.exhaustive)])
 def test_an_environment_that_returns_nan_is_reported_as_on_the_host(what: str) -> None:
     device, host = (make(rejeu.DQN, Breaks(what=what)) for _ in range(2))
     with pytest.raises(rejeu.BadEnvironmentError) as raised:

@@ -88,6 +88,7 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path: Path) -> None:
     assert_same_runs(whole, resumed, 0.0)
 
 
+@pytest.mark.exhaustive
 def test_nan_is_reported_as_on_the_host(tmp_path: Path) -> None:
     device, host = (make(rejeu.PPO, "jax/CartPole-v1", **PPO, learning_rate=1e38) for _ in range(2))
     host.on_device, errors = False, []
@@ -102,6 +103,7 @@ def test_nan_is_reported_as_on_the_host(tmp_path: Path) -> None:
     assert all(np.isfinite(value).all() for value in device.get_parameters().values())
 
 
+@pytest.mark.exhaustive
 def test_rollouts_of_whole_episodes_train_on_the_host_with_a_warning() -> None:
     agent = make(rejeu.PPO, "jax/CartPole-v1", **PPO, n_episodes=1)
     with pytest.warns(UserWarning, match="n_episodes"):

@@ -38,7 +38,7 @@ def train(
     runs: Sequence[Run],
     learner: Learner,
     n_steps: int | None,
-    progress: Callable[[int], float],
+    progress: Callable[[Any], Any],
     stops: Stops,
     begin: Callable[[Run], None],
     active: Sequence[int] = (0,),
@@ -50,7 +50,7 @@ def train(
         runs: mutated; consistent whenever the generator has yielded.
         learner: the algorithm.
         n_steps: over all environments of a run; None: until the caller stops.
-        progress: returns the progress of schedules after a number of steps.
+        progress: returns the progress of schedules after a number of steps, or an array of it after an array of numbers.
         stops: where chunks must end.
         begin: starts episodes in the environments of a run.
         active: indices of the runs that are trained, ascending. The caller may remove some between chunks: such runs stay
@@ -77,7 +77,7 @@ def train(
                 begin(run)
         if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
             trained = [*active]
-            machine.push(runs, leader, progress(leader.step - first))
+            machine.push(runs, leader, float(progress(leader.step - first)))
         for timer in timers:
             timer.lap("replay")
         step = leader.step
@@ -135,12 +135,13 @@ def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
 
 
 def schedule(
-    progress: Callable[[int], float], taken: int, n_turns: int, n_envs: int, capacity: int, last: int | None, first: int
+    progress: Callable[[Any], Any], taken: int, n_turns: int, n_envs: int, capacity: int, last: int | None, first: int
 ) -> np.ndarray:
     """Returns the progress after 0 to ``n_turns`` turns, ``float32 (capacity + 1,)``, padded."""
-    most = ALL if last is None else last - first
-    values = [progress(min(taken + i * n_envs, most)) for i in range(n_turns + 1)]
-    return np.pad(np.array(values, np.float32), (0, capacity - n_turns), mode="edge")
+    most = np.iinfo(np.int64).max if last is None else last - first
+    steps = np.minimum(taken + n_envs * np.arange(n_turns + 1), most)
+    values = np.broadcast_to(np.asarray(progress(steps), np.float32), steps.shape)
+    return np.pad(values, (0, capacity - n_turns), mode="edge")
 
 
 class Pace:
