@@ -117,7 +117,11 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     if backend == "envpool" and not is_envpool_installed() and made.is_registered():
         backend = "gymnasium"
     backend = arguments.backend or backend
-    ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if backend == "ray" else None
+    ray = (
+        {"address": arguments.ray, "num_cpus": arguments.env_cpus}
+        if backend == "ray" or arguments.ray is not None
+        else None
+    )
     order = None if arguments.arrivals is None else run_folder.read_arrivals(arguments.arrivals)
     return made.vector(
         n_envs,

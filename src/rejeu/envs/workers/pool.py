@@ -74,7 +74,7 @@ class Workers:
         try:
             for number, make in enumerate(self._makes):
                 self.workers.append(starter.start(number, make))
-            self.descriptions = [self._made(worker) for worker in self.workers]
+            self.descriptions = self._made(self.workers)
         except BaseException:
             self.end()
             raise
@@ -84,17 +84,19 @@ class Workers:
         """Whether the workers were terminated."""
         return not self._finalizer.alive
 
-    def _made(self, worker: Worker) -> Description:
-        """Waits until an environment is made, and returns its description."""
+    def _made(self, workers: Sequence[Worker]) -> list[Description]:
+        """Waits until environments are made, all at the same time, and returns their descriptions."""
         deadline = None if self.timeout is None else time.monotonic() + max(self.timeout, START_SECONDS)
         try:
-            worker.connect(deadline)
-            made = worker.answer(deadline)
+            for worker in workers:
+                worker.connect(deadline)
+            answers = [worker.answer(deadline) for worker in workers]
         except Lost as lost:
             raise WorkerError(f"{lost}; what it printed says why. {self._starter.advice}") from None
-        if isinstance(made, Failure):
-            raise WorkerError(f"environment {worker.number} could not be made in a worker process:\n{made.trace}")
-        return made
+        for worker, made in zip(workers, answers, strict=True):
+            if isinstance(made, Failure):
+                raise WorkerError(f"environment {worker.number} could not be made in a worker process:\n{made.trace}")
+        return answers
 
     def ask(self, requests: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         """Sends requests and returns the answers, both by the index of the environment. See :meth:`answers`."""
@@ -168,8 +170,7 @@ class Workers:
         lost = {number: answer for number, answer in found.items() if isinstance(answer, Lost)}
         replaced = {number: self._replaced(number, answer) for number, answer in lost.items()}
         try:
-            for number in replaced:
-                self._made(self.workers[number])
+            self._made([self.workers[number] for number in replaced])
         except BaseException:
             self.end()
             raise

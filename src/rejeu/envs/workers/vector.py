@@ -257,14 +257,19 @@ class InWorkers(VectorEnv):
 
     def _listen(self) -> None:
         """Waits until at least one environment that steps on its own has answered."""
-        for i, answer in self.workers.first(self._pending).items():
-            self._arrived(i, answer)
+        said = self.workers.first(self._pending)
+        for i, answer in said.items():
+            if isinstance(answer, Failure):
+                self._pending.discard(i)
+            else:
+                self._arrived(i, answer)
+        self._heard({i: answer for i, answer in said.items() if isinstance(answer, Failure)}, "step")
 
     def _arrived(self, i: int, answer: Any) -> None:
         """Keeps the result of an environment. One whose worker was lost has none until its new episode has begun."""
-        self._heard({i: answer}, "step")
         if isinstance(answer, Restarted):
             self._lost[i] = answer
+            self._restarted.add(i)
             self.workers.send({i: ("reset", self._next_seed(i))})
             return
         self._pending.discard(i)
