@@ -84,6 +84,8 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
     assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--set", "gamma", "--out", str(out)]) == 2
     assert "must be name=value" in capsys.readouterr().err
     assert not out.exists()
+    assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--pause", "10"]) == 2
+    assert "--pause is for a single run" in capsys.readouterr().err
 
 
 def test_jobs_without_seeds(capsys):

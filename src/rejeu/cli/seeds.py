@@ -21,7 +21,20 @@ from rejeu.sweeps.jobs import Code, Job, Options
 from rejeu.sweeps.processes import LocalLauncher, default_workers, threads_of
 from rejeu.sweeps.table import echo, shown
 
-OWN = {"env", "seeds", "jobs", "seed", "out", "json", "algo", "assignments", "env_kwargs", "wrapper", "imports"}
+OWN = {
+    "env",
+    "seeds",
+    "jobs",
+    "seed",
+    "out",
+    "json",
+    "algo",
+    "assignments",
+    "env_kwargs",
+    "wrapper",
+    "imports",
+    "pause",
+}
 """Arguments that are no options of a job."""
 
 
@@ -62,6 +75,8 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
         ValueError: for an invalid option.
     """
     assert arguments.seeds is not None
+    if arguments.pause is not None:
+        raise ValueError("--pause is for a single run; leave out --seeds, or --pause")
     first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Options)}
     paths = {key: None if given[key] is None else str(given[key]) for key in ("preset", "arrivals")}
