@@ -129,7 +129,7 @@ class Workers:
         while waiting:  # all answers, otherwise the next request would receive the remaining ones
             found |= self._arrived(waiting)
             waiting -= found.keys()
-        return self._without_lost(found)
+        return self._without_lost(dict(sorted(found.items())))
 
     def first(self, numbers: Collection[int]) -> dict[int, Any]:
         """Waits until one of these workers has answered, and returns what has arrived, in any order.
