@@ -49,7 +49,7 @@ def document(capsys, *argv, status=0):
 def documented_keys(command):
     """The keys that the documentation lists for a command, the nested ones left out."""
     text = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
-    (row,) = [row for row in text.splitlines() if re.match(rf"\|.*`{command}`.* \| `", row)]
+    (row,) = [row for row in text.splitlines() if re.match(rf"\|.*`{command}`(?! of).* \| `", row)]
     return set(re.findall(r"`(\w+)`", re.sub(r"\([^()]*\)", "", row.split("|")[2]).replace("`null`", "")))
 
 
