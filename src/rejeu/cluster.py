@@ -30,6 +30,8 @@ _connections: set[Connection] = set()
 """Those that are open; Ray has one connection for the whole process."""
 _is_ours = False
 """Whether Ray was connected here, and not by the user's program."""
+_is_local = False
+"""Whether the cluster was started for this process."""
 
 
 class Connection:
@@ -38,6 +40,8 @@ class Connection:
     def __init__(self, ray: Any) -> None:
         self.ray = ray
         """The module ``ray``."""
+        self.is_local = _is_local
+        """Whether the cluster was started for this process."""
         _connections.add(self)
 
     def close(self) -> None:
@@ -45,10 +49,10 @@ class Connection:
 
         Further calls do nothing. A cluster that was started for this process ends then.
         """
-        global _is_ours
+        global _is_ours, _is_local
         _connections.discard(self)
         if _is_ours and not _connections:
-            _is_ours = False
+            _is_ours = _is_local = False
             self.ray.shutdown()
 
 
@@ -66,7 +70,7 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
         ClusterError: if there is no such cluster, it does not answer, or has another version of Python or Ray.
         ValueError: for an address of another form.
     """
-    global _is_ours
+    global _is_ours, _is_local
     if not (address or os.environ.get("RAY_ADDRESS")):
         os.environ.setdefault(LOOPBACK, "0")  # read when Ray is imported, and by the processes that it starts
     try:
@@ -85,7 +89,7 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
                 # Ray starts its own programs so, at once and without Python in between.
                 warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
                 ray.init(
-                    given,
+                    given or "local",  # else Ray would join any cluster that somebody started on this machine
                     include_dashboard=None if given else False,
                     logging_level=logging.ERROR,
                     configure_logging=False,
@@ -94,7 +98,7 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             where = "a cluster on this machine" if given is None else f"the Ray cluster {given!r}"
             raise ClusterError(f"cannot connect to {where}: {one_line(error)}") from error
-        _is_ours = True
+        _is_ours, _is_local = True, given is None
     return Connection(ray)
 
 

@@ -81,7 +81,9 @@ def ray(monkeypatch):
     ray = Ray(closed=[])
     monkeypatch.setattr(process, "node_address", lambda: "10.0.0.7")
     monkeypatch.setattr(
-        cluster, "connect", lambda address: SimpleNamespace(ray=ray, close=lambda: ray.closed.append(address))
+        cluster,
+        "connect",
+        lambda address: SimpleNamespace(ray=ray, is_local=False, close=lambda: ray.closed.append(address)),
     )
     return ray
 

@@ -72,8 +72,8 @@ class Train(EnvironmentOptions):
     """With --wait-for: take the results in the order of an earlier run, its arrivals.npy."""
     ray: Annotated[str | None, arg(metavar="ADDRESS", help_behavior_hint="")] = None
     """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
-    env_cpus: Annotated[float, arg(metavar="N", help_behavior_hint="(default: 1)")] = 1.0
-    """With --backend ray: CPUs that each environment reserves; a fraction for simulators that mostly wait."""
+    env_cpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
+    """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
     seed: Count = None
     """Seeds everything; by default a random one."""
     seeds: Count = None
@@ -149,8 +149,8 @@ class Resume(RunOptions):
     """Hyperparameters to change from here on, as for rejeu train; those that change shapes cannot be changed."""
     restart_workers: Annotated[int, arg(metavar="N")] = 0
     """As for rejeu train; for this part of the run."""
-    env_cpus: Annotated[float, arg(metavar="N", help_behavior_hint="(default: 1)")] = 1.0
-    """With --backend ray: CPUs that each environment reserves; a fraction for simulators that mostly wait."""
+    env_cpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
+    """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
     no_report: Annotated[bool, FlagCreatePairsOff] = False
     """Write no report.html at the end."""
     no_video: Annotated[bool, FlagCreatePairsOff] = False

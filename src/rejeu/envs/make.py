@@ -96,7 +96,7 @@ def make_vector(
             results in the same order. None: in the order in which they arrive.
         ray: for ``"ray"``: ``address`` of the cluster (``"HOST:PORT"`` or ``"auto"``; by default that in the environment
             variable ``RAY_ADDRESS``, else Ray is started on this machine), and what each environment reserves:
-            ``num_cpus`` (1), ``num_gpus`` (0), ``memory`` in bytes, ``resources`` by name.
+            ``num_cpus`` (1, or 0 if Ray is started here), ``num_gpus`` (0), ``memory`` in bytes, ``resources`` by name.
         env_kwargs: handed to ``gymnasium.make``.
 
     Raises:

@@ -46,7 +46,7 @@ class Options:
     """Path of the record of an earlier run."""
     ray: str | None = None
     """Address of a Ray cluster for environments with ``backend="ray"``."""
-    env_cpus: float = 1.0
+    env_cpus: float | None = None
     success_threshold: float | None = None
     video_every: int | None = None
     checkpoint_minutes: float = 5.0
@@ -60,7 +60,7 @@ class Options:
         for key in ("steps", "envs", "video_every", "evaluate_every", "evaluate_episodes"):
             coerce(self, key, whole, optional=True, least=INTEGERS[key][0], most=INTEGERS[key][1])
         coerce(self, "wait_for", whole, optional=True, least=1)
-        coerce(self, "env_cpus", number, least=0, most=10_000)
+        coerce(self, "env_cpus", number, optional=True, least=0, most=10_000)
         coerce(self, "restart_workers", whole, least=0)
         coerce(self, "minutes", number, optional=True, above=0)
         coerce(self, "success_threshold", number, optional=True)

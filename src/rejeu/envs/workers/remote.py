@@ -41,8 +41,9 @@ class RayOptions:
 
     address: str | None = None
     """``"HOST:PORT"`` of the cluster, or ``"auto"``; see :func:`rejeu.cluster.connect`."""
-    num_cpus: float = 1.0
-    """CPUs that each environment reserves; a fraction for simulators that mostly wait."""
+    num_cpus: float | None = None
+    """CPUs that each environment reserves; a fraction for simulators that mostly wait. None: 1, and 0 on a cluster that is
+    started for this process, where nothing else needs a place."""
     num_gpus: float = 0.0
     """GPUs that each environment reserves."""
     memory: float | None = None
@@ -53,8 +54,8 @@ class RayOptions:
     def __post_init__(self) -> None:
         if self.address is not None and not isinstance(self.address, str):
             raise TypeError(f"address={self.address!r} must be 'HOST:PORT' or 'auto'")
-        validation.coerce(self, ("num_cpus", "num_gpus"), validation.number, least=0)
-        validation.coerce(self, "memory", validation.number, optional=True, least=0)
+        validation.coerce(self, "num_gpus", validation.number, least=0)
+        validation.coerce(self, ("num_cpus", "memory"), validation.number, optional=True, least=0)
         if not isinstance(self.resources, Mapping):
             raise TypeError(f"resources={self.resources!r} must be a dict of numbers by name")
         resources = {
@@ -62,10 +63,10 @@ class RayOptions:
         }
         validation.assign(self, resources=resources)
 
-    def reserved(self) -> dict[str, Any]:
-        """Returns the reservation as options of a Ray actor."""
+    def reserved(self, is_local: bool) -> dict[str, Any]:
+        """Returns the reservation as options of a Ray actor; ``is_local``: on a cluster started for this process."""
         return {
-            "num_cpus": self.num_cpus,
+            "num_cpus": (0.0 if is_local else 1.0) if self.num_cpus is None else self.num_cpus,
             "num_gpus": self.num_gpus,
             "memory": self.memory,
             "resources": dict(self.resources),
@@ -91,6 +92,8 @@ class Actors(Starter):
         self.options = validation.build(RayOptions, options)
         self._connection = cluster.connect(self.options.address)
         self.ray = self._connection.ray
+        self.reserved = self.options.reserved(self._connection.is_local)
+        """What each worker reserves, as options of a Ray actor."""
         try:
             self._class = self.ray.remote(RemoteWorker)
             self._server = socket.create_server((self.ray.util.get_node_ip_address(), 0), backlog=1024)
@@ -108,7 +111,7 @@ class Actors(Starter):
         self.forget(worker)
         token = secrets.token_bytes(TOKEN_BYTES)
         # Ray would restart a lost actor by itself, but with an environment that nobody has seeded.
-        actor = self._class.options(max_restarts=0, max_task_retries=0, **self.options.reserved()).remote()
+        actor = self._class.options(max_restarts=0, max_task_retries=0, **self.reserved).remote()
         self._waiting[token] = worker
         return actor, actor.serve.remote(self._server.getsockname()[:2], token)
 
@@ -200,7 +203,7 @@ class ActorWorker(Worker):
         self._actor, self._served = self._actors.launch(self)
 
     def _needs(self) -> str:
-        given = {key: value for key, value in self._actors.options.reserved().items() if value}
+        given = {key: value for key, value in self._actors.reserved.items() if value}
         found = self._actors.ray.cluster_resources()
         return f"of which each environment reserves {given}, and which has {found.get('CPU', 0):g} CPUs in all"
 
