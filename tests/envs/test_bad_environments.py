@@ -17,7 +17,7 @@ from rejeu.envs import checker
 from rejeu.envs.checker import findings
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
-from rejeu.envs.workers import pool
+from rejeu.envs.workers import local
 from rejeu.errors import BadEnvironmentError
 from rejeu.loops import checks
 from rejeu.loops.checks import check_finite
@@ -176,7 +176,9 @@ def test_vectors_that_were_given_are_explained(name, words):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # by which Gymnasium shows the traceback
 def test_workers_that_were_given_are_explained():
-    env = AsyncVectorEnv([EVERY["too long"].make] * 2, context=pool.START_METHOD, autoreset_mode=AutoresetMode.DISABLED)
+    env = AsyncVectorEnv(
+        [EVERY["too long"].make] * 2, context=local.START_METHOD, autoreset_mode=AutoresetMode.DISABLED
+    )
     vector = GymnasiumVector(env)
     vector.reset(0)
     action = np.zeros((2, 1), np.float32)

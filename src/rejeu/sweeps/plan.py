@@ -125,7 +125,7 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
 def line_of(text: str, place: Place) -> int:
     r"""Returns the line in which the value at a place begins, or that of the table around it.
 
-    >>> line_of("steps = 10\\n[settings.fast]\\n\\ngamma = [\\n0.9]", ("settings", "fast", "gamma"))
+    >>> line_of("steps = 10\n[settings.fast]\n\ngamma = [\n0.9]", ("settings", "fast", "gamma"))
     4
     """
     lines = text.splitlines(keepends=True)
