@@ -32,6 +32,8 @@ from typing import Any
 RESULT = Path(__file__).parent / "results" / "sweep_kills.json"
 LOOPBACK = {"node_ip_address": "127.0.0.1", "include_dashboard": False}
 ENVIRON = {**os.environ, "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_USAGE_STATS_ENABLED": "0"}
+PAUSE = (4.0, 16.0)
+"""Seconds between two kills: a process takes several to start, and a run that is lost five times in a row has failed."""
 PLAN = """\
 seeds = 2
 threads = 1
@@ -104,12 +106,14 @@ def processes(folder: Path) -> list[tuple[int, int, str]]:
 def seconds_since_checkpoint(run: Path) -> float | None:
     """Returns the training time of the present process since the newest checkpoint; None if it does not train."""
     folder = run / "checkpoints"
-    if (run / "agent.safetensors").is_file():  # written after the last checkpoint
-        return None
     with contextlib.suppress(FileNotFoundError):
+        began = (folder / "lock").stat().st_mtime  # touched when training begins
+        model = run / "agent.safetensors"
+        if model.is_file() and model.stat().st_mtime >= began:  # written when training ends
+            return None
         times = [path.stat().st_mtime for path in folder.glob("run_*.safetensors")]
-        if times:  # the lock is touched when training begins
-            return time.time() - max(*times, (folder / "lock").stat().st_mtime)
+        if times:
+            return time.time() - max(*times, began)
     return None
 
 
@@ -184,7 +188,7 @@ def trial(
         folder, log = root / f"{'ray' if cluster else 'local'}-{rounds}", root / "printed.log"
         sweep = start(["sweep", str(plan), "--out", str(folder), *options], log)
         while sweep.poll() is None:
-            time.sleep(rng.uniform(3.0, 10.0))
+            time.sleep(rng.uniform(*PAUSE))
             done = disturb(sweep, folder, cluster, rng) if counts.total() < kills else None
             if done is None:
                 continue
