@@ -57,12 +57,13 @@ def strict_dtypes() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def forget_registered_algorithms() -> Iterator[None]:
-    """Removes the algorithms and presets that a test registered, for example with a page of the documentation."""
+def forget_registered() -> Iterator[None]:
+    """Removes the algorithms, presets and environments in JAX that a test registered, for example with a page of the docs."""
     import rejeu
     from rejeu import presets
+    from rejeu.envs.functional.registry import REGISTRY
 
-    registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered)
+    registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered, REGISTRY)
     before = [dict(registry) for registry in registries]
     yield
     for registry, entries in zip(registries, before, strict=True):
