@@ -151,7 +151,7 @@ class RayLauncher:
         return self.ray.remote(kind).options(num_cpus=0, scheduling_strategy=strategy, max_concurrency=1)
 
     def _check_nodes(self) -> int:
-        """Returns how many nodes see the folder of the sweep.
+        """Returns how many nodes see the folder of the sweep. Nodes that are lost meanwhile do not count.
 
         Raises:
             ClusterError: if a node has other versions, or does not answer.
@@ -176,6 +176,12 @@ class RayLauncher:
                 there, is_shared = ray.get(answers[node["NodeID"]], timeout=ANSWER)
             except ray.exceptions.GetTimeoutError:
                 raise ClusterError(f"{where} has not answered for {ANSWER:g} s; look at its raylet") from None
+            except (
+                ray.exceptions.NodeDiedError,
+                ray.exceptions.TaskUnschedulableError,
+                ray.exceptions.WorkerCrashedError,
+            ):
+                continue  # the node has been lost since the cluster was asked for its nodes
             except ray.exceptions.RayError as error:
                 cause = getattr(error, "cause", None) or error
                 raise ClusterError(
