@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 import time
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from rejeu import presets
-from rejeu.cli import environment, jsonout, settings
+from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Pbt, Resume
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
 from rejeu.cli.run_folder import check_free
-from rejeu.cli.tune import algorithm_of, read_search
+from rejeu.cli.tune import shared
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.sweeps.processes import default_workers, environment as variables, threads_of
 from rejeu.tuning import members as trained, population as populations
@@ -35,26 +33,8 @@ def pbt(arguments: Pbt) -> tuple[int, dict[str, Any]]:
     check_free(arguments.out)
     made = environment.from_arguments(arguments.env, arguments)
     made.vector(1, arguments.backend or "auto", arguments.seed).close()
-    preset = None if arguments.preset is None else presets.read(arguments.preset)
     population = populations.make(
-        arguments.rounds,
-        arguments.round_steps,
-        arguments.members,
-        env_id=made.env_id,
-        algorithm=arguments.algo,
-        env_argument=made.typed,
-        env_kwargs=made.kwargs,
-        wrappers=made.wrapper_names,
-        preset=preset,
-        fixed=settings.apply(chain.from_iterable(arguments.assignments), {}),
-        search=read_search(chain.from_iterable(arguments.search), algorithm_of(arguments, made, preset)),
-        only=tuple(chain.from_iterable(arguments.only)),
-        n_envs=arguments.envs,
-        backend=arguments.backend,
-        evaluate_episodes=arguments.evaluate_episodes,
-        seed=arguments.seed,
-        measure=arguments.measure,
-        checkpoint_minutes=arguments.checkpoint_minutes,
+        arguments.rounds, arguments.round_steps, arguments.members, env_id=made.env_id, **shared(arguments, made)
     )
     name = re.sub(r"[^\w.-]+", "-", f"pbt-{made.env_id}-{population.plan.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}")
     members = trained.create(arguments.out or Path("runs") / name, population)

@@ -68,30 +68,37 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
 
 def make_plan(arguments: Tune, made: Environment) -> Plan:
     """Returns the plan of the study that the command line asks for."""
-    preset = None if arguments.preset is None else presets.read(arguments.preset)
     return plans.make(
         made.env_id,
-        arguments.algo,
-        env_argument=made.typed,
-        env_kwargs=made.kwargs,
-        wrappers=made.wrapper_names,
-        preset=preset,
-        fixed=settings.apply(chain.from_iterable(arguments.assignments), {}),
-        search=read_search(chain.from_iterable(arguments.search), algorithm_of(arguments, made, preset)),
-        only=tuple(chain.from_iterable(arguments.only)),
         trials=arguments.trials,
         steps=arguments.steps,
-        n_envs=arguments.envs,
-        backend=arguments.backend,
         evaluate_every=arguments.evaluate_every,
-        evaluate_episodes=arguments.evaluate_episodes,
         trial_seeds=arguments.trial_seeds,
         final_seeds=arguments.final_seeds,
-        seed=arguments.seed,
         pruner=arguments.pruner,
-        measure=arguments.measure,
-        checkpoint_minutes=arguments.checkpoint_minutes,
+        **shared(arguments, made),
     )
+
+
+def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
+    """Returns the arguments of a plan that studies and populations share."""
+    preset = None if arguments.preset is None else presets.read(arguments.preset)
+    return {
+        "algorithm": arguments.algo,
+        "env_argument": made.typed,
+        "env_kwargs": made.kwargs,
+        "wrappers": made.wrapper_names,
+        "preset": preset,
+        "fixed": settings.apply(chain.from_iterable(arguments.assignments), {}),
+        "search": read_search(chain.from_iterable(arguments.search), algorithm_of(arguments, made, preset)),
+        "only": tuple(chain.from_iterable(arguments.only)),
+        "n_envs": arguments.envs,
+        "backend": arguments.backend,
+        "evaluate_episodes": arguments.evaluate_episodes,
+        "seed": arguments.seed,
+        "measure": arguments.measure,
+        "checkpoint_minutes": arguments.checkpoint_minutes,
+    }
 
 
 def algorithm_of(arguments: Tune | Pbt, made: Environment, preset: Preset | None) -> str | None:
