@@ -62,7 +62,7 @@ def write_hostile(parent):
         "versions": {EVIL: EVIL},
     }
     folder = write(parent / "<img src=x onerror=window.hacked=1>", config, metrics=f"train/{EVIL}_loss")
-    (folder / "warnings.txt").write_text(f"{EVIL}\n{{{{ 7 * 7 }}}}{{% raw %}}\n", encoding="utf-8")
+    (folder / "warnings.txt").write_text(f"{EVIL}\n{{{{ 'not' + 'evaluated' }}}}{{% raw %}}\n", encoding="utf-8")
     (folder / "videos" / "step_'\"><img src=x onerror=window.hacked=1>.mp4").write_bytes(MP4)
     (folder / "video.mp4").write_text("<script>window.hacked=1</script>", encoding="utf-8")
     (parent / "secret.mp4").write_bytes(MP4 + b"secret")
