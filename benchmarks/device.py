@@ -139,7 +139,8 @@ def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> di
 def measure(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
     """Returns a measurement made in a process of its own, or its error."""
     words = [sys.executable, __file__, "--child", json.dumps([name, kind, n_envs, n_seeds, seconds])]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": ""}  # no cache, so that every process compiles
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     found = {"case": name, "kind": kind, "n_envs": n_envs, "n_seeds": n_seeds}
     if done.returncode:
         return {**found, "error": (done.stderr.strip().splitlines() or ["no message"])[-1]}

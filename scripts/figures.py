@@ -4,7 +4,7 @@
     python scripts/figures.py --check    # changes nothing; exits with 1 if something is out of date
 
 A marked block starts with ``<!-- figures: NAME ARGUMENTS -->`` and ends with ``<!-- end of figures -->``. The data is
-in ``benchmarks/results``.
+in ``benchmarks/results`` and ``trials/results``.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from gymnasium import spaces
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
+from benchmarks import tables  # noqa: E402
 from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
 from benchmarks.bench.text import table, times  # noqa: E402
 from rejeu import presets, validation  # noqa: E402
@@ -33,6 +34,7 @@ from rejeu.envs.masks import n_choices  # noqa: E402
 from rejeu.presets.result import Result  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
+TRIALS = ROOT / "trials" / "results"
 PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
@@ -42,9 +44,9 @@ JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
 
 
-def load(name: str) -> Any:
-    """Returns the data of a file in ``benchmarks/results``."""
-    return json.loads((DATA / name).read_text(encoding="utf-8"))
+def load(name: str, folder: Path = DATA) -> Any:
+    """Returns the data of a file of results."""
+    return json.loads((folder / name).read_text(encoding="utf-8"))
 
 
 def measured() -> list[Result]:
@@ -313,19 +315,6 @@ def functional_unstable() -> str:
     )
 
 
-def functional() -> str:
-    """Steps per second of the environments in JAX and of their counterparts."""
-    names = ("program", "vector", "gymnasium", "envpool")
-    rows = []
-    for entry in load("functional.json")["results"]:
-        rates = [entry["steps_per_second"].get(name) for name in names]
-        cells = ("" if rate is None else f"{rate:,.0f}" for rate in rates)
-        rows.append((f"`{entry['env']}`", f"{entry['n_envs']:,}", *cells, f"{entry['compile_seconds']:.1f} s"))
-    return table(
-        ("environment", "`n_envs`", "in a program", "`make_vector`", "Gymnasium", "EnvPool", "compilation"), rows
-    )
-
-
 def overlap() -> str:
     """Learning with and without the overlap of environments and updates."""
     rows = []
@@ -422,22 +411,34 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "parking": parking,
     "speed": speed,
     "backends": backends,
-    "functional": functional,
+    "functional": lambda: tables.functional(load("functional.json")),
     "functional-equality": functional_equality,
     "functional-unstable": functional_unstable,
     "mountain-car": mountain_car,
     "overlap": overlap,
     "lunar-lander": lunar_lander,
     "size": size,
+    "device": lambda name="device": tables.device_loops(load(f"{name}.json")),
+    "device-seeds": lambda name="device": tables.device_seeds(load(f"{name}.json")),
+    "device-peers": lambda: tables.peers(load("device_peers.json")),
+    "parking-transfer": lambda: tables.transfer(load("parking_transfer.json")),
+    "sweep": lambda: tables.sweep(load("sweep.json")),
+    "sweep-kills": lambda: tables.sweep_kills(load("sweep_kills.json", TRIALS)),
+    "remote": lambda: tables.remote(load("remote.json")),
+    "first-of-n": lambda: tables.first_of_n(load("first_of_n.json")),
+    "tune": lambda: tables.tune(load("tune.json")),
 }
 
 
 def render(text: str) -> str:
-    """Returns a page with every marked block regenerated."""
+    """Returns a page with every marked block regenerated; a block whose data does not exist yet is empty."""
 
     def block(match: re.Match[str]) -> str:
         name, *arguments = match[2].split()
-        return f"{match[1]}{BLOCKS[name](*arguments)}\n{match[3]}"
+        try:
+            return f"{match[1]}{BLOCKS[name](*arguments)}\n{match[3]}"
+        except FileNotFoundError:
+            return match[1] + match[3]
 
     return BLOCK.sub(block, text)
 
