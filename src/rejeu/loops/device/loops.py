@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
+import jax
+
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.loops.device.driver import Stops, train
@@ -63,6 +65,7 @@ def together(
     active: Sequence[int],
     variants: Variants | None = None,
     hyper: Sequence[dict[str, float]] | None = None,
+    devices: Sequence[jax.Device] = (),
 ) -> Iterator[list[Progress | None]]:
     """Trains several runs of equal settings in one program; yields what each has done after every chunk.
 
@@ -76,16 +79,17 @@ def together(
         active: see :func:`rejeu.loops.device.driver.train`.
         variants: what makes the algorithm, if hyperparameters differ.
         hyper: those that differ, by run.
+        devices: of which each computes some of the runs; none for JAX's default device.
     """
     if runs[0].env.backend != "jax":
         assert isinstance(config, OffPolicyConfig)
-        host = HostMachine(learner, config, active)
+        host = HostMachine(learner, config, active, devices)
         yield from train(host, runs, learner, n_steps, progress, stops, begin_episodes, active)
         return
     differing = [{}] * len(runs) if hyper is None else hyper
     if isinstance(config, OnPolicyConfig):
-        on = OnPolicyMachine(runs, learner, config, stops, variants, differing)
+        on = OnPolicyMachine(runs, learner, config, stops, variants, differing, devices)
         yield from train(on, runs, learner, n_steps, progress, stops, lambda run: begin_rollouts(run, config), active)
     else:
-        off = OffPolicyMachine(runs, learner, config, stops, variants, differing)
+        off = OffPolicyMachine(runs, learner, config, stops, variants, differing, devices)
         yield from train(off, runs, learner, n_steps, progress, stops, begin_episodes, active)

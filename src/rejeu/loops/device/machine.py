@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -14,22 +14,30 @@ import numpy as np
 from rejeu.core import Clock, Rollout, Transition
 from rejeu.envs.base import Step
 from rejeu.loops.checks import check_finite
-from rejeu.loops.device.transfer import copies, episodes_of, put_players, stacked, unstacked
+from rejeu.loops.device.sharing import filled, mesh_of, over_runs, spread
+from rejeu.loops.device.transfer import copies, episodes_of, put_players, unstacked
 from rejeu.loops.device.turns import Limits, Report
 from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Progress, Run
 
+SHARED = ("counts", "valid")
+"""Fields that are equal in all runs: counters, and which steps of a rollout count."""
+
 
 class Machine(ABC):
     """A compiled program with its arguments on the device. Mutable. Abstract: there is one for each kind of learning.
 
-    With several runs their arrays have a leading axis, except for counters, which are equal in all runs.
+    With several runs their arrays have a leading axis, except for those that all runs share.
     """
 
-    def __init__(self, runs: Sequence[Run], program: Any) -> None:
-        """Takes runs of equal settings in JAX environments, and the program that trains them."""
-        self.n, self.env, self.program = len(runs), runs[0].env.env, program
+    def __init__(self, runs: Sequence[Run], program: Any, devices: Sequence[jax.Device]) -> None:
+        """Takes runs of equal settings in JAX environments, the program that trains them, and devices that may share them."""
+        self.env, self.program = runs[0].env.env, program
+        self.mesh = mesh_of(len(runs), devices)
+        """The devices that share the runs; None if one computes all."""
+        self.n = len(filled(runs, self.mesh))
+        """Number of runs that are computed."""
         self.carry: Any = None
         self.store: Any = None
         """The experience, which is donated to every chunk."""
@@ -75,17 +83,23 @@ class Machine(ABC):
 
     def push(self, runs: Sequence[Run], leader: Run, progress: float) -> None:
         """Puts the runs onto the device, with the counters of ``leader``."""
+        runs = filled(runs, self.mesh)
         self.begin(runs)
-        carries = [self.carry_of(run, progress) for run in runs]
-        self.carry = stacked(carries)
-        if self.n > 1:
-            self.carry = self.carry._replace(counts=carries[[run is leader for run in runs].index(True)].counts)
-        self.store = stacked([self.store_of(run) for run in runs])
+        if self.n == 1:
+            self.carry, self.store = self.carry_of(leader, progress), self.store_of(leader)
+            return
+        self.carry = spread(lambda run: self.carry_of(run, progress), runs, self.mesh)
+        self.store = spread(lambda run: jax.device_get(self.store_of(run)), runs, self.mesh)
+        self.carry = with_shared(self.carry, lambda: self.carry_of(leader, progress))
+        self.store = with_shared(self.store, lambda: self.store_of(leader))
 
     def call(self, limits: Limits) -> None:
         """Takes a chunk of turns."""
-        take = take_chunk if self.n == 1 else take_chunks
-        self.carry, self.store, report = take((self.program, self.env, self.carry, limits), self.store)
+        if self.n == 1:
+            self.carry, self.store, report = take_chunk((self.program, self.env, self.carry, limits), self.store)
+        else:
+            kept = (self.program, self.mesh, self.env, self.carry, limits)
+            self.carry, self.store, report = take_chunks(kept, self.store)
         counts, self.reports = copies(self.carry.counts), unstacked(copies(report), self.n)
         if self.n == 1:  # networks and environments stay on the device; everything else is small
             players = self.carry.players
@@ -125,7 +139,7 @@ class Machine(ABC):
             BadEnvironmentError: if a reward or an observation is not finite.
             NonFiniteUpdate: if an update left numbers that are not finite.
         """
-        self.n = 1
+        self.n, self.mesh = 1, None
         for i in range(int(limits.n_turns)):
             progress = np.roll(limits.progress, -i)
             one = limits._replace(n_turns=np.int32(1), progress=progress)
@@ -167,8 +181,21 @@ def take_chunk(kept: tuple[Any, ...], store: Any) -> tuple[Any, Any, Report]:
 
 @eqx.filter_jit(donate="all-except-first")
 def take_chunks(kept: tuple[Any, ...], store: Any) -> tuple[Any, Any, Report]:
-    """Does the same for several runs."""
-    program, env, carry, limits = kept
-    axes = type(carry)(**{name: None if name == "counts" else 0 for name in carry._fields})
-    one = lambda carry, store: program.chunk(env, carry, store, limits)  # noqa: E731
-    return jax.vmap(one, in_axes=(axes, 0), out_axes=(axes, 0, 0))(carry, store)
+    """Does the same for several runs, which the devices of a mesh share."""
+    program, mesh, env, carry, limits = kept
+    arrays, rest = eqx.partition(env, eqx.is_array)
+    one = lambda arrays, carry, store, limits: program.chunk(eqx.combine(arrays, rest), carry, store, limits)  # noqa: E731
+    axes = axes_of(carry), axes_of(store)
+    return over_runs(one, mesh, (None, *axes, None), (*axes, 0))(arrays, carry, store, limits)
+
+
+def axes_of(tree: Any) -> Any:
+    """Returns for each field of a carry or of experience 0, or None if all runs share it."""
+    return type(tree)(**{name: None if name in SHARED else 0 for name in tree._fields})
+
+
+def with_shared(tree: Any, make: Callable[[], Any]) -> Any:
+    """Returns a carry or experience of several runs, with the fields that all share from the one that ``make`` returns."""
+    names = [name for name in tree._fields if name in SHARED]
+    of_one = make() if names else None
+    return tree._replace(**{name: getattr(of_one, name) for name in names})

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from rejeu import spaces
 from rejeu.algorithms.config import OffPolicyConfig
@@ -19,6 +20,7 @@ from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.loops.device.driver import Stops, capacity_of
 from rejeu.loops.device.machine import Machine
 from rejeu.loops.device.off_policy import Carry, Counts, OffPolicyProgram, choose, draw, draws
+from rejeu.loops.device.sharing import over_runs
 from rejeu.loops.device.transfer import copies, players_of, rounded_up, unstacked
 from rejeu.loops.device.variants import Variants
 from rejeu.loops.learner import Learner
@@ -36,8 +38,12 @@ class OffPolicyMachine(Machine):
         stops: Stops,
         variants: Variants | None = None,
         hyper: Sequence[dict[str, float]] = ({},),
+        devices: Sequence[jax.Device] = (),
     ) -> None:
-        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each."""
+        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each.
+
+        ``devices`` share several runs.
+        """
         run = runs[0]
         program = OffPolicyProgram(
             learner.algorithm,
@@ -50,7 +56,7 @@ class OffPolicyMachine(Machine):
             stops.at_episodes,
             variants,
         )
-        super().__init__(runs, program)
+        super().__init__(runs, program, devices)
         self.heads: np.ndarray = np.zeros(0)
         """Times of the newest rows that the hosts' rings have, ``int64 (n_runs, n_envs)``."""
         self.hyper = {id(run): one for run, one in zip(runs, hyper, strict=True)}
@@ -87,7 +93,10 @@ class OffPolicyMachine(Machine):
         heads = np.asarray(self.store.head).astype(np.int64).reshape(self.n, -1)
         size = rounded_up(int((heads - self.heads).max()) + 1, self.program.replay.rows)
         first = self.heads.astype(np.int32)
-        rows = rows_from(self.program.replay, self.store, first if self.n > 1 else first[0], size)
+        if self.n > 1:
+            rows = rows_of_each(self.program.replay, self.mesh, self.store, first, size)
+        else:
+            rows = rows_from(self.program.replay, self.store, first[0], size)
         self.heads = heads
         return list(zip(heads, unstacked(jax.device_get(rows), self.n), strict=True))
 
@@ -119,10 +128,14 @@ def drawn(
 
 @eqx.filter_jit
 def rows_from(replay: DeviceReplay, ring: DeviceRing, first: Any, size: int) -> dict[str, Any]:
-    """Returns rows of one ring, or of several; see :func:`rejeu.buffers.device.written`."""
-    if first.ndim == 1:
-        return written(replay, ring, first, size)
-    return jax.vmap(lambda ring, first: written(replay, ring, first, size))(ring, first)
+    """Returns rows of a ring; see :func:`rejeu.buffers.device.written`."""
+    return written(replay, ring, first, size)
+
+
+@eqx.filter_jit
+def rows_of_each(replay: DeviceReplay, mesh: Mesh | None, ring: DeviceRing, first: Any, size: int) -> dict[str, Any]:
+    """Returns rows of the rings of several runs."""
+    return over_runs(lambda ring, first: written(replay, ring, first, size), mesh, (0, 0), 0)(ring, first)
 
 
 def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:

@@ -34,8 +34,12 @@ class OnPolicyMachine(Machine):
         stops: Stops,
         variants: Variants | None = None,
         hyper: Sequence[dict[str, float]] = ({},),
+        devices: Sequence[jax.Device] = (),
     ) -> None:
-        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each."""
+        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each.
+
+        ``devices`` share several runs.
+        """
         program = OnPolicyProgram(
             learner.algorithm,
             learner.explorer,
@@ -47,7 +51,7 @@ class OnPolicyMachine(Machine):
             stops.at_episodes,
             variants,
         )
-        super().__init__(runs, program)
+        super().__init__(runs, program, devices)
         self.hyper = {id(run): one for run, one in zip(runs, hyper, strict=True)}
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
@@ -91,7 +95,10 @@ class OnPolicyMachine(Machine):
 
     def fetch(self, carries: Sequence[Any]) -> list[Any]:
         if carries[0].counts.length:
-            return unstacked(jax.device_get(self.store), self.n)
+            steps = jax.device_get(self.store)
+            if self.n == 1:
+                return [steps]
+            return [one._replace(valid=steps.valid) for one in unstacked(steps._replace(valid=None), self.n)]
         beginnings = jax.device_get((self.store.started, self.store.carry))
         return [self.store._replace(started=a, carry=b) for a, b in unstacked(beginnings, self.n)]
 

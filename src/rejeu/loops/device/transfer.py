@@ -73,12 +73,17 @@ def host_obs(run: Run, obs: PyTree) -> PyTree:
 
 
 def stacked(trees: Sequence[PyTree]) -> PyTree:
-    """Returns trees of equal structure as one, whose leaves have a leading axis; a single tree as it is."""
-    return trees[0] if len(trees) == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    """Returns trees of equal structure as one on the device, whose leaves have a leading axis."""
+
+    def joined(*leaves: Any) -> jax.Array:
+        on_host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
+        return jnp.array(np.stack(leaves)) if on_host else jnp.stack(leaves)
+
+    return jax.tree.map(joined, *trees)
 
 
 def unstacked(tree: PyTree, n: int) -> list[PyTree]:
-    """Returns the ``n`` trees of which :func:`stacked` made one."""
+    """Returns the ``n`` trees of which :func:`stacked` made one; a single one has no leading axis."""
     return [tree] if n == 1 else [jax.tree.map(lambda leaf, i=i: leaf[i], tree) for i in range(n)]
 
 

@@ -1,0 +1,72 @@
+"""Several devices that share the runs of one program: each computes an equal number of them, apart from the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from rejeu.core import PyTree
+from rejeu.loops.device.transfer import stacked
+
+T = TypeVar("T")
+RUNS = "runs"
+"""Name of the axis of runs."""
+
+
+def mesh_of(n_runs: int, devices: Sequence[jax.Device]) -> Mesh | None:
+    """Returns the devices that share so many runs; None if one computes all."""
+    used = np.array(devices[:n_runs])
+    return Mesh(used, (RUNS,)) if len(used) > 1 else None
+
+
+def filled(runs: Sequence[T], mesh: Mesh | None) -> list[T]:
+    """Returns the runs, and the first one again until every device has the same number.
+
+    What the additional ones compute is not used. It takes no time, because the other devices are busy as long.
+
+    >>> filled("abc", None)
+    ['a', 'b', 'c']
+    """
+    n_more = 0 if mesh is None else -len(runs) % mesh.size
+    return [*runs, *[runs[0]] * n_more]
+
+
+def spread(make: Callable[[T], PyTree], runs: Sequence[T], mesh: Mesh | None) -> PyTree:
+    """Returns the trees that ``make`` returns for the runs as one, whose leaves have a leading axis of runs.
+
+    The number of runs must be a multiple of the number of devices, each of which gets its share.
+    """
+    if mesh is None:
+        return stacked([make(run) for run in runs])
+    size, sharding = len(runs) // mesh.size, NamedSharding(mesh, PartitionSpec(RUNS))
+    shares = [
+        jax.device_put(stacked([make(run) for run in runs[i * size : (i + 1) * size]]), device)
+        for i, device in enumerate(mesh.devices)
+    ]
+    whole = (
+        lambda *parts: jax.make_array_from_single_device_arrays(  # noqa: E731
+            (len(runs), *parts[0].shape[1:]), sharding, parts
+        )
+    )
+    return jax.tree.map(whole, *shares)
+
+
+def over_runs(function: Callable[..., Any], mesh: Mesh | None, in_axes: Any, out_axes: Any) -> Callable[..., Any]:
+    """Returns ``function`` of one run for all: ``jax.vmap``, and each device computes its share.
+
+    Args:
+        function: of one run.
+        mesh: the devices.
+        in_axes: 0 for arguments with an axis of runs, None for those without one; trees as for ``jax.vmap``.
+        out_axes: likewise of the results.
+    """
+    mapped = jax.vmap(function, in_axes, out_axes)
+    if mesh is None:
+        return mapped
+    spec = lambda axis: PartitionSpec() if axis is None else PartitionSpec(RUNS)  # noqa: E731
+    specs = lambda axes: jax.tree.map(spec, axes, is_leaf=lambda axis: axis is None)  # noqa: E731
+    return jax.shard_map(mapped, mesh=mesh, in_specs=specs(in_axes), out_specs=specs(out_axes), check_vma=False)
