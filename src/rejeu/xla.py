@@ -16,6 +16,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 THREADS = "NPROC"
 """Environment variable with the size of XLA's CPU thread pool."""
+DEVICES = "--xla_force_host_platform_device_count"
+"""Option of XLA with the number of devices as which the CPU appears."""
 CORES = "REJEU_CORES"
 """Environment variable with the most cores that a process should use; set for each run of a sweep."""
 LITTLE_WORK = 2**23
@@ -70,20 +72,23 @@ def threads_for(work: float) -> int:
     return 1 if work <= LITTLE_WORK else cores()
 
 
-def start_device(n_threads: int) -> None:
-    """Starts JAX's device, on a CPU with ``n_threads`` threads.
+def start_device(n_threads: int, n_devices: int = 1) -> None:
+    """Starts JAX's device, on a CPU with ``n_threads`` threads, or the CPU as several devices.
 
-    The number of threads is fixed when the device starts, once in a process. It is not changed if the program has used JAX
-    before or ``NPROC`` is set.
+    Both numbers are fixed when the device starts, once in a process. They are not changed if the program has used JAX before
+    or ``NPROC`` is set; the second also not if the user set it by ``XLA_FLAGS`` or ``jax_num_cpu_devices``.
     """
     global _threads
     if _threads is not None:
         return
-    if _is_running() or THREADS in os.environ:
+    if is_running() or THREADS in os.environ:
         given = os.environ.get(THREADS, "")
         _threads = int(given) if given.isdecimal() and int(given) > 0 else cores()
         return
     _threads = n_threads
+    is_set = DEVICES in os.environ.get("XLA_FLAGS", "") or jax.config.jax_num_cpu_devices >= 0  # type: ignore[attr-defined]
+    if n_devices > 1 and not is_set:
+        jax.config.update("jax_num_cpu_devices", n_devices)
     os.environ[THREADS] = str(n_threads)
     try:
         jax.local_devices()
@@ -96,13 +101,19 @@ def threads() -> int:
     return cores() if _threads is None else _threads
 
 
-def _is_running() -> bool:
+def is_running() -> bool:
     """Returns whether the program has started JAX's device."""
     try:
         from jax._src.xla_bridge import backends_are_initialized  # there is no public way to ask
     except ImportError:
         return False
     return backends_are_initialized()
+
+
+def platform() -> str:
+    """Returns the kind of the device on which JAX computes here: ``"cpu"``, ``"gpu"`` or another."""
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+    return jax.default_backend() if device is None else getattr(device, "platform", device)
 
 
 def run_once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -147,7 +158,7 @@ def _marked(function: F, marks: dict[str, str], most: float) -> F:
     def call(*arguments: Any, **keywords: Any) -> Any:
         leaves, structure = jax.tree.flatten((arguments, keywords))
         where = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray)]
-        if jax.default_backend() != "cpu" or sum(leaves[i].size for i in where) > most:
+        if platform() != "cpu" or sum(leaves[i].size for i in where) > most:
             return function(*arguments, **keywords)
 
         def of_arrays(*arrays: Array) -> Any:

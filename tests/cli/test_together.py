@@ -15,7 +15,18 @@ TINY = ["--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=
 def test_seeds_in_one_program_write_a_run_folder_each_and_a_comparison(tmp_path, capsys):
     out = tmp_path / "out"
     words = ["train", "jax/CartPole-v1", "--algo", "DQN", "--seeds", "2", "--seed", "3", "--steps", "120", "--no-video"]
-    words += ["--evaluate-every", "60", "--evaluate-episodes", "2", "--out", str(out), "--json", *TINY]
+    words += [
+        "--evaluate-every",
+        "60",
+        "--evaluate-episodes",
+        "2",
+        "--out",
+        str(out),
+        "--json",
+        "--device",
+        "cpu",
+        *TINY,
+    ]
     assert cli.main(words) == 0
     printed = capsys.readouterr()
     result = json.loads(printed.out)
@@ -31,9 +42,12 @@ def test_seeds_in_one_program_write_a_run_folder_each_and_a_comparison(tmp_path,
             "episodes.csv",
             "evaluations.csv",
         } <= {path.name for path in folder.iterdir()}
-        assert json.loads((folder / "config.json").read_text())["seed"] == seed
+        config = json.loads((folder / "config.json").read_text())
+        assert (config["seed"], config["device"]) == (seed, "cpu")
         assert len((folder / "evaluations.csv").read_text().splitlines()) == 3
     assert (out / "compare.html").is_file()
+    path = out / "seed_3" / "config.json"
+    path.write_text(path.read_text().replace('"device": "cpu"', '"device": "gpu"'))  # as on a machine that has one
     assert cli.main(["resume", str(out / "seed_3"), "--steps", "40", "--no-video"]) == 0
     assert len((out / "seed_3" / "evaluations.csv").read_text().splitlines()) == 4
 
@@ -43,3 +57,11 @@ def test_seeds_are_trained_in_one_program_unless_processes_are_asked_for():
     assert not together.is_possible(Train("jax/CartPole-v1", seeds=2, jobs=2))
     assert not together.is_possible(Train("CartPole-v1", seeds=2))
     assert not together.is_possible(Train("jax/CartPole-v1", seeds=2, wrapper=("my_env:Shaped",)))
+
+
+def test_an_unknown_device_is_one_line(capsys):
+    assert cli.main(["train", "jax/CartPole-v1", "--seeds", "2", "--device", "tpu"]) == 2
+    assert cli.main(["train", "CartPole-v1", "--device", "tpu"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all("must be 'auto'" in line for line in lines), lines

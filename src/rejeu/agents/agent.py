@@ -9,7 +9,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from rejeu import spaces
+from rejeu import devices, spaces
 from rejeu.agents import model_files, policy, resume, training
 from rejeu.agents.base import BaseAgent
 from rejeu.agents.record import record
@@ -70,7 +70,8 @@ class Agent(BaseAgent):
             ValueError: without an environment or a limit.
         """
         call = training.start_call(self, total_timesteps, episodes, minutes, log_interval, reset_num_timesteps)
-        training.train(self, call, callback, tb_log_name, progress_bar, sinks)
+        with devices.chosen(self.device):
+            training.train(self, call, callback, tb_log_name, progress_bar, sinks)
         return self
 
     def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
@@ -125,7 +126,8 @@ class Agent(BaseAgent):
         batch = self.with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
-        action, memory = policy.act(self, batch, deterministic, state, ended)
+        with devices.chosen(self.device):
+            action, memory = policy.act(self, batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
         return (scaled[0] if single else scaled), state if memory is None else memory
 
@@ -155,7 +157,8 @@ class Agent(BaseAgent):
         A callback may call it during ``learn``. If it uses the training environments, training continues in new
         episodes.
         """
-        return policy.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
+        with devices.chosen(self.device):
+            return policy.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
 
     def report(self, path: str | Path, evaluations: Iterable[tuple[int, Evaluation]] = ()) -> Path:
         """Writes a page about the training so far, one HTML file that needs no network, and returns its path.

@@ -18,7 +18,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import spaces, validation, xla
+from rejeu import devices, spaces, validation, xla
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import RunFolder, Stateful
 from rejeu.core import Algorithm
@@ -54,7 +54,8 @@ AGENT_ARGUMENTS = {
     "the environment's own reward threshold, if it has one.",
     "best_window": "Training episodes over whose mean return the best weights are chosen; 1 keeps those of the best "
     "episode. A larger value is less affected by chance.",
-    "device": "Accepted for compatibility with Stable-Baselines3; JAX chooses the device (see JAX_PLATFORMS).",
+    "device": "Where it computes: ``auto`` (JAX's default device, a GPU if JAX has one), ``cpu`` or ``gpu``. Files do not "
+    "contain it.",
 }
 """Arguments of every agent in addition to its hyperparameters, with their meanings."""
 
@@ -136,6 +137,7 @@ class BaseAgent(ABC):
             validation.whole("stats_window_size", stats_window_size, least=1),
             None if success_threshold is None else validation.number("success_threshold", success_threshold),
             validation.whole("best_window", best_window, least=1),
+            device,
         )
         self.made_from_id = isinstance(env, str)
         vector = self.make_envs(env, 1, seed=self.seed)
@@ -155,6 +157,7 @@ class BaseAgent(ABC):
         stats_window_size: int,
         success_threshold: float | None,
         best_window: int,
+        device: str = "auto",
     ) -> None:
         """Sets the attributes that do not depend on the environment."""
         self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
@@ -162,6 +165,8 @@ class BaseAgent(ABC):
         self.tensorboard_log = tensorboard_log
         self.stats_window_size, self.success_threshold = stats_window_size, success_threshold
         self.best_window = best_window
+        self.device = devices.named(device)
+        """Where it computes: ``"auto"``, ``"cpu"`` or ``"gpu"``."""
         self.history = History()
         self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=stats_window_size)
         """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
@@ -239,7 +244,8 @@ class BaseAgent(ABC):
             state: the state of the algorithm, packed; None initializes it from the seed.
         """
         buffer, learn_from = (None, 0) if env is None else (self.make_buffer(env), self.first_learning_step(0))
-        self.run: Run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
+        with devices.chosen(self.device):
+            self.run: Run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
 
     @abstractmethod
     def make_envs(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rejeu import devices
 from rejeu.agents.base import BaseAgent
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers.device import STRATEGIES
@@ -15,6 +16,7 @@ from rejeu.buffers.hindsight import HerReplayBuffer
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.envs.functional.vector import JaxVector
+from rejeu.loops.device import memory
 from rejeu.loops.device.driver import MAX_TURNS, Stops
 from rejeu.loops.run import Progress
 from rejeu.loops.training_call import TrainingCall
@@ -43,6 +45,16 @@ def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[Any]) -> 
             stacklevel=5,
         )
     return None
+
+
+def require_memory(agent: BaseAgent, n_runs: int = 1) -> None:
+    """Checks that the device has room for so many runs like that of an agent, whose training has not begun.
+
+    Raises:
+        MemoryError: if it has not, with the numbers and what to lower.
+    """
+    batch_size = agent.gradient_batch_size(agent.n_envs)
+    memory.check(agent.run, agent.learner, n_runs, batch_size, devices.local(agent.device))
 
 
 def stops_at(call: TrainingCall, callbacks: Sequence[Any]) -> Stops:

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from rejeu import spaces, validation, xla
+from rejeu import devices, spaces, validation, xla
 from rejeu.agents.base import AGENT_ARGUMENTS, BEST_WINDOW, BaseAgent, check_policy, whole_seed
 from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
@@ -275,6 +275,7 @@ def load(
         agent.check_spaces(vector, "the given environment")
     n_envs = 1 if vector is None else vector.n_envs
     xla.start_device(agent.n_threads(n_envs) if threads is None else threads)
+    devices.find(agent.device)  # an error of its own
     try:
         agent.start_run(vector, agent.learner.pack(state))
         _restore_counters(agent, saved.header)
@@ -306,6 +307,7 @@ def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
         validation.whole("stats_window_size", stats_window_size, 1),
         None if success_threshold is None else validation.number("success_threshold", success_threshold),
         validation.whole("best_window", best_window, 1),
+        given.get("device", "auto"),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from rejeu import spaces
+from rejeu import devices, spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
@@ -110,7 +110,8 @@ class OffPolicyAgent(Agent):
         >>> agent.q_values(obs, np.ones((50, 1))).shape, agent.q_values(obs[0], [1.0]).shape
         ((50,), ())
         """
-        return policy.q_values(self, observation, action, critics)
+        with devices.chosen(self.device):
+            return policy.q_values(self, observation, action, critics)
 
     def make_envs(
         self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None

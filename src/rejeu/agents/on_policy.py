@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from rejeu import spaces
+from rejeu import devices, spaces
 from rejeu.agents import policy
 from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
@@ -55,7 +55,8 @@ class OnPolicyAgent(Agent):
         >>> agent.value(np.zeros((50, 4), np.float32)).shape
         (50,)
         """
-        return policy.value(self, observation, state, episode_start)
+        with devices.chosen(self.device):
+            return policy.value(self, observation, state, episode_start)
 
     def make_envs(
         self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu import spaces, xla
+from rejeu import devices, spaces, xla
 from rejeu.agents import model_files
 from rejeu.agents.base import BaseAgent, Best, Resumed, whole_seed
 from rejeu.agents.run_files import (
@@ -123,7 +123,8 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         saved = convert(json_arrays.decode(header.run, file.read("run.")), SavedRun)
         best = checkpoint.within(file.read("best."), "best.")
         parts = [read_rows(path.parent / name, agent) for name in header.rows]
-        reason = restore(agent, saved, parts, best, path)
+        with devices.chosen(agent.device):
+            reason = restore(agent, saved, parts, best, path)
         agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
         if "train_freq" not in changes:
             check_owed(agent)

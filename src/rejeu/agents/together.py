@@ -14,10 +14,11 @@ from typing import Any, TypeVar
 
 import jax
 
-from rejeu import xla
+from rejeu import devices, xla
 from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
 from rejeu.agents.base import whole_seed
+from rejeu.agents.device import require_memory
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
@@ -33,8 +34,6 @@ from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Sink
 
 A = TypeVar("A", bound=Agent)
-MANY = 8
-"""Number of runs from which on their layers are large enough for several threads."""
 STATIC = ("buffer_size", "learning_starts", "batch_size", "n_steps", "n_epochs")
 """Whole numbers on which the shapes or the course of a program depend, which runs of one program therefore share."""
 IN_REPLAY = ("gamma",)
@@ -53,6 +52,7 @@ def train_seeds(
     callback: Callable[[A], Callback | Iterable[Callback] | None] | None = None,
     log_interval: int = 4,
     progress_bar: bool = False,
+    device: str = "auto",
     **settings: Any,
 ) -> list[A]:
     """Trains independent runs together, in JAX environments in one program on the device, and returns their agents.
@@ -72,6 +72,7 @@ def train_seeds(
         callback: called with each agent before training; returns its callbacks.
         log_interval: episodes of a run between two rows of its statistics.
         progress_bar: show the progress of the first run, which is that of all.
+        device: ``"auto"``, ``"cpu"`` or ``"gpu"``. If JAX has several devices of the kind, they share the runs.
         settings: arguments of the agent. A list of numbers in place of a float hyperparameter, such as
             ``learning_rate=[1e-4, 3e-4, 1e-3]``, trains every seed with each of them, or with each combination of several.
 
@@ -79,7 +80,9 @@ def train_seeds(
         The agents: for the first values of such hyperparameters one of each seed, then for the next.
 
     Raises:
-        ValueError: if the environment is an object that runs would share, or a setting is not supported or cannot differ.
+        ValueError: if the environment is an object that runs would share, or a setting is not supported or cannot differ; or
+            if JAX has no such device.
+        MemoryError: if replay buffers and states of all runs need more memory than is free.
 
     >>> import rejeu
     >>> agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 60, seeds=2, learning_rate=[1e-4, 1e-3])
@@ -100,7 +103,9 @@ def train_seeds(
     agents: list[A] = []
     for one in values:
         vector = lambda seed: first_envs(kind, env, n_envs, seed)  # noqa: E731
-        first = kind(policy, vector(numbers[0]), seed=numbers[0], **fixed, **one)
+        first = kind(policy, vector(numbers[0]), seed=numbers[0], device=device, **fixed, **one)
+        if not agents:
+            require_memory(first, len(numbers) * len(values))
         first.made_from_id = isinstance(env, str)
         agents += [first, *(sibling(first, vector(seed), seed) for seed in numbers[1:])]
     calls = [training.start_call(agent, total_timesteps, None, minutes, log_interval, True) for agent in agents]
@@ -110,9 +115,10 @@ def train_seeds(
 
 
 def start_device(n_runs: int) -> None:
-    """Starts JAX's device for so many runs in one program: with all threads if they are many."""
-    if n_runs >= MANY:
-        xla.start_device(xla.cores())
+    """Starts JAX's device for so many runs in one program: a CPU as one device for each core, which share the runs."""
+    n_devices = min(xla.cores(), n_runs)
+    if n_devices > 1:
+        xla.start_device(xla.cores() // n_devices, n_devices)
 
 
 def first_envs(kind: type[Agent], env: Any, n_envs: int, seed: int) -> Any:
@@ -145,6 +151,7 @@ def sibling(agent: A, env: Any, seed: int) -> A:
         agent.stats_window_size,
         agent.success_threshold,
         agent.best_window,
+        agent.device,
     )
     other.made_from_id = agent.made_from_id
     other.observation_space, other.action_space = agent.observation_space, agent.action_space
@@ -186,6 +193,7 @@ def learn_together(
     hyper = [{name: float(getattr(agent.config, name)) for name in differing} for agent in agents]
     active = [*range(len(agents))]
     with ExitStack() as stack:
+        stack.enter_context(devices.chosen(first.device))
         outputs = sinks or [()] * len(agents)
         sessions = [
             stack.enter_context(training.session(agent, call, one, None, more))
@@ -202,6 +210,7 @@ def learn_together(
                     active,
                     variants,
                     hyper,
+                    devices.local(first.device),
                 )
                 for chunk in named(turns, differing, first):
                     over = [i for i in active if sessions[i](chunk[i])]

@@ -120,6 +120,8 @@ def train(
         bar = [ProgressBar(call.n_steps, call.seconds, taken=taken, spent=call.spent)]
     callbacks = in_order([*listed(callback), *bar])
     agent.stops = device.stops_of(agent, call, callbacks)
+    if agent.stops is not None:
+        device.require_memory(agent)
     with session(agent, call, callbacks, tb_log_name, sinks) as record:
         try:
             with Interrupt() as interrupt:

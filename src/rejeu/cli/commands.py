@@ -19,6 +19,7 @@ Return = Annotated[float | None, arg(metavar="RETURN", help_behavior_hint="")]
 Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 Assignments = tuple[tuple[str, ...], ...]
 Json = Annotated[bool, FlagCreatePairsOff]
+Device = Annotated[str, arg(metavar="NAME")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +75,8 @@ class Train(EnvironmentOptions):
     """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
     env_cpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
     """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
+    device: Device = "auto"
+    """auto, cpu or gpu; auto is the device that JAX chooses, a GPU if it has one."""
     seed: Count = None
     """Seeds everything; by default a random one."""
     seeds: Count = None
@@ -147,6 +150,8 @@ class Resume(RunOptions):
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
     """Hyperparameters to change from here on, as for rejeu train; those that change shapes cannot be changed."""
+    device: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """As for rejeu train; by default cpu if the run was trained there on request, else auto."""
     restart_workers: Annotated[int, arg(metavar="N")] = 0
     """As for rejeu train; for this part of the run."""
     env_cpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -267,6 +272,8 @@ class Evaluate(RunOptions):
     """Wall time after which no further episode begins; running episodes are finished."""
     backend: Annotated[str, arg(metavar="NAME")] = "auto"
     """auto, envpool, gymnasium or gymnasium-async; gymnasium is the environment's own package."""
+    device: Device = "auto"
+    """As for rejeu train."""
     seed: Count = None
     """Of the environments; by default a random one."""
     success_threshold: Return = None

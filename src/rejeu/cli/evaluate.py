@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 
+from rejeu import devices
 from rejeu.agents import load
 from rejeu.cli import jsonout, run_folder
 from rejeu.cli.commands import Evaluate
@@ -11,12 +12,13 @@ from rejeu.cli.commands import Evaluate
 
 def run(arguments: Evaluate) -> int:
     """Evaluates, prints the result, and returns the exit status."""
+    devices.start_with("--device", arguments.device)
     episodes, minutes = arguments.episodes, arguments.minutes
     if minutes is None and episodes is None:
         episodes = 100
     model = run_folder.find_model(arguments.run, arguments.which)
     environment = run_folder.environment_of(model, arguments)
-    agent = load(model)
+    agent = load(model, device=arguments.device)
     n_envs = 16 if episodes is None else min(episodes, 16)
     with (
         jsonout.messages(arguments.json) as output,

@@ -8,6 +8,7 @@ from contextlib import closing
 from itertools import chain
 from typing import Any
 
+from rejeu import devices
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
 from rejeu.cli import jsonout, pbt, run_folder, settings, sweep, tune
@@ -47,6 +48,8 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     if arguments.ray is not None and config.backend != "ray":
         raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray is for these")
     require(config.log)
+    device = arguments.device or ("cpu" if config.device == "cpu" else "auto")  # a GPU may not be here
+    devices.start_with("--device", device)
     kind = agent_of_file(config.algorithm, folder.config)
     environment = run_folder.of_run(folder, config, arguments)
     ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
@@ -54,7 +57,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
-            agent = kind.resume(folder.checkpoints, env, **changes(arguments, config))
+            agent = kind.resume(folder.checkpoints, env, device=device, **changes(arguments, config))
         if arguments.assignments:
             config = dataclasses.replace(config, hyperparameters=configs.to_json(agent.config))
             run_folder.write_config(folder, config)

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from rejeu import devices
 from rejeu.agents import training
-from rejeu.agents.device import reason_against
+from rejeu.agents.device import reason_against, require_memory
 from rejeu.agents.together import learn_together, start_device
 from rejeu.cli import run_folder, seeds, sweep
 from rejeu.cli.commands import Train
@@ -35,6 +36,7 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
     Settings that cannot be trained on the device are trained in processes.
     """
     stopwatch, jobs = Stopwatch(), seeds.make_jobs(arguments)
+    devices.start_with("--device", arguments.device)
     path = seeds.choose_folder(arguments)
     start_device(len(jobs))
     with ExitStack() as stack:
@@ -42,6 +44,7 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
         if reason := reason_against(first.agent, ()):
             echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
             return seeds.train_all(arguments)
+        require_memory(first.agent, len(jobs))
         code = Code(env=arguments.env, wrappers=arguments.wrapper, imports=arguments.imports)
         folder = open_folder(path, Sweep(jobs=jobs, threads=threads_of(1)), None, code)
         sessions = [first, *(begin(arguments, job.seed, first, stack) for job in jobs[1:])]

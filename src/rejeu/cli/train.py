@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import presets, validation
+from rejeu import devices, presets, validation
 from rejeu.agents import AGENTS, agent_of_file, find_agent
 from rejeu.agents.together import sibling
 from rejeu.algorithms import config as configs
@@ -42,6 +42,7 @@ def run(arguments: Train) -> int:
 def train(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
+    devices.start_with("--device", arguments.device)
     run_folder.check_free(arguments.out)
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with ExitStack() as stack:
@@ -71,7 +72,12 @@ def begin(arguments: Train, seed: int, first: Session | None, stack: ExitStack) 
     if first is None:
         config = make_config(arguments, made, preset, algorithm or choose_algorithm(preset, env), env, seed, logs)
         agent = AGENTS[config.algorithm](
-            config.policy, env, seed=seed, success_threshold=config.success_threshold, **config.hyperparameters
+            config.policy,
+            env,
+            seed=seed,
+            success_threshold=config.success_threshold,
+            device=config.device,
+            **config.hyperparameters,
         )
     else:
         config = dataclasses.replace(first.config, seed=seed)
@@ -190,6 +196,7 @@ def make_config(
         n_envs=env.n_envs,
         backend=env.backend,
         wait_for=env.wait_for,
+        device=devices.named(arguments.device, "--device"),
         steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
         minutes=arguments.minutes,
         success_threshold=arguments.success_threshold,

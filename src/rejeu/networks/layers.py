@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from rejeu import xla
+
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "relu": jax.nn.relu,
     "tanh": jnp.tanh,
@@ -65,7 +67,7 @@ def _product_forward(x: Array, weight: Array) -> tuple[Array, tuple[Array, Array
 def _product_backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, weight = saved
     rows, row_gradients = x.reshape(-1, weight.shape[0]), gradient.reshape(-1, weight.shape[1])
-    if weight.shape[1] == 1 or jax.default_backend() != "cpu":
+    if weight.shape[1] == 1 or xla.platform() != "cpu":
         return gradient @ weight.T, rows.T @ row_gradients
     apart = jax.lax.optimization_barrier
     return gradient @ weight.T, apart(apart(rows.T) @ row_gradients)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from rejeu import devices
 from rejeu.cli import settings
 from rejeu.cli.settings import INTEGERS
 from rejeu.envs.make import BACKENDS
@@ -44,6 +45,7 @@ class Options:
     wait_for: int | None = None
     arrivals: str | None = None
     """Path of the record of an earlier run."""
+    device: str = "auto"
     ray: str | None = None
     """Address of a Ray cluster for environments with ``backend="ray"``."""
     env_cpus: float | None = None
@@ -71,6 +73,7 @@ class Options:
             if value is not None and (not isinstance(value, str) or not value or value.startswith("-")):
                 raise ValueError(f"{key}={value!r} must be {'an address' if key == 'ray' else 'the path of a file'}")
         coerce(self, "backend", choice, optional=True, among=BACKENDS)
+        coerce(self, "device", choice, among=devices.NAMES)
         if not isinstance(self.log, str | list | tuple) or not all(isinstance(one, str) for one in self.log):
             raise TypeError(f"log={self.log!r} must be a list of names")
         assign(self, log=check_logs("log", self.log))

@@ -47,12 +47,11 @@ def spread(make: Callable[[T], PyTree], runs: Sequence[T], mesh: Mesh | None) ->
         jax.device_put(stacked([make(run) for run in runs[i * size : (i + 1) * size]]), device)
         for i, device in enumerate(mesh.devices)
     ]
-    whole = (
-        lambda *parts: jax.make_array_from_single_device_arrays(  # noqa: E731
-            (len(runs), *parts[0].shape[1:]), sharding, parts
-        )
-    )
-    return jax.tree.map(whole, *shares)
+
+    def joined(*parts: jax.Array) -> jax.Array:
+        return jax.make_array_from_single_device_arrays((len(runs), *parts[0].shape[1:]), sharding, parts)
+
+    return jax.tree.map(joined, *shares)
 
 
 def over_runs(function: Callable[..., Any], mesh: Mesh | None, in_axes: Any, out_axes: Any) -> Callable[..., Any]:
