@@ -6,10 +6,10 @@ import os
 import subprocess
 import sys
 
-import numpy as np
+import jax
 import pytest
 
-from rejeu.loops.device.sharing import filled, mesh_of
+from rejeu.loops.device.sharing import filled, group_size, mesh_of
 from tests.loops.device.two_devices import CASES
 
 TWO = "--xla_force_host_platform_device_count=2"
@@ -30,7 +30,8 @@ def test_runs_on_two_devices_equal_single_ones(name: str) -> None:
 
 
 def test_every_device_has_the_same_number_of_runs() -> None:
-    mesh = mesh_of(5, np.array([f"device {i}" for i in range(2)]).tolist())
-    assert mesh is not None
-    assert filled([1, 2, 3, 4, 5], mesh) == [1, 2, 3, 4, 5, 1]
-    assert mesh_of(1, ["one", "two"]) is None  # type: ignore[list-item]
+    cpus = [jax.devices("cpu")[0]] * 2
+    assert [group_size(n, cpus) for n in (1, 2, 3, 5, 16, 17, 64)] == [1, 2, 4, 6, 16, 10, 16]
+    assert [group_size(n, cpus[:1]) for n in (1, 8, 9, 64)] == [1, 8, 5, 8]
+    assert filled([1, 2, 3, 4, 5], 6) == [1, 2, 3, 4, 5, 1]
+    assert mesh_of(1, cpus) is None

@@ -13,6 +13,7 @@ import numpy as np
 import rejeu
 from rejeu import devices
 from rejeu.callbacks import Checkpoint
+from rejeu.loops.device import sharing
 from rejeu.loops.device.machine import Machine
 from tests.agents.test_together import ON_POLICY, SMALL, assert_same_runs
 
@@ -26,14 +27,15 @@ CASES: dict[str, Any] = {
 def share(name: str) -> None:
     """Compares runs that stop at different steps with single ones, and resumes one of them."""
     kind, env, settings = CASES[name]
+    sharing.MOST_ON_CPU = 1  # so that there are two groups of runs
     used: list[int] = []
-    call = Machine.call
+    start = Machine.start
 
     def counted(machine: Machine, limits: Any) -> None:
-        call(machine, limits)
+        start(machine, limits)
         used.append(len(jax.tree.leaves(machine.carry.state)[0].sharding.device_set))
 
-    Machine.call = counted  # type: ignore[method-assign]
+    Machine.start = counted  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder:
 
         def callbacks(agent: Any) -> list[Any]:

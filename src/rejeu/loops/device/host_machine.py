@@ -50,6 +50,8 @@ class HostMachine:
         """
         self.learner, self.config, self.active, self.devices = learner, config, active, devices
         self.mesh: Mesh | None = None
+        self.size = 0
+        """Number of runs that are computed: a multiple of the number of devices."""
         self.runs: list[Run] = []
         """The runs that are trained."""
         self.order: list[int] = []
@@ -78,10 +80,12 @@ class HostMachine:
         """Stacks the states of the runs, and chooses first actions."""
         self.order = [*self.active]
         self.runs = runs = [runs[i] for i in self.order]
-        if (mesh := mesh_of(len(runs), self.devices)) != self.mesh:
+        mesh = mesh_of(len(runs), self.devices)
+        self.size = len(runs) if mesh is None else mesh.size * -(-len(runs) // mesh.size)
+        if mesh != self.mesh:
             self.mesh = mesh
             self.several = self.learner.several(partial(over_runs, mesh=mesh, in_axes=0, out_axes=0))
-        self.state = spread(lambda run: [np.asarray(part) for part in run.state], filled(runs, mesh), mesh)
+        self.state = spread(lambda run: [np.asarray(part) for part in run.state], filled(runs, self.size), mesh)
         self.carry = self.stacked([run.carry for run in runs])
         self.in_a_row = np.zeros(len(runs), np.int64)
         clocks = [clock_of(run, progress) for run in runs]
@@ -175,7 +179,7 @@ class HostMachine:
 
     def stacked(self, trees: Sequence[Any]) -> Any:
         """Returns what each run gives to a call as one, on the host, with a leading axis of as many as are computed."""
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *filled(trees, self.mesh))
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *filled(trees, self.size))
 
     def fault(self, which: int) -> bool:
         """Returns whether the last chunk left something that is not finite in a run."""

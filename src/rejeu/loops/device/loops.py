@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import jax
 
 from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.loops.device.driver import Stops, train
+from rejeu.loops.device.groups import Groups
 from rejeu.loops.device.host_machine import HostMachine
 from rejeu.loops.device.off_policy_machine import OffPolicyMachine
 from rejeu.loops.device.on_policy_machine import OnPolicyMachine
+from rejeu.loops.device.sharing import group_size
 from rejeu.loops.device.variants import Variants
 from rejeu.loops.learner import Learner
 from rejeu.loops.off_policy import begin_episodes
@@ -86,10 +89,11 @@ def together(
         host = HostMachine(learner, config, active, devices)
         yield from train(host, runs, learner, n_steps, progress, stops, begin_episodes, active)
         return
-    differing = [{}] * len(runs) if hyper is None else hyper
-    if isinstance(config, OnPolicyConfig):
-        on = OnPolicyMachine(runs, learner, config, stops, variants, differing, devices)
-        yield from train(on, runs, learner, n_steps, progress, stops, lambda run: begin_rollouts(run, config), active)
-    else:
-        off = OffPolicyMachine(runs, learner, config, stops, variants, differing, devices)
-        yield from train(off, runs, learner, n_steps, progress, stops, begin_episodes, active)
+    size = group_size(len(runs), devices)
+    by_run = {id(run): one for run, one in zip(runs, hyper or [{}] * len(runs), strict=True)}
+    kind: Any = OnPolicyMachine if isinstance(config, OnPolicyConfig) else OffPolicyMachine
+    groups = [runs[i : i + size] for i in range(0, len(runs), size)]
+    machines = [kind(group, learner, config, stops, variants, by_run, size, devices) for group in groups]
+    machine = machines[0] if len(machines) == 1 else Groups(machines, size, active)
+    begin = (lambda run: begin_rollouts(run, config)) if kind is OnPolicyMachine else begin_episodes
+    yield from train(machine, runs, learner, n_steps, progress, stops, begin, active)

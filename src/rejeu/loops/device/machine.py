@@ -8,7 +8,6 @@ from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rejeu.core import Clock, Rollout, Transition
@@ -31,12 +30,15 @@ class Machine(ABC):
     With several runs their arrays have a leading axis, except for those that all runs share.
     """
 
-    def __init__(self, runs: Sequence[Run], program: Any, devices: Sequence[jax.Device]) -> None:
-        """Takes runs of equal settings in JAX environments, the program that trains them, and devices that may share them."""
+    def __init__(self, runs: Sequence[Run], program: Any, size: int, devices: Sequence[jax.Device]) -> None:
+        """Takes runs of equal settings in JAX environments, the program that trains them, and devices that may share them.
+
+        ``size`` is the number of runs for which the program is compiled, a multiple of that of the devices.
+        """
         self.env, self.program = runs[0].env.env, program
-        self.mesh = mesh_of(len(runs), devices)
+        self.mesh = mesh_of(size, devices)
         """The devices that share the runs; None if one computes all."""
-        self.n = len(filled(runs, self.mesh))
+        self.n = size
         """Number of runs that are computed."""
         self.carry: Any = None
         self.store: Any = None
@@ -45,8 +47,10 @@ class Machine(ABC):
         """The carry after the last chunk by run, on the host apart from large arrays of a single run."""
         self.experience: list[Any] = []
         """What :meth:`fetch` returned after the last chunk, by run."""
+        self.report: Any = None
+        """Of the last chunk."""
         self.reports: list[Report] = []
-        """The reports of the last chunk on the host, by run."""
+        """The same on the host, by run."""
 
     @property
     def capacity(self) -> int:
@@ -83,7 +87,7 @@ class Machine(ABC):
 
     def push(self, runs: Sequence[Run], leader: Run, progress: float) -> None:
         """Puts the runs onto the device, with the counters of ``leader``."""
-        runs = filled(runs, self.mesh)
+        runs = filled(runs, self.n)
         self.begin(runs)
         if self.n == 1:
             self.carry, self.store = self.carry_of(leader, progress), self.store_of(leader)
@@ -95,12 +99,20 @@ class Machine(ABC):
 
     def call(self, limits: Limits) -> None:
         """Takes a chunk of turns."""
+        self.start(limits)
+        self.finish()
+
+    def start(self, limits: Limits) -> None:
+        """Starts a chunk of turns, and does not wait for it."""
         if self.n == 1:
-            self.carry, self.store, report = take_chunk((self.program, self.env, self.carry, limits), self.store)
+            self.carry, self.store, self.report = take_chunk((self.program, self.env, self.carry, limits), self.store)
         else:
             kept = (self.program, self.mesh, self.env, self.carry, limits)
-            self.carry, self.store, report = take_chunks(kept, self.store)
-        counts, self.reports = copies(self.carry.counts), unstacked(copies(report), self.n)
+            self.carry, self.store, self.report = take_chunks(kept, self.store)
+
+    def finish(self) -> None:
+        """Waits for the chunk, and copies what it did to the host."""
+        counts, self.reports = copies(self.carry.counts), unstacked(copies(self.report), self.n)
         if self.n == 1:  # networks and environments stay on the device; everything else is small
             players = self.carry.players
             small = copies(players._replace(env=None))._replace(env=players.env)
@@ -125,9 +137,8 @@ class Machine(ABC):
         run.n_updates += int(report.n_updates)
         run.monitor.n_skipped += int(report.n_bad)
         if report.n_updates:
-            run.metrics = Readings.of(
-                {name: jnp.asarray(value) for name, value in report.metrics.items()}, report.n_bad
-            )
+            values = [*report.metrics.values(), report.n_bad]
+            run.metrics = Readings(tuple(report.metrics), np.array(values, np.float32))
         self.put(run, carry, self.experience[which])
         episodes = episodes_of(run, report.log, first_step, run.step)
         return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))

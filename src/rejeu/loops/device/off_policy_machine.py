@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -37,12 +37,13 @@ class OffPolicyMachine(Machine):
         config: OffPolicyConfig,
         stops: Stops,
         variants: Variants | None = None,
-        hyper: Sequence[dict[str, float]] = ({},),
+        hyper: Mapping[int, dict[str, float]] | None = None,
+        size: int = 1,
         devices: Sequence[jax.Device] = (),
     ) -> None:
-        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each.
+        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each, by its ``id``.
 
-        ``devices`` share several runs.
+        ``devices`` share several runs; see :class:`Machine` for ``size``.
         """
         run = runs[0]
         program = OffPolicyProgram(
@@ -56,10 +57,10 @@ class OffPolicyMachine(Machine):
             stops.at_episodes,
             variants,
         )
-        super().__init__(runs, program, devices)
+        super().__init__(runs, program, size, devices)
         self.heads: np.ndarray = np.zeros(0)
         """Times of the newest rows that the hosts' rings have, ``int64 (n_runs, n_envs)``."""
-        self.hyper = {id(run): one for run, one in zip(runs, hyper, strict=True)}
+        self.hyper = {} if hyper is None else hyper
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
         return False
@@ -76,7 +77,7 @@ class OffPolicyMachine(Machine):
             players=players_of(run),
             counts=Counts(jnp.uint32(run.step), jnp.int32(run.owed), jnp.int32(run.steps_since_update)),
             in_a_row=jnp.int32(0),
-            hyper={name: jnp.float32(value) for name, value in self.hyper[id(run)].items()},
+            hyper={name: jnp.float32(value) for name, value in self.hyper.get(id(run), {}).items()},
         )
         if run.action is None:
             run.action = np.array(first_action(self.program, self.env, carry, np.float32(progress)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -33,12 +33,13 @@ class OnPolicyMachine(Machine):
         config: OnPolicyConfig,
         stops: Stops,
         variants: Variants | None = None,
-        hyper: Sequence[dict[str, float]] = ({},),
+        hyper: Mapping[int, dict[str, float]] | None = None,
+        size: int = 1,
         devices: Sequence[jax.Device] = (),
     ) -> None:
-        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each.
+        """Takes runs of equal settings in JAX environments, apart from the hyperparameters ``hyper`` of each, by its ``id``.
 
-        ``devices`` share several runs.
+        ``devices`` share several runs; see :class:`Machine` for ``size``.
         """
         program = OnPolicyProgram(
             learner.algorithm,
@@ -51,8 +52,8 @@ class OnPolicyMachine(Machine):
             stops.at_episodes,
             variants,
         )
-        super().__init__(runs, program, devices)
-        self.hyper = {id(run): one for run, one in zip(runs, hyper, strict=True)}
+        super().__init__(runs, program, size, devices)
+        self.hyper = {} if hyper is None else hyper
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
         """Returns whether the rollout that is under way at the step ``last`` is learned from.
@@ -75,7 +76,7 @@ class OnPolicyMachine(Machine):
             players=players_of(run),
             counts=Counts(jnp.uint32(run.step), jnp.int32(run.replay.length)),
             in_a_row=jnp.int32(0),
-            hyper={name: jnp.float32(value) for name, value in self.hyper[id(run)].items()},
+            hyper={name: jnp.float32(value) for name, value in self.hyper.get(id(run), {}).items()},
         )
 
     def store_of(self, run: Run) -> Steps:

@@ -15,6 +15,8 @@ from rejeu.loops.device.transfer import stacked
 T = TypeVar("T")
 RUNS = "runs"
 """Name of the axis of runs."""
+MOST_ON_CPU = 8
+"""Runs that a CPU device computes at once at most: the layers of more do not fit into the cache of a core."""
 
 
 def mesh_of(n_runs: int, devices: Sequence[jax.Device]) -> Mesh | None:
@@ -23,16 +25,24 @@ def mesh_of(n_runs: int, devices: Sequence[jax.Device]) -> Mesh | None:
     return Mesh(used, (RUNS,)) if len(used) > 1 else None
 
 
-def filled(runs: Sequence[T], mesh: Mesh | None) -> list[T]:
-    """Returns the runs, and the first one again until every device has the same number.
+def filled(runs: Sequence[T], size: int) -> list[T]:
+    """Returns the runs, and the first one again until there are ``size``.
 
-    What the additional ones compute is not used. It takes no time, because the other devices are busy as long.
+    What the additional ones compute is not used. It takes no time, because other devices are busy as long.
 
-    >>> filled("abc", None)
-    ['a', 'b', 'c']
+    >>> filled("abc", 4)
+    ['a', 'b', 'c', 'a']
     """
-    n_more = 0 if mesh is None else -len(runs) % mesh.size
-    return [*runs, *[runs[0]] * n_more]
+    return [*runs, *[runs[0]] * (size - len(runs))]
+
+
+def group_size(n_runs: int, devices: Sequence[jax.Device]) -> int:
+    """Returns how many runs are computed at once: a multiple of the number of devices that share them."""
+    n_devices = min(max(len(devices), 1), n_runs)
+    of_each = -(-n_runs // n_devices)
+    is_cpu = not devices or devices[0].platform == "cpu"
+    n_groups = -(-of_each // MOST_ON_CPU) if is_cpu else 1
+    return n_devices * -(-of_each // n_groups)
 
 
 def spread(make: Callable[[T], PyTree], runs: Sequence[T], mesh: Mesh | None) -> PyTree:
