@@ -41,6 +41,20 @@ def functional(data: dict[str, Any]) -> str:
     return f"{paragraph(intro)}\n\n{table(header, rows)}"
 
 
+def device_replay(data: dict[str, Any]) -> str:
+    """Times of the host's loop with its replay buffer on the host and on the device."""
+    rows = []
+    for one in data["results"]:
+        times, rounds = one["microseconds"], one["of_each_round"]
+        cells = (f"{times[kind]:.0f} ({min(rounds[kind]):.0f} to {max(rounds[kind]):.0f})" for kind in times)
+        rows.append((one["case"], *cells, f"{one['batch_by_numpy_microseconds']:.0f}"))
+    intro = (
+        f"Microseconds for each step, median and range of {len(next(iter(rounds.values())))} rounds (`{data['command']}`; "
+        f"{data['machine']['device']}, {data['machine']['cores']} cores)."
+    )
+    return f"{paragraph(intro)}\n\n{table(('', *times, 'NumPy, for a batch alone'), rows)}"
+
+
 def device_loops(data: dict[str, Any]) -> str:
     """Steps per second of the loop on the device, and of the host's loop with two kinds of environments."""
     rows = []

@@ -421,6 +421,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "device": lambda name="device": tables.device_loops(load(f"{name}.json")),
     "device-seeds": lambda name="device": tables.device_seeds(load(f"{name}.json")),
     "device-peers": lambda: tables.peers(load("device_peers.json")),
+    "device-replay": lambda: tables.device_replay(load("device_replay.json")),
     "parking-transfer": lambda: tables.transfer(load("parking_transfer.json")),
     "sweep": lambda: tables.sweep(load("sweep.json")),
     "sweep-kills": lambda: tables.sweep_kills(load("sweep_kills.json", TRIALS)),

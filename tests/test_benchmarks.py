@@ -125,3 +125,13 @@ def test_the_texts_on_sweeps_have_shares_and_kills():
     }
     text = tables.sweep_kills({"command": "it", "checkpoint_interval_seconds": 3.0, "local": kills})
     assert "| local processes | 3: 3 of a run | 7 of 8 | 2.5 s |" in text
+
+
+def test_table_of_the_replay_buffer_on_the_device():
+    entry = {
+        "case": "SAC", "microseconds": {"host": 2.0, "one call": 5.0},
+        "of_each_round": {"host": [1.0, 2.0, 3.0], "one call": [4.0, 5.0, 6.0]}, "batch_by_numpy_microseconds": 1.0,
+    }  # fmt: skip
+    text = tables.device_replay({**PROVENANCE, "results": [entry]})
+    assert "of 3 rounds" in text
+    assert "| SAC | 2 (1 to 3) | 5 (4 to 6) | 1 |" in text
