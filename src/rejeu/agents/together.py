@@ -23,6 +23,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.envs.functional.registry import is_functional
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt
 from rejeu.loops import finite
@@ -99,7 +100,8 @@ def train_seeds(
     lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
     fixed = {name: value for name, value in settings.items() if name not in lists}
     values = [dict(zip(lists, one, strict=True)) for one in itertools.product(*lists.values())]
-    start_device(len(numbers) * len(values))
+    if isinstance(env, FunctionalEnv) or is_functional(env):
+        start_device(len(numbers) * len(values))
     agents: list[A] = []
     for one in values:
         vector = lambda seed: first_envs(kind, env, n_envs, seed)  # noqa: E731

@@ -9,7 +9,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -147,7 +147,7 @@ class RunConfig:
     """Logs beside ``metrics.csv``."""
     wait_for: Positive | None = None
     """How many results are taken at a time, None where all environments step together; missing in older folders."""
-    device: Literal["auto", "cpu", "gpu"] = "auto"
+    device: Annotated[str, Meta(pattern="^(auto|cpu|gpu)$")] = "auto"
     """The device that was asked for; the run can be resumed and its models loaded on any. Missing in older folders."""
 
 

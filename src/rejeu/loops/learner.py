@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -52,12 +51,9 @@ class Learner:
         self.action_values, self.state_value = jax.jit(self._action_values), jax.jit(self._state_value)
         self.copy = jax.jit(copy)
 
-    def several(self, over_runs: Callable[..., Any] = jax.vmap) -> Several:
-        """Returns the functions for several states at once, each argument and result with a leading axis of states.
-
-        ``over_runs`` makes such a function.
-        """
-        mapped = lambda function, **options: jax.jit(over_runs(function), **options)  # noqa: E731
+    def several(self) -> Several:
+        """Returns the functions for several states at once, each argument and result with a leading axis of states."""
+        mapped = lambda function, **options: jax.jit(jax.vmap(function), **options)  # noqa: E731
         observe = None if self.observe is None else mapped(self._observe, donate_argnums=0)
         return Several(mapped(partial(self._act, self.explorer)), mapped(self._update, donate_argnums=0), observe)
 

@@ -7,18 +7,15 @@ compiled code are one for all runs. As on the device, callbacks are served betwe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Clock
 from rejeu.loops.checks import check_step, checked_reset
 from rejeu.loops.device.driver import MAX_TURNS
-from rejeu.loops.device.sharing import filled, mesh_of, over_runs, spread
 from rejeu.loops.device.turns import NO_LIMIT, Limits
 from rejeu.loops.learner import Learner, is_finite
 from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
@@ -41,22 +38,14 @@ class HostMachine:
 
     capacity = MAX_TURNS
 
-    def __init__(
-        self, learner: Learner, config: OffPolicyConfig, active: Sequence[int], devices: Sequence[jax.Device] = ()
-    ) -> None:
-        """Takes the algorithm, its hyperparameters, the indices of the runs that are trained, which may change, and devices.
-
-        Each of the devices computes some of the runs.
-        """
-        self.learner, self.config, self.active, self.devices = learner, config, active, devices
-        self.mesh: Mesh | None = None
-        self.size = 0
-        """Number of runs that are computed: a multiple of the number of devices."""
+    def __init__(self, learner: Learner, config: OffPolicyConfig, active: Sequence[int]) -> None:
+        """Takes the algorithm, its hyperparameters, and the indices of the runs that are trained, which may change."""
+        self.learner, self.config, self.active = learner, config, active
         self.runs: list[Run] = []
         """The runs that are trained."""
         self.order: list[int] = []
         """Their indices."""
-        self.several = learner.several(partial(over_runs, mesh=None, in_axes=0, out_axes=0))
+        self.several = learner.several()
         self.state: PackedState = []
         """Packed states of all runs, with a leading axis."""
         self.carry: Any = None
@@ -80,18 +69,13 @@ class HostMachine:
         """Stacks the states of the runs, and chooses first actions."""
         self.order = [*self.active]
         self.runs = runs = [runs[i] for i in self.order]
-        mesh = mesh_of(len(runs), self.devices)
-        self.size = len(runs) if mesh is None else mesh.size * -(-len(runs) // mesh.size)
-        if mesh != self.mesh:
-            self.mesh = mesh
-            self.several = self.learner.several(partial(over_runs, mesh=mesh, in_axes=0, out_axes=0))
-        self.state = spread(lambda run: [np.asarray(part) for part in run.state], filled(runs, self.size), mesh)
-        self.carry = self.stacked([run.carry for run in runs])
+        self.state = [jax.numpy.asarray(part) for part in stacked([run.state for run in runs])]
+        self.carry = stacked([run.carry for run in runs])
         self.in_a_row = np.zeros(len(runs), np.int64)
         clocks = [clock_of(run, progress) for run in runs]
         if any(run.action is None for run in runs):
             chosen = self.choose(clocks)
-            for run, action in zip(runs, np.asarray(chosen)[: len(runs)], strict=True):
+            for run, action in zip(runs, np.asarray(chosen), strict=True):
                 run.action = np.array(action) if run.action is None else run.action
 
     def call(self, limits: Limits) -> None:
@@ -109,7 +93,7 @@ class HostMachine:
                 run.state = self.state_of(i)
             raise
         self.fetch()
-        bad = [np.asarray(one.vector)[: len(self.runs), -1].astype(np.int64) for one in found]
+        bad = [np.asarray(one.vector)[:, -1].astype(np.int64) for one in found]
         self.n_bad = np.sum(bad, axis=0) if bad else np.zeros(len(self.runs), np.int64)
         for one in bad:
             self.in_a_row = np.where(one > 0, self.in_a_row + one, 0)
@@ -121,13 +105,13 @@ class HostMachine:
         last = None if limits.last == NO_LIMIT else int(limits.last)
         ended = [self.step(i, run, last) for i, run in enumerate(runs)]
         if self.learner.observe is not None:
-            seen, returns = self.stacked([run.obs for run in runs]), self.stacked([run.running_return for run in runs])
+            seen, returns = stacked([run.obs for run in runs]), stacked([run.running_return for run in runs])
             self.calls.append(Call(False, (seen, returns)))
             self.state = self.several.observe(self.state, seen, returns)
         (n_updates,) = {due(run, config, kept, n) for run, (kept, n) in zip(runs, ended, strict=True)}
         clocks = [clock_of(run, progress) for run in runs]
         chosen = self.choose(clocks) if config.overlap else None
-        readings, clock = [], Clock(*self.stacked(clocks))
+        readings, clock = [], Clock(*stacked(clocks))
         drawn = [[run.replay.draw(run.rng, shape, progress) for run in runs]
                  for shape in batch_shapes(n_updates, config, n_envs)]  # fmt: skip
         for run in runs:
@@ -135,15 +119,15 @@ class HostMachine:
             run.td_errors = []
             run.n_updates += n_updates
         for samples in drawn:
-            batch = self.stacked([one for one, _ in samples])
+            batch = stacked([one for one, _ in samples])
             self.calls.append(Call(True, (batch, clock)))
             self.state, reading, td_error = self.several.update(self.state, batch, clock)
             readings.append(reading)
             if td_error is not None:
-                for run, (_, draw), error in zip(runs, samples, td_error, strict=False):
+                for run, (_, draw), error in zip(runs, samples, td_error, strict=True):
                     run.td_errors.append((draw, error))
         chosen = self.choose(clocks) if chosen is None else chosen
-        for run, action in zip(runs, np.asarray(chosen)[: len(runs)], strict=True):
+        for run, action in zip(runs, np.asarray(chosen), strict=True):
             run.action = action
         return readings
 
@@ -173,13 +157,9 @@ class HostMachine:
         if runs[0].step < self.config.learning_starts:
             return [random_action(run.env.action_space, run.env.n_envs, run.rng) for run in runs]
         given = zip(*((run.obs, run.ended, run.key) for run in runs), strict=True)
-        obs, ended, keys = (self.stacked(one) for one in given)
-        chosen, self.carry = self.several.act(self.state, self.carry, obs, ended, keys, Clock(*self.stacked(clocks)))
+        obs, ended, keys = (stacked(one) for one in given)
+        chosen, self.carry = self.several.act(self.state, self.carry, obs, ended, keys, Clock(*stacked(clocks)))
         return chosen
-
-    def stacked(self, trees: Sequence[Any]) -> Any:
-        """Returns what each run gives to a call as one, on the host, with a leading axis of as many as are computed."""
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *filled(trees, self.size))
 
     def fault(self, which: int) -> bool:
         """Returns whether the last chunk left something that is not finite in a run."""
@@ -197,7 +177,7 @@ class HostMachine:
 
     def state_of(self, which: int) -> PackedState:
         """Returns the packed state of a run after the chunk by its place among those that are trained."""
-        return [part[which] for part in self.after]  # type: ignore[misc]
+        return [part[which] for part in self.after]
 
     def pull(self, which: int, run: Run) -> Progress:
         """Puts what the last chunk did into a run, and returns it."""
@@ -224,3 +204,8 @@ class HostMachine:
                 assert learner.observe is not None
                 state = learner.observe(state, *own)
         raise AssertionError("the chunk was not finite, and its updates are")
+
+
+def stacked(trees: Sequence[Any]) -> Any:
+    """Returns trees of equal structure as one, whose leaves have a leading axis, on the host."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -82,11 +83,11 @@ def together(
         active: see :func:`rejeu.loops.device.driver.train`.
         variants: what makes the algorithm, if hyperparameters differ.
         hyper: those that differ, by run.
-        devices: of which each computes some of the runs; none for JAX's default device.
+        devices: of which each computes some of the runs in JAX environments; none for JAX's default device.
     """
     if runs[0].env.backend != "jax":
         assert isinstance(config, OffPolicyConfig)
-        host = HostMachine(learner, config, active, devices)
+        host = HostMachine(learner, config, active)
         yield from train(host, runs, learner, n_steps, progress, stops, begin_episodes, active)
         return
     size = group_size(len(runs), devices)
@@ -95,5 +96,5 @@ def together(
     groups = [runs[i : i + size] for i in range(0, len(runs), size)]
     machines = [kind(group, learner, config, stops, variants, by_run, size, devices) for group in groups]
     machine = machines[0] if len(machines) == 1 else Groups(machines, size, active)
-    begin = (lambda run: begin_rollouts(run, config)) if kind is OnPolicyMachine else begin_episodes
+    begin: Any = partial(begin_rollouts, config=config) if isinstance(config, OnPolicyConfig) else begin_episodes
     yield from train(machine, runs, learner, n_steps, progress, stops, begin, active)

@@ -138,7 +138,7 @@ class Machine(ABC):
         run.monitor.n_skipped += int(report.n_bad)
         if report.n_updates:
             values = [*report.metrics.values(), report.n_bad]
-            run.metrics = Readings(tuple(report.metrics), np.array(values, np.float32))
+            run.metrics = Readings(tuple(report.metrics), np.array(values, np.float32))  # type: ignore[arg-type]
         self.put(run, carry, self.experience[which])
         episodes = episodes_of(run, report.log, first_step, run.step)
         return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))
