@@ -193,6 +193,7 @@ def check_shape(shape: PolicyConfig) -> None:
     """Raises ``ValueError`` for network shapes other than plain layers: CrossQ puts its normalization between them."""
     given = {
         "layer_norm": shape.layer_norm,
+        "cnn_layer_norm": shape.cnn_layer_norm,
         "encoder": shape.encoder is not None,
         "head": shape.head is not None,
         "architecture": shape.architecture != "mlp",

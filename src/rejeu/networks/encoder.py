@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.core import PyTree
-from rejeu.networks.layers import Linear
+from rejeu.networks.layers import LayerNorm, Linear
 from rejeu.networks.own import own_module
 from rejeu.networks.shape import PolicyConfig
 from rejeu.spaces import Leaf
@@ -76,12 +76,14 @@ class Convolution(eqx.Module):
 
 
 class CNN(eqx.Module):
-    """Pixels to features: convolutions and one linear layer, each followed by a relu."""
+    """Pixels to features: convolutions and one linear layer, each followed by an optional layer norm and a relu."""
 
     layers: tuple[Convolution, ...]
     linear: Linear
+    norms: tuple[LayerNorm, ...]
+    """Over the channels of each layer; empty without layer norm."""
 
-    def __init__(self, key: Array, shape: tuple[int, ...], kind: Convolutions) -> None:
+    def __init__(self, key: Array, shape: tuple[int, ...], kind: Convolutions, layer_norm: bool = False) -> None:
         *layer_keys, linear_key = jax.random.split(key, len(kind.layers) + 1)
         height, width, channels = image_shape(shape)
         layers = []
@@ -90,6 +92,8 @@ class CNN(eqx.Module):
             height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, n_filters
         self.layers = tuple(layers)
         self.linear = Linear(linear_key, height * width * channels, kind.n_outputs)
+        widths = (*(n_filters for n_filters, _, _ in kind.layers), kind.n_outputs)
+        self.norms = tuple(map(LayerNorm, widths)) if layer_norm else ()
 
     def __call__(self, x: Array) -> Array:
         """Maps images ``(batch, ...)`` of 0 to 255 to features ``(batch, n_outputs)``, ``CHUNK`` images at a time."""
@@ -98,9 +102,13 @@ class CNN(eqx.Module):
     def features(self, x: Array) -> Array:
         """Returns the features of all images at once."""
         x = channels_last(x).astype(jnp.float32) / 255.0
-        for layer in self.layers:
-            x = jax.nn.relu(layer(x))
-        return jax.nn.relu(self.linear(x.reshape(x.shape[0], -1)))
+        for i, layer in enumerate(self.layers):
+            x = jax.nn.relu(self.normalized(i, layer(x)))
+        return jax.nn.relu(self.normalized(-1, self.linear(x.reshape(x.shape[0], -1))))
+
+    def normalized(self, i: int, x: Array) -> Array:
+        """Returns the outputs of a layer after its layer norm, if there is one."""
+        return self.norms[i](x) if self.norms else x
 
 
 def in_chunks(function: Callable[[Array], Array], x: Array, size: int) -> Array:
@@ -125,8 +133,8 @@ class Encoder(eqx.Module):
     images: tuple[CNN, ...]
     """In the order of the leaves that are images."""
 
-    def __init__(self, leaves: tuple[Leaf, ...], key: Array | None = None) -> None:
-        """Builds an encoder of these leaves; the key is needed only for images.
+    def __init__(self, leaves: tuple[Leaf, ...], key: Array | None = None, layer_norm: bool = False) -> None:
+        """Builds an encoder of these leaves; the key is needed only for images, which ``layer_norm`` is for too.
 
         Raises:
             TypeError: if there are images and no key.
@@ -137,7 +145,7 @@ class Encoder(eqx.Module):
             if (kind := convolutions(leaf)) is not None:
                 if key is None:
                     raise TypeError("Encoder(leaves, key): the encoder of an image has weights and needs a key")
-                images.append(CNN(jax.random.fold_in(key, len(images)), leaf.shape, kind))
+                images.append(CNN(jax.random.fold_in(key, len(images)), leaf.shape, kind, layer_norm))
         self.images = tuple(images)
 
     @property
@@ -185,7 +193,9 @@ class OwnEncoder(eqx.Module):
 
 def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:
     """Returns the encoder of these leaves: rejeu's own, or the module of the user's."""
-    return Encoder(leaves, key) if shape.encoder is None else OwnEncoder(key, leaves, shape.encoder)
+    if shape.encoder is not None:
+        return OwnEncoder(key, leaves, shape.encoder)
+    return Encoder(leaves, key, shape.cnn_layer_norm)
 
 
 def reads_image(leaves: tuple[Leaf, ...]) -> bool:

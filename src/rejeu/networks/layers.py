@@ -89,11 +89,13 @@ class LayerNorm(eqx.Module):
         self.offset = jnp.zeros((width,), jnp.float32)
 
     def __call__(self, x: Array) -> Array:
-        """Returns ``x`` with mean 0 and variance 1 along its last axis, scaled and shifted."""
+        """Returns ``x``, ``(..., width)``, with mean 0 and variance 1 along its last axis, scaled and shifted."""
         mean = jnp.mean(x, axis=-1, keepdims=True)
         centered = x - mean
         variance = jnp.mean(jnp.square(centered), axis=-1, keepdims=True)
-        return centered * jax.lax.rsqrt(variance + 1e-5) * self.scale[None] + self.offset[None]
+        shape = (1,) * (x.ndim - 1) + (-1,)
+        scale, offset = self.scale.reshape(shape), self.offset.reshape(shape)
+        return centered * jax.lax.rsqrt(variance + 1e-5) * scale + offset
 
 
 class MLP(eqx.Module):

@@ -40,6 +40,8 @@ class PolicyConfig:
     of that name (``jax.nn.relu``, ``torch.nn.ReLU``) is accepted too."""
     layer_norm: bool = False
     """Normalize each hidden layer before its nonlinearity: steadier critics, above all at high learning rates."""
+    cnn_layer_norm: bool = False
+    """Normalize the layers of the CNN of an image likewise, each pixel over its channels."""
     architecture: Literal["mlp", "simba"] = "mlp"
     """``simba``: residual blocks with layer norm (arXiv 2410.09754) in place of plain layers; ``net_arch`` then holds
     one number a block, all equal, and is made from ``n_blocks`` and ``width`` where it is None."""
@@ -76,7 +78,7 @@ class PolicyConfig:
         coerce(self, BRANCHES, layer_widths)
         coerce(self, ("n_blocks", "width"), whole, least=1)
         coerce(self, "activation_fn", activation_name)
-        coerce(self, "layer_norm", flag)
+        coerce(self, ("layer_norm", "cnn_layer_norm"), flag)
         coerce(self, "architecture", choice, among=("mlp", "simba"))
         self._check_shape()
 
