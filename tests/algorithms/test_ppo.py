@@ -23,6 +23,7 @@ from rejeu.algorithms.actor_critic import (
     is_value,
     standardized,
 )
+from rejeu.algorithms.minibatches import shuffled
 from rejeu.core import Clock, Rollout, clip
 from rejeu.distributions import Bernoulli, Categorical, Normal
 from rejeu.prng import nth
@@ -329,7 +330,7 @@ def begin(algorithm, seed=0):
 def orders_of(state, rollout, config):
     valid = rollout.valid.ravel()
     size = min(config.batch_size, valid.size)
-    orders = ppo.shuffled(nth(state.key, state.n_rollouts), valid, config.n_epochs, -valid.size % size)
+    orders = shuffled(nth(state.key, state.n_rollouts), valid, config.n_epochs, -valid.size % size)
     return np.asarray(orders)[:, : valid.sum()]
 
 
@@ -402,7 +403,7 @@ def test_each_rollout_is_shuffled_anew():
 @pytest.mark.parametrize("n_valid", [1, 7, 12])
 def test_an_order_holds_every_step_once_the_valid_ones_first(n_valid):
     valid = np.random.default_rng(0).permutation(np.arange(12) < n_valid)
-    orders = np.asarray(ppo.shuffled(nth(jax.random.PRNGKey(0), 3), jnp.array(valid), 5, 4))
+    orders = np.asarray(shuffled(nth(jax.random.PRNGKey(0), 3), jnp.array(valid), 5, 4))
     assert (orders.shape, orders.dtype) == ((5, 16), np.int32)
     for order in orders:
         assert sorted(order[:12]) == list(range(12))
@@ -413,7 +414,7 @@ def test_an_order_holds_every_step_once_the_valid_ones_first(n_valid):
 
 def test_every_step_comes_first_equally_often():
     """1200 orders of 6 steps: each is expected first 200 times, with a deviation of 13."""
-    orders = np.asarray(ppo.shuffled(nth(jax.random.PRNGKey(1), 0), jnp.ones(6, bool), 1200, 0))
+    orders = np.asarray(shuffled(nth(jax.random.PRNGKey(1), 0), jnp.ones(6, bool), 1200, 0))
     assert np.abs(np.bincount(orders[:, 0], minlength=6) - 200).max() < 5 * 13
 
 

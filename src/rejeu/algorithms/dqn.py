@@ -98,20 +98,12 @@ class QLearningConfig(OffPolicyConfig):
             )
         coerce(self, "target_update_interval", whole, least=1)
         coerce(self, "max_grad_norm", number, above=0, optional=True)
-        coerce(self, "exploration_fraction", number, above=0, most=1)
-        coerce(self, "exploration_schedule", choice, among=("linear", "exponential"))
-        for key in ("exploration_initial_eps", "exploration_final_eps"):
-            coerce(self, key, number, least=0, most=1)
-            if getattr(self, key) == 0 and self.exploration_schedule == "exponential":
-                raise ValueError(
-                    f"{key}=0 is not possible with an exponential schedule; try 0.01, or the linear schedule"
-                )
+        check_epsilon(self)
 
     @property
     def epsilon(self) -> Schedule:
         """The probability of a random action as a function of the progress."""
-        kind = {"linear": Linear, "exponential": Exponential}[self.exploration_schedule]
-        return kind(self.exploration_initial_eps, self.exploration_final_eps, self.exploration_fraction)
+        return epsilon_schedule(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,6 +274,26 @@ def epsilon_greedy(values: Array, epsilon: Any, key: Array) -> Array:
     batch, n_actions = values.shape
     random = jax.random.randint(which_key, (batch,), 0, n_actions, jnp.int32)
     return jnp.where(jax.random.uniform(whether_key, (batch,)) < epsilon, random, greedy(values))
+
+
+def check_epsilon(config: Any) -> None:
+    """Checks and converts the four settings of a configuration that begin with ``exploration_``.
+
+    Raises:
+        ValueError: for one that is not possible.
+    """
+    coerce(config, "exploration_fraction", number, above=0, most=1)
+    coerce(config, "exploration_schedule", choice, among=("linear", "exponential"))
+    for key in ("exploration_initial_eps", "exploration_final_eps"):
+        coerce(config, key, number, least=0, most=1)
+        if getattr(config, key) == 0 and config.exploration_schedule == "exponential":
+            raise ValueError(f"{key}=0 is not possible with an exponential schedule; try 0.01, or the linear schedule")
+
+
+def epsilon_schedule(config: Any) -> Schedule:
+    """Returns the probability of a random action that these settings describe, as a function of the progress."""
+    kind = {"linear": Linear, "exponential": Exponential}[config.exploration_schedule]
+    return kind(config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction)
 
 
 def moves_due(last_step: Array, step: Any, interval: int) -> Array:

@@ -47,6 +47,7 @@ from rejeu.algorithms.actor_critic import (
     samples,
     standardized,
 )
+from rejeu.algorithms.minibatches import minibatches
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
@@ -148,20 +149,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
-        n = data.valid.shape[0]
-        size = min(config.batch_size, n)
-        n_valid = jnp.sum(data.valid)
-        n_batches = (n_valid + size - 1) // size
-        orders = shuffled(nth(state.key, state.n_rollouts), data.valid, config.n_epochs, -n % size)
-
-        def minibatch(i: Array) -> Samples:
-            first = (i % n_batches) * size
-            index = jax.lax.dynamic_slice(orders, (i // n_batches, first), (1, size))[0]
-            chosen = jax.tree.map(lambda x: x[index], data)
-            return chosen._replace(valid=first + jnp.arange(size) < n_valid)
-
+        order_key = nth(state.key, state.n_rollouts)
+        minibatch, n_minibatches = minibatches(data, order_key, config.n_epochs, config.batch_size)
         network, optimizer_state, n_steps, losses = epochs(
-            loss, state.network, state.optimizer, minibatch, config.n_epochs * n_batches, optimizer, config, clock
+            loss, state.network, state.optimizer, minibatch, n_minibatches, optimizer, config, clock
         )
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
@@ -200,12 +191,6 @@ def metrics_of(
     if network.log_std is not None:
         metrics["std"] = jnp.mean(jnp.exp(network.log_std))
     return metrics
-
-
-def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
-    """Returns a random order of all steps for every epoch, the valid ones first, ``int32 (n_epochs, n + padding)``."""
-    drawn = jax.random.uniform(key, (n_epochs, valid.shape[0])) + jnp.where(valid, 0.0, 2.0)[None]
-    return jnp.pad(jnp.argsort(drawn, axis=1).astype(jnp.int32), ((0, 0), (0, n_padding)))
 
 
 def epochs(

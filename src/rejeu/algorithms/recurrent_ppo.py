@@ -37,7 +37,8 @@ from rejeu.algorithms.actor_critic import (
     unmasked,
     with_advantages,
 )
-from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of, shuffled
+from rejeu.algorithms.minibatches import shuffled
+from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
 from rejeu.exploration.explorer import renew

@@ -148,20 +148,34 @@ Q_LEARNING: SearchSpace = {
     "policy_kwargs.net_arch": Choice(([64], [64, 64], [256, 256])),
 }
 """Of DQN and QR-DQN."""
-ON_POLICY: SearchSpace = {
+ROLLOUT: SearchSpace = {
     "learning_rate": LogUniform(1e-5, 2e-3),
     "n_steps": Choice((32, 64, 128, 256, 512, 1024, 2048)),
     "gamma": NearOne(0.97, 0.9999),
+    "policy_kwargs.net_arch": Choice(([64], [64, 64], [256, 256])),
+}
+"""Of every algorithm that learns from rollouts."""
+ON_POLICY: SearchSpace = {
+    **ROLLOUT,
     "gae_lambda": NearOne(0.9, 0.9999),
     "ent_coef": LogUniform(1e-8, 0.1),
     "max_grad_norm": Uniform(0.3, 2.0),
-    "policy_kwargs.net_arch": Choice(([64], [64, 64], [256, 256])),
     "policy_kwargs.activation_fn": Choice(("tanh", "relu")),
 }
-"""Of every on-policy algorithm."""
+"""Of every algorithm with a policy and a value that learns from rollouts."""
 PPO: SearchSpace = {
     **ON_POLICY,
     "batch_size": Choice((32, 64, 128, 256, 512)),
     "n_epochs": Choice((1, 5, 10, 20)),
     "clip_range": Choice((0.1, 0.2, 0.3, 0.4)),
+}
+PQN: SearchSpace = {
+    **ROLLOUT,
+    "n_steps": Choice((8, 16, 32, 64, 128)),
+    "batch_size": Choice((64, 128, 256, 512)),
+    "n_epochs": Choice((1, 2, 4)),
+    "q_lambda": Uniform(0.3, 0.99),
+    "exploration_fraction": Uniform(0.02, 0.5),
+    "exploration_final_eps": Uniform(0.0, 0.2),
+    "policy_kwargs.net_arch": Choice(([64, 64], [128, 128], [256, 256])),
 }

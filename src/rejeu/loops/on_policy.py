@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 import jax
 import numpy as np
 
-from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core import PyTree
 from rejeu.envs.base import Step
 from rejeu.loops.checks import check_obs, check_state, check_step, checked_reset
@@ -27,7 +27,7 @@ from rejeu.spaces import action_scaler
 
 
 def on_policy(
-    run: Run, learner: Learner, config: OnPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
+    run: Run, learner: Learner, config: RolloutConfig, n_steps: int | None, progress: Callable[[int], float]
 ) -> Iterator[Progress]:
     """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
 
@@ -92,7 +92,7 @@ def on_policy(
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
 
 
-def begin_episodes(run: Run, config: OnPolicyConfig) -> None:
+def begin_episodes(run: Run, config: RolloutConfig) -> None:
     """Starts an episode in every environment, which ends the running ones.
 
     The current rollout keeps its steps, unless rollouts hold whole episodes: then it starts again too.
@@ -104,7 +104,7 @@ def begin_episodes(run: Run, config: OnPolicyConfig) -> None:
         begin(run, config)
 
 
-def begin(run: Run, config: OnPolicyConfig) -> None:
+def begin(run: Run, config: RolloutConfig) -> None:
     """Starts a rollout at the current observations."""
     run.replay.begin(run.carry, run.ended)
     run.playing = np.full(run.env.n_envs, config.n_episodes or 0)
@@ -122,7 +122,7 @@ def which_count(run: Run, stepped: np.ndarray | None, last: int | None) -> np.nd
     return among & (np.cumsum(among) <= last - run.step)
 
 
-def next_obs(run: Run, step: Step, config: OnPolicyConfig, is_done: bool) -> PyTree:
+def next_obs(run: Run, step: Step, config: RolloutConfig, is_done: bool) -> PyTree:
     """Returns the observations to act on next, and starts new episodes where some ended.
 
     If rollouts hold whole episodes, an environment that has played its share waits, and all start again together.

@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
-from rejeu import normalization, schedules
-from rejeu.algorithms import optimizers, search
+from rejeu import schedules
+from rejeu.algorithms import search
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
 from rejeu.networks import PolicyConfig, Widths, convolutions, split_net_arch
-from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
-from rejeu.validation import assign, choice, coerce, flag, nested, number, whole
+from rejeu.validation import assign, coerce, flag, number, whole
 
 HIDDEN_LAYERS = (64, 64)
 """Default widths of policy and value."""
@@ -75,20 +75,9 @@ class ActorCriticConfig(PolicyConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnPolicyConfig:
-    """The hyper-parameters of every on-policy algorithm."""
+class OnPolicyConfig(RolloutConfig):
+    """The hyper-parameters of every on-policy algorithm with a policy and a value."""
 
-    learning_rate: float | Schedule = 3e-4
-    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_3e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
-    n_steps: int = 2048
-    """Steps of each environment between two updates. A larger number estimates the gradient better and updates less
-    often."""
-    n_episodes: int | None = None
-    """Complete episodes of each environment between two updates, instead of ``n_steps``; environments that are done wait
-    for the others. Without a time limit an episode counts at most ``n_steps`` steps. None uses ``n_steps``."""
-    gamma: float = 0.99
-    """Discount factor, in [0, 1]."""
     gae_lambda: float = 0.95
     """Lambda of generalized advantage estimation, in [0, 1]: 0 bootstraps after one step, 1 sums all rewards to the end
     of the episode and subtracts the value. A larger value has less bias and more variance."""
@@ -96,8 +85,6 @@ class OnPolicyConfig:
     """Weight of the entropy bonus. A larger value keeps the policy random for longer."""
     vf_coef: float = 0.5
     """Weight of the value loss. Without shared layers it affects only the clipping of the gradient."""
-    max_grad_norm: float | None = 0.5
-    """Maximum norm of the gradient; larger gradients are scaled down. None: no limit."""
     critic_learning_rate: float | Schedule | None = None
     """Learning rate of the value alone, whose gradient is then clipped separately. None uses ``learning_rate`` for
     both. Needs ``share_layers=False``, and of images ``share_features_extractor=False``."""
@@ -107,44 +94,26 @@ class OnPolicyConfig:
     """Steps after which that noise is resampled; -1: in every episode."""
     normalize_advantage: bool = True
     """Normalize the advantages of every batch to mean 0 and standard deviation 1."""
-    normalize: NormalizationConfig | None = None
-    """Normalize observations and rewards by running statistics: True, or a dict with ``norm_obs``, ``norm_reward``,
-    ``clip_obs``, ``clip_reward``. The statistics are saved with the agent, which takes raw observations."""
-    nonfinite: Literal["stop", "skip"] = "stop"
-    """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
-    it and saves the rollout, or ``"skip"`` that update and count it."""
-    optimizer: Any = "adam"
-    """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, an Optax
-    optimizer such as ``optax.lamb``, or one that was created with the learning rate 1, which is then ``learning_rate``."""
     policy_kwargs: ActorCriticConfig = dataclasses.field(default_factory=ActorCriticConfig)
     """Shape of the networks: ``net_arch`` (also ``dict(pi=[...], vf=[...])``), ``activation_fn``, ``ortho_init``,
     ``log_std_init``, ``share_layers``, ``squash_output``, ``state_dependent_std``, ``layer_norm``, ``architecture``, or
     modules of your own as ``encoder``, ``torso`` and ``head``."""
 
-    name: ClassVar[str] = ""
+    policy_kwargs_class: ClassVar[type[PolicyConfig]] = ActorCriticConfig
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     """Default widths of policy and value."""
-    hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
-    """The same where the observation is an image."""
     search_space: ClassVar[SearchSpace] = search.ON_POLICY
-    """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
 
     def __post_init__(self) -> None:
-        coerce(self, ("learning_rate", "ent_coef"), schedules.parse, least=0)
+        RolloutConfig.__post_init__(self)
+        coerce(self, "ent_coef", schedules.parse, least=0)
         coerce(self, "critic_learning_rate", schedules.parse, least=0, optional=True)
-        coerce(self, "optimizer", optimizers.parse, optional=True)
-        coerce(self, "n_steps", whole, least=1)
-        coerce(self, "n_episodes", whole, least=1, optional=True)
-        coerce(self, ("gamma", "gae_lambda"), number, least=0, most=1)
+        coerce(self, "gae_lambda", number, least=0, most=1)
         coerce(self, "vf_coef", number, least=0)
-        coerce(self, "max_grad_norm", number, above=0, optional=True)
         coerce(self, ("normalize_advantage", "use_sde"), flag)
         coerce(self, "sde_sample_freq", whole, least=-1)
         if self.sde_sample_freq == 0:
             raise ValueError("sde_sample_freq=0 would sample no noise; use 1 or more, or -1 for once per episode")
-        assign(self, normalize=normalization.parse(self.normalize))
-        coerce(self, "nonfinite", choice, among=("stop", "skip"))
-        coerce(self, "policy_kwargs", nested, kind=ActorCriticConfig)
         if self.critic_learning_rate is not None and self.policy_kwargs.share_layers:
             raise ValueError(
                 "critic_learning_rate is a learning rate of its own for the value, which share_layers=True forbids; leave "
@@ -154,26 +123,6 @@ class OnPolicyConfig:
             raise ValueError(
                 "use_sde=True has a standard deviation of its own; leave state_dependent_std and learn_std out"
             )
-
-    def steps_per_gradient(self, n_envs: int) -> int:
-        """Returns the number of steps of ``n_envs`` environments per gradient step."""
-        return self.n_steps * n_envs
-
-    def gradient_steps(self, n: int) -> int:
-        """Returns the number of gradient steps on a rollout of ``n`` steps, if nothing stops them early."""
-        return 1
-
-    def learns_from_part(self, n: int, n_envs: int) -> bool:
-        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends.
-
-        It must hold a minibatch at least. Where a whole rollout is one minibatch it is never learned from.
-        """
-        return False
-
-    @property
-    def stops_early(self) -> bool:
-        """Whether the gradient steps may stop early; the metric ``gradient_steps`` is then their number."""
-        return False
 
 
 def check_value_rate(config: OnPolicyConfig, obs_leaves: tuple[Leaf, ...]) -> None:

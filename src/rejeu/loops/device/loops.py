@@ -8,8 +8,8 @@ from typing import Any
 
 import jax
 
-from rejeu.algorithms.actor_critic import OnPolicyConfig
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.loops.device.driver import Stops, train
 from rejeu.loops.device.groups import Groups
 from rejeu.loops.device.host_machine import HostMachine
@@ -44,7 +44,7 @@ def off_policy(
 def on_policy(
     run: Run,
     learner: Learner,
-    config: OnPolicyConfig,
+    config: RolloutConfig,
     n_steps: int | None,
     progress: Callable[[int], float],
     stops: Stops,
@@ -62,7 +62,7 @@ def on_policy(
 def together(
     runs: Sequence[Run],
     learner: Learner,
-    config: OffPolicyConfig | OnPolicyConfig,
+    config: OffPolicyConfig | RolloutConfig,
     n_steps: int | None,
     progress: Callable[[int], float],
     stops: Stops,
@@ -92,9 +92,9 @@ def together(
         return
     size = group_size(len(runs), devices)
     by_run = {id(run): one for run, one in zip(runs, hyper or [{}] * len(runs), strict=True)}
-    kind: Any = OnPolicyMachine if isinstance(config, OnPolicyConfig) else OffPolicyMachine
+    kind: Any = OnPolicyMachine if isinstance(config, RolloutConfig) else OffPolicyMachine
     groups = [runs[i : i + size] for i in range(0, len(runs), size)]
     machines = [kind(group, learner, config, stops, variants, by_run, size, devices) for group in groups]
     machine = machines[0] if len(machines) == 1 else Groups(machines, size, active)
-    begin: Any = partial(begin_rollouts, config=config) if isinstance(config, OnPolicyConfig) else begin_episodes
+    begin: Any = partial(begin_rollouts, config=config) if isinstance(config, RolloutConfig) else begin_episodes
     yield from train(machine, runs, learner, n_steps, progress, stops, begin, active)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.loops.device.turns import (
@@ -92,7 +92,7 @@ class OnPolicyProgram:
 
     algorithm: Algorithm
     explorer: Explorer
-    config: OnPolicyConfig
+    config: RolloutConfig
     n_envs: int
     packing: Packing
     """Of the algorithm's state."""

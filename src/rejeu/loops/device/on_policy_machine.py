@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core import Clock, Rollout
 from rejeu.loops.device.driver import Stops, capacity_of
 from rejeu.loops.device.machine import Machine
@@ -30,7 +30,7 @@ class OnPolicyMachine(Machine):
         self,
         runs: Sequence[Run],
         learner: Learner,
-        config: OnPolicyConfig,
+        config: RolloutConfig,
         stops: Stops,
         variants: Variants | None = None,
         hyper: Mapping[int, dict[str, float]] | None = None,
