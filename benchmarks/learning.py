@@ -98,7 +98,10 @@ def main() -> None:
     result = {
         "command": shlex.join(["python", "benchmarks/learning.py", *sys.argv[1:]]),
         "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
-        "versions": {name: importlib.metadata.version(name) for name in ("rejeu", "jax", "gymnasium", "envpool")},
+        "versions": {
+            "rejeu": rejeu.__version__,
+            **{name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool")},
+        },
         "hyperparameters": configs.to_json(
             validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, preset.hyperparameters)
         ),

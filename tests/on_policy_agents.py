@@ -1,4 +1,4 @@
-"""Small on-policy agents with every kind of action space that they support. They share compiled functions."""
+"""Small agents that learn from rollouts, with every kind of action space that they support; they share compiled functions."""
 
 from __future__ import annotations
 
@@ -53,6 +53,13 @@ LEARNING = {"learning_rate": rejeu.Linear(2e-2, 1e-3), "gamma": 0.5, "policy_kwa
 ALGORITHMS = {
     "PPO": {"n_steps": 16, "batch_size": 16, "n_epochs": 4},
     "A2C": {"n_steps": 4, "learning_rate": rejeu.Linear(5e-2, 1e-2)},
+    "PQN": {
+        "n_steps": 16,
+        "batch_size": 16,
+        "n_epochs": 4,
+        "exploration_initial_eps": 0.5,
+        "exploration_final_eps": 0.5,
+    },
 }
 ACTIONS = {"Box": None, "Discrete": Discretely, "MultiDiscrete": Doubly, "MultiBinary": Bitwise}
 NARROW = {"policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}}
@@ -62,4 +69,5 @@ KINDS = {
     f"{name}, {actions}": Kind(name, wrapper, settings | (NARROW if wrapper is None else {}))
     for name, settings in ALGORITHMS.items()
     for actions, wrapper in ACTIONS.items()
+    if name != "PQN" or actions == "Discrete"
 }

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from rejeu import core
-from rejeu.algorithms import a2c, crossq, ddpg, dqn, ppo, qrdqn, sac, td3, tqc
+from rejeu.algorithms import a2c, crossq, ddpg, dqn, ppo, pqn, qrdqn, sac, td3, tqc
 from rejeu.io.checkpoint import names
 
 BOX, DISCRETE = spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(3)
@@ -16,7 +16,7 @@ BOX, DISCRETE = spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(3)
 
 @pytest.mark.parametrize(
     ("module", "action_space"),
-    [(m, BOX) for m in (a2c, crossq, ddpg, ppo, sac, td3, tqc)] + [(m, DISCRETE) for m in (ddpg, dqn, qrdqn, sac)],
+    [(m, BOX) for m in (a2c, crossq, ddpg, ppo, sac, td3, tqc)] + [(m, DISCRETE) for m in (ddpg, dqn, pqn, qrdqn, sac)],
 )
 def test_averaged_leaves_are_targets_and_first_moments(module, action_space):
     algorithm = module.make(module.Config(), spaces.Box(-1, 1, (3,), np.float32), action_space)

@@ -406,8 +406,8 @@ def discrete_probe():
     return Allowing(Later())
 
 
-SETTINGS = {name: ON if name in ("PPO", "A2C", "RecurrentPPO", "MaskablePPO") else OFF for name in rejeu.AGENTS}
-ENVIRONMENT = {"DQN": discrete_probe, "QRDQN": discrete_probe, "MaskablePPO": discrete_probe}
+SETTINGS = {name: ON if name in ("PPO", "A2C", "PQN", "RecurrentPPO", "MaskablePPO") else OFF for name in rejeu.AGENTS}
+ENVIRONMENT = dict.fromkeys(("DQN", "QRDQN", "PQN", "MaskablePPO"), discrete_probe)
 
 
 def normalising(name, **settings):
@@ -424,7 +424,7 @@ def finite(agent):
     return all(np.isfinite(array).all() for array in agent.get_parameters().values())
 
 
-@pytest.mark.parametrize("name", only(["SAC", "CrossQ", "DQN", "PPO", "RecurrentPPO"], rejeu.AGENTS))
+@pytest.mark.parametrize("name", only(["SAC", "CrossQ", "DQN", "PPO", "PQN", "RecurrentPPO"], rejeu.AGENTS))
 def test_every_algorithm_learns_on_scaled_numbers_and_keeps_them_in_its_file(name, tmp_path):
     agent = normalising(name)
     assert finite(agent)

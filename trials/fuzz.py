@@ -96,7 +96,7 @@ VALUES += (
     "float64",
     "HerReplayBuffer",
 )
-VALUES += ("SAC", "DDPG", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO", "A2C", "RecurrentPPO", "MaskablePPO")
+VALUES += ("SAC", "DDPG", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO", "A2C", "PQN", "RecurrentPPO", "MaskablePPO")
 """Replacements for values of a header, in addition to each other."""
 
 

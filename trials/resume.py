@@ -33,7 +33,7 @@ CONTINUOUS = ("Pendulum-v1", "MountainCarContinuous-v0", "rejeu/Ball-v0", "HalfC
 DISCRETE = ("CartPole-v1", "MountainCar-v0", "Acrobot-v1")
 ALGORITHMS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ"), CONTINUOUS),
-    **dict.fromkeys(("DQN", "QRDQN"), DISCRETE),
+    **dict.fromkeys(("DQN", "QRDQN", "PQN"), DISCRETE),
     **dict.fromkeys(("PPO", "A2C", "RecurrentPPO"), (*CONTINUOUS, *DISCRETE)),
 }
 NOT_CARRIED = {
@@ -77,7 +77,7 @@ def make(algorithm: str, env_id: str, n_envs: int, backend: str) -> Callable[[],
     import rejeu
 
     settings: dict[str, Any] = dict(SMALL)
-    if algorithm in ("PPO", "A2C", "RecurrentPPO"):
+    if algorithm in ("PPO", "A2C", "PQN", "RecurrentPPO"):
         settings |= ON_POLICY if algorithm == "A2C" else {**ON_POLICY, "batch_size": 64}
     else:
         settings |= OFF_POLICY

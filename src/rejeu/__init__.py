@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         DDPG,
         DQN,
         PPO,
+        PQN,
         QRDQN,
         SAC,
         TD3,
@@ -67,8 +68,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS DDPG DQN PPO QRDQN SAC TD3 TQC CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent RecurrentPPO "
-    "load register",
+    "rejeu.agents": "A2C AGENTS DDPG DQN PPO PQN QRDQN SAC TD3 TQC CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent "
+    "RecurrentPPO load register",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",
@@ -99,6 +100,7 @@ __all__ = [
     "DDPG",
     "DQN",
     "PPO",
+    "PQN",
     "QRDQN",
     "SAC",
     "TD3",

@@ -75,11 +75,12 @@ CASES = {
     "PPO, whole episodes": ("PPO", vector("rejeu/Ball-v0"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
     "PPO, gSDE": ("PPO", vector("Pendulum-v1"), {**SMALL, "n_steps": 16, "batch_size": 16, "use_sde": True}),
     "A2C": ("A2C", vector("MountainCar-v0"), {**SMALL, "n_steps": 5}),
+    "PQN": ("PQN", vector("CartPole-v1"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "RecurrentPPO": ("RecurrentPPO", vector("rejeu/CartPoleNoVelocity-v0"), {**SMALL, "n_steps": 16, "batch_size": 16}),
 }
 
 DEFAULT_CASES = {
-    *("SAC", "DDPG, Discrete", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO, normalised", "A2C", "RecurrentPPO"),
+    *("SAC", "DDPG, Discrete", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO, normalised", "A2C", "PQN", "RecurrentPPO"),
     *("priorities, n steps", "episodes", "normalised", "EnvPool", "worker processes", "EnvPool, whole episodes"),
     "first of n",
     next(case for case in CASES if case.endswith(" noise")),

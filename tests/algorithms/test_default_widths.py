@@ -22,13 +22,13 @@ STACK = gym.spaces.Box(0, 255, (2, 8, 8, 1), np.uint8)
 DICT = gym.spaces.Dict(image=IMAGE)
 TINY = gym.spaces.Box(0, 255, (4, 4, 1), np.uint8)
 BOX, DISCRETE = gym.spaces.Box(-1.0, 1.0, (1,), np.float32), gym.spaces.Discrete(2)
-DISCRETE_ONLY = ("DQN", "QRDQN", "MaskablePPO")
+DISCRETE_ONLY = ("DQN", "QRDQN", "PQN", "MaskablePPO")
 
 
 def networks_of(name, space, **settings):
     """Returns the networks that an algorithm builds for observations of a space, of shapes in place of arrays."""
     module = rejeu.AGENTS[name].algorithm
-    action_space = DISCRETE if name in ("DQN", "QRDQN", "MaskablePPO") else BOX
+    action_space = DISCRETE if name in DISCRETE_ONLY else BOX
     state = jax.eval_shape(module.make(module.Config(**settings), space, action_space).init, jax.random.PRNGKey(0))
     if name in ("SAC", "TQC", "TD3"):
         return [state.actor, state.critics]

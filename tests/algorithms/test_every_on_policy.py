@@ -1,4 +1,4 @@
-"""What holds for PPO and A2C on every kind of action: counting, repeating, learning in parts, saving, stopping, dtypes."""
+"""What holds for PPO, A2C and PQN on every kind of action: counting, repeating, learning in parts, saving, stopping."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from tests.helpers import assert_same_parameters, same_parameters
 from tests.on_policy_agents import KINDS
 
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
-both_algorithms = pytest.mark.parametrize("kind", [KINDS["PPO, Discrete"], KINDS["A2C, Box"]], ids=["PPO", "A2C"])
+every_algorithm = pytest.mark.parametrize(
+    "kind", [KINDS["PPO, Discrete"], KINDS["A2C, Box"], KINDS["PQN, Discrete"]], ids=["PPO", "A2C", "PQN"]
+)
 RATE = {"learning_rate": 1e-2}
 """Constant: how far a run in parts has come is told otherwise than that of a whole one."""
 
@@ -41,6 +43,14 @@ def moved(before, agent):
     return {name for name, array in before.items() if (array != after[name]).any()}
 
 
+CRITIC = {"value_loss", "entropy_loss", "explained_variance"}
+METRICS = {
+    "PPO": {"loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "clip_range"} | CRITIC,
+    "A2C": {"policy_loss"} | CRITIC,
+    "PQN": {"loss", "q_value"},
+}
+
+
 @every_kind
 def test_everything_moves_and_stays_finite(kind):
     """What a policy gradient of a narrow policy and a value's gradient reach, biases and standard deviation too."""
@@ -52,24 +62,21 @@ def test_everything_moves_and_stays_finite(kind):
     assert all(np.isfinite(array).all() for array in agent.get_parameters().values())
     row = agent.statistics()
     assert all(np.isfinite(value) for value in row.values()), row
-    keys = {"value_loss", "entropy_loss", "explained_variance", "n_updates", "learning_rate"}
-    ppo = {"loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "clip_range"}
-    keys |= ppo if "PPO" in kind.name else {"policy_loss"}
-    keys |= {"std"} if kind.wrapper is None else set()
+    keys = METRICS[kind.name] | {"n_updates", "learning_rate"} | ({"std"} if kind.wrapper is None else set())
     assert {f"train/{key}" for key in keys} <= set(row)
     assert row["rollout/ep_len_mean"] == 5.0
 
 
 @pytest.mark.parametrize(("n_envs", "total"), [(1, 45), (3, 50), (3, 67)])
-@both_algorithms
+@every_algorithm
 def test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe(kind, n_envs, total):
     """16 steps a gradient step, each learned from 4 times; a last rollout of fewer than 16, or of A2C's, has to wait."""
     agent = start(kind, n_envs).learn(total)
     assert agent.num_timesteps == total
     size = agent.config.n_steps * n_envs
     rest = total % size
-    sizes = [size] * (total // size) + [rest] * (kind.name == "PPO" and rest >= 16)
-    expected = sum(4 * -(-n // 16) for n in sizes) if kind.name == "PPO" else len(sizes)
+    sizes = [size] * (total // size) + [rest] * (kind.name != "A2C" and rest >= 16)
+    expected = len(sizes) if kind.name == "A2C" else sum(4 * -(-n // 16) for n in sizes)
     assert agent.n_updates == int(agent.state.n_updates) == expected
     assert sum(agent.history["length"]) <= total
     agent.learn(5)
@@ -88,7 +95,7 @@ def test_two_runs_with_one_seed_are_the_same_to_the_last_bit_and_another_seed_di
     assert (one.history["return"] != other.history["return"]).any()
 
 
-@both_algorithms
+@every_algorithm
 def test_functions_compiled_apart_give_the_same_bits(kind):
     """Agents of these tests share compiled functions; those of users do not."""
     shared = start(kind).learn(40)
@@ -100,7 +107,7 @@ PLAIN = {"policy_kwargs": {"net_arch": [16]}}
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-@both_algorithms
+@every_algorithm
 def test_learning_in_parts_of_whole_rollouts_is_learning_at_once(kind, n_envs):
     size = kind.settings["n_steps"] * n_envs
     whole, parts = start(kind, n_envs).learn(5 * size), start(kind, n_envs)
@@ -111,7 +118,7 @@ def test_learning_in_parts_of_whole_rollouts_is_learning_at_once(kind, n_envs):
     np.testing.assert_array_equal(whole.history["return"], parts.history["return"])
 
 
-@both_algorithms
+@every_algorithm
 def test_a_run_stopped_within_a_rollout_goes_on_with_it(kind):
     """A callback's False leaves what was collected for later, however much it is."""
     size = kind.settings["n_steps"]
@@ -122,7 +129,7 @@ def test_a_run_stopped_within_a_rollout_goes_on_with_it(kind):
     assert_same_parameters(whole, parts)
 
 
-@both_algorithms
+@every_algorithm
 def test_a_last_rollout_smaller_than_a_minibatch_waits_for_the_next_learn(kind):
     size = kind.settings["n_steps"]
     whole, parts = start(kind).learn(3 * size), start(kind)
@@ -137,7 +144,7 @@ def test_a_last_rollout_smaller_than_a_minibatch_waits_for_the_next_learn(kind):
     np.testing.assert_array_equal(whole.history["return"], parts.history["return"])
 
 
-@both_algorithms
+@every_algorithm
 @pytest.mark.parametrize("change", ["set_parameters", "restore_best", "set_env"])
 def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_from(kind, change):
     """The log-probabilities of its actions are computed later, by the policy that learns from it."""
@@ -159,7 +166,7 @@ def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_f
     assert agent.n_updates > n_updates
 
 
-@both_algorithms
+@every_algorithm
 def test_what_happens_beside_training_does_not_change_it(kind, tmp_path):
     def look(agent, progress):
         agent.save(tmp_path / "model")
@@ -190,14 +197,14 @@ def test_a_loaded_agent_predicts_the_same_bits_and_goes_on_learning_all_its_part
     assert moved(before, loaded) == set(before)
 
 
-@both_algorithms
+@every_algorithm
 def test_two_agents_of_one_file_go_on_alike(kind, tmp_path):
     path = start(kind).learn(32).save(tmp_path / "model")
     one, two = (kind.load(path, env=wanderers(kind)).learn(40) for _ in range(2))
     assert_same_parameters(one, two)
 
 
-@both_algorithms
+@every_algorithm
 def test_an_agent_without_environment_predicts_and_will_not_learn(kind, tmp_path):
     agent = start(kind).learn(16)
     loaded = kind.load(agent.save(tmp_path / "model"))
@@ -206,7 +213,7 @@ def test_an_agent_without_environment_predicts_and_will_not_learn(kind, tmp_path
         loaded.learn(8)
 
 
-@both_algorithms
+@every_algorithm
 def test_ctrl_c_ends_training_after_a_step_with_everything_consistent(kind):
     def press(agent, progress):
         if progress.step == 21:
@@ -220,7 +227,7 @@ def test_ctrl_c_ends_training_after_a_step_with_everything_consistent(kind):
     assert_same_parameters(agent, start(kind).learn(60))
 
 
-@both_algorithms
+@every_algorithm
 def test_another_number_of_environments_may_follow(kind):
     agent = start(kind).learn(21)
     agent.set_env(wanderers(kind, 3))
@@ -230,14 +237,14 @@ def test_another_number_of_environments_may_follow(kind):
     assert all(np.isfinite(array).all() for array in agent.get_parameters().values())
 
 
-@both_algorithms
+@every_algorithm
 def test_one_step_at_a_time_is_learnt_from(kind):
     """Stable-Baselines3 1.1.0 and 1.6.1 mended batches of one."""
-    settings = {"n_steps": 1, **({"batch_size": 1} if kind.name == "PPO" else {})}
+    settings = {"n_steps": 1, **({} if kind.name == "A2C" else {"batch_size": 1})}
     agent = start(kind, **settings)
     before = networks(agent)
     agent.learn(12)
-    assert agent.n_updates == int(agent.state.n_updates) == (48 if kind.name == "PPO" else 12)
+    assert agent.n_updates == int(agent.state.n_updates) == (12 if kind.name == "A2C" else 48)
     assert moved(before, agent) == set(before)
     assert all(np.isfinite(array).all() for array in agent.get_parameters().values())
 
@@ -258,7 +265,7 @@ NESTED = gym.spaces.Dict(
 )
 
 
-@pytest.mark.parametrize("agent", [rejeu.PPO, rejeu.A2C])
+@pytest.mark.parametrize("agent", [rejeu.PPO, rejeu.A2C, rejeu.PQN])
 def test_observations_of_any_structure_are_learnt_from_and_saved(agent, tmp_path):
     envs = InProcess([Sampled(NESTED, gym.spaces.Discrete(2)) for _ in range(2)], seed=0)
     one = agent("MultiInputPolicy", envs, n_steps=4, policy_kwargs={"net_arch": [4]}, seed=0)
@@ -279,7 +286,7 @@ class Broken(Probe):
         return float("nan") if self.time == 4 else 1.0
 
 
-@both_algorithms
+@every_algorithm
 def test_a_reward_that_is_no_number_ends_training_before_anything_is_learnt_from_it(kind):
     agent = kind.small(kind.envs(Broken), n_steps=50)
     before = networks(agent)

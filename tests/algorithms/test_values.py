@@ -84,6 +84,17 @@ def test_observations_may_be_dicts():
     np.testing.assert_allclose(single, batch[1], rtol=1e-5)
 
 
+def test_pqn_rates_all_actions_and_the_value_is_that_of_the_best():
+    kind = ON_POLICY["PQN, Discrete"]
+    agent = kind.small(kind.envs(Probe))
+    rated, start = agent.q_values(OBS), agent.action_space.start
+    assert rated.shape == (N, agent.action_space.n)
+    np.testing.assert_array_equal(agent.q_values(OBS, start + rated.argmax(axis=1)), rated.max(axis=1))
+    np.testing.assert_array_equal(agent.predict(OBS, deterministic=True)[0], start + rated.argmax(axis=1))
+    np.testing.assert_allclose(agent.value(OBS), rated.max(axis=1), rtol=1e-6)
+    assert agent.q_values(OBS[0], critics="all").shape == (1, agent.action_space.n)
+
+
 @pytest.mark.parametrize("kind", [ON_POLICY["PPO, Box"], ON_POLICY["A2C, Discrete"]], ids=["PPO", "A2C"])
 def test_the_value_of_an_observation_is_that_of_the_critic(kind):
     agent = kind.small(kind.envs(Probe))

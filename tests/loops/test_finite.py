@@ -70,6 +70,7 @@ MAKE = {
     "PPO": lambda **s: rejeu.PPO("MlpPolicy", box(2), batch_size=8, n_epochs=2, **ON, **s),
     "PPO, normalised": lambda **s: rejeu.PPO("MlpPolicy", box(), batch_size=8, normalize=True, **ON, **s),
     "A2C": lambda **s: rejeu.A2C("MlpPolicy", choice(), **ON, **s),
+    "PQN": lambda **s: rejeu.PQN("MlpPolicy", choice(), batch_size=8, **ON, **s),
     "MaskablePPO": lambda **s: rejeu.MaskablePPO("MlpPolicy", InProcess([Rules()], seed=0), batch_size=8, **ON, **s),
     "RecurrentPPO": lambda **s: rejeu.RecurrentPPO(
         "MlpPolicy",
@@ -82,7 +83,7 @@ MAKE = {
     ),
 }
 SCANS = ("SAC, four steps in a scan", "SAC, three environments")
-ON_POLICY = ("PPO", "PPO, normalised", "A2C", "MaskablePPO", "RecurrentPPO")
+ON_POLICY = ("PPO", "PPO, normalised", "A2C", "PQN", "MaskablePPO", "RecurrentPPO")
 
 
 def replace_update(agent, which, instead):

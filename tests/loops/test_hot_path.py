@@ -58,6 +58,7 @@ CASES = {
     "PPO": Case(lambda: rejeu.PPO("MlpPolicy", sampled(), batch_size=4, n_epochs=2, **ON), 3),
     "PPO, 3 environments": Case(lambda: rejeu.PPO("MlpPolicy", sampled(3), batch_size=4, n_epochs=2, **ON), 3, 3),
     "A2C, 3 environments": Case(lambda: rejeu.A2C("MlpPolicy", sampled(3, 3), **ON), 3, 3),
+    "PQN, 3 environments": Case(lambda: rejeu.PQN("MlpPolicy", sampled(3, 3), batch_size=4, **ON), 3, 3),
 }
 
 

@@ -6,7 +6,7 @@ import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.tuning import population as populations, space as spaces
 
-ENVIRONMENTS = dict.fromkeys(("DQN", "QRDQN", "PPO", "A2C", "RecurrentPPO"), "CartPole-v1")
+ENVIRONMENTS = dict.fromkeys(("DQN", "QRDQN", "PPO", "A2C", "PQN", "RecurrentPPO"), "CartPole-v1")
 SMALL = {"policy_kwargs": {"net_arch": [8]}}
 OFF_POLICY = {"learning_starts": 32, "buffer_size": 1000, **SMALL}
 ON_POLICY = {"n_steps": 16, **SMALL}

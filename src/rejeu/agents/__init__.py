@@ -3,7 +3,7 @@
 from rejeu.agents.agent import Agent
 from rejeu.agents.base import whole_seed
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
-from rejeu.agents.on_policy import A2C, PPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
+from rejeu.agents.on_policy import A2C, PPO, PQN, MaskablePPO, OnPolicyAgent, RecurrentPPO
 from rejeu.agents.registry import AGENTS, agent_of_file, find_agent, load, register
 from rejeu.callbacks.base import Callback
 
@@ -13,6 +13,7 @@ __all__ = [
     "DDPG",
     "DQN",
     "PPO",
+    "PQN",
     "QRDQN",
     "SAC",
     "TD3",

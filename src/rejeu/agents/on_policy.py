@@ -1,10 +1,10 @@
-"""Agents that learn from rollouts of their current policy: PPO, RecurrentPPO, MaskablePPO and A2C."""
+"""Agents that learn from rollouts of their current policy: PPO, RecurrentPPO, MaskablePPO, A2C and PQN."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -13,8 +13,8 @@ from rejeu import devices, spaces
 from rejeu.agents import policy
 from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
-from rejeu.algorithms import a2c, maskable_ppo, ppo, recurrent_ppo
-from rejeu.algorithms.actor_critic import OnPolicyConfig
+from rejeu.algorithms import a2c, maskable_ppo, ppo, pqn, recurrent_ppo
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import Masked
 from rejeu.envs.make import Backend, VectorEnv, make_vector
@@ -31,7 +31,7 @@ class OnPolicyAgent(Agent):
     They may override :meth:`make_buffer`, :meth:`make_envs` and :meth:`loop`.
     """
 
-    config: OnPolicyConfig
+    config: RolloutConfig
 
     def value(self, observation: Any, state: Any = None, episode_start: Any = None) -> np.ndarray:
         """Returns the critic's values of observations, that is, the expected discounted return, as ``float32``.
@@ -143,3 +143,34 @@ class MaskablePPO(OnPolicyAgent):
 
     algorithm: ClassVar[ModuleType] = maskable_ppo
     takes_masks: ClassVar[bool] = True
+
+
+class PQN(OnPolicyAgent):
+    """Parallelized Q-network (Gallici et al. 2024), Q-learning from rollouts for Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = pqn
+
+    def q_values(
+        self, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
+    ) -> np.ndarray:
+        """Returns the values of actions, that is, the expected discounted return, as ``float32``.
+
+        :meth:`value` returns the highest of each observation.
+
+        Args:
+            observation: one of the environment's space, or a batch of them with a leading axis.
+            action: one for each observation. None: all actions.
+            critics: accepted as for other agents; there is one network. ``"all"`` adds a leading axis of length 1.
+
+        Returns:
+            ``(batch,)``, or ``(batch, n_actions)`` without ``action``. There is no batch axis if the observation has none.
+
+        Raises:
+            ValueError: if observations or actions are not in their spaces.
+
+        >>> import gymnasium as gym, rejeu
+        >>> agent = rejeu.PQN("MlpPolicy", gym.make("CartPole-v1"), seed=0)
+        >>> agent.q_values(np.zeros((50, 4), np.float32)).shape
+        (50, 2)
+        """
+        return policy.q_values(self, observation, action, critics)

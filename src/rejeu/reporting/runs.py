@@ -390,9 +390,23 @@ def is_file(path: Path) -> bool:
 
 def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Returns ``given`` and the defaults of one of rejeu's algorithms as JSON values; empty for another."""
-    from rejeu.algorithms import a2c, config, crossq, ddpg, dqn, maskable_ppo, ppo, qrdqn, recurrent_ppo, sac, td3, tqc
+    from rejeu.algorithms import (
+        a2c,
+        config,
+        crossq,
+        ddpg,
+        dqn,
+        maskable_ppo,
+        ppo,
+        pqn,
+        qrdqn,
+        recurrent_ppo,
+        sac,
+        td3,
+        tqc,
+    )
 
-    modules: tuple[Any, ...] = (a2c, crossq, ddpg, dqn, maskable_ppo, ppo, qrdqn, recurrent_ppo, sac, td3, tqc)
+    modules: tuple[Any, ...] = (a2c, crossq, ddpg, dqn, maskable_ppo, ppo, pqn, qrdqn, recurrent_ppo, sac, td3, tqc)
     kinds = {module.Config.name: module.Config for module in modules}
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
 

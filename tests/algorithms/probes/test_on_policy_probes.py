@@ -1,4 +1,4 @@
-"""PPO and A2C solve the probe environments on each kind of action that they take."""
+"""PPO, A2C and PQN solve the probe environments on each kind of action that they take."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from tests.tiers import crossed, only
 GAMMA = 0.5
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 some_kinds = pytest.mark.parametrize(
-    "kind", only([KINDS["PPO, Box"], KINDS["A2C, Discrete"]], KINDS.values()), ids=KINDS
+    "kind", only([KINDS["PPO, Box"], KINDS["A2C, Discrete"], KINDS["PQN, Discrete"]], KINDS.values()), ids=KINDS
 )
-both_algorithms = pytest.mark.parametrize("kind", [KINDS["PPO, Discrete"], KINDS["A2C, Box"]], ids=["PPO", "A2C"])
+every_algorithm = pytest.mark.parametrize(
+    "kind", [KINDS["PPO, Discrete"], KINDS["A2C, Box"], KINDS["PQN, Discrete"]], ids=["PPO", "A2C", "PQN"]
+)
 
-algorithms_and_numbers = pytest.mark.parametrize(("name", "n_envs"), crossed(["PPO, Discrete", "A2C, Box"], [1, 3, 8]))
+algorithms_and_numbers = pytest.mark.parametrize(
+    ("name", "n_envs"), crossed(["PPO, Discrete", "A2C, Box", "PQN, Discrete"], [1, 3, 8])
+)
 
 
 def solve(kind, probe, steps=800, n_envs=1):
@@ -24,10 +28,10 @@ def solve(kind, probe, steps=800, n_envs=1):
 
 
 def values(agent, sights):
-    return np.asarray(agent.state.network.value(np.float32(sights)[:, None]))
+    return agent.value(np.float32(sights)[:, None])
 
 
-@both_algorithms
+@every_algorithm
 def test_the_value_is_a_constant(kind):
     assert values(solve(kind, Constant), [0.0]) == pytest.approx([1.0], abs=0.05)
 
@@ -54,7 +58,7 @@ def test_a_terminal_state_is_worth_nothing(name, n_envs):
     assert values(solve(KINDS[name], Cut, 800 * n_envs, n_envs), [-1.0, 1.0]) == pytest.approx([0.0, 1.0], abs=0.05)
 
 
-@both_algorithms
+@every_algorithm
 def test_what_time_limits_cut_is_worth_as_much_as_if_it_went_on(kind):
     assert values(solve(kind, Endless), [0.0]) == pytest.approx([1.0 / (1.0 - GAMMA)], abs=0.05)
 

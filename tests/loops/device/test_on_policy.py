@@ -41,6 +41,7 @@ def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
     [
         (rejeu.PPO, "jax/CartPole-v1", {**PPO, "learning_rate": "lin_1e-3", "normalize": True}),
         (rejeu.A2C, "jax/CartPole-v1", {"n_steps": 5}),
+        (rejeu.PQN, "jax/CartPole-v1", {**PPO, "exploration_fraction": 0.5}),
         pytest.param(rejeu.PPO, "jax/Pendulum-v1", {**PPO, "target_kl": 1e-4}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.PPO, "jax/Pendulum-v1", {**PPO, "use_sde": True}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.RecurrentPPO, "jax/CartPole-v1", PPO, marks=pytest.mark.exhaustive),

@@ -1,0 +1,260 @@
+"""Parallelized Q-network: Q-learning from rollouts, without replay buffer and without target network.
+
+Source: Gallici et al. 2024, "Simplifying Deep Temporal Difference Learning" (arXiv 2407.04811, algorithm 1). Layer norm in
+the network ``Q`` keeps the values from diverging, and many environments take the place of the replay buffer. With the
+reward ``r_t``, the true successor ``s'_t``, the discount ``d_t`` (0 where the MDP terminated) and ``lambda``, computed
+backwards over the rollout with the network that collected it::
+
+    V'_t = max_a Q(s'_t, a)
+    R_t  = r_t + d_t [(1 - lambda) V'_t + lambda R_{t+1}],      lambda is 0 where an episode or the rollout ends
+    J    = mean (Q(s, a) - R)^2 / 2                             over minibatches, for several epochs
+    a    = argmax_a Q(s, a), or any with probability epsilon
+
+So a time limit bootstraps from the state in which it was reached, where the authors' code treats it as a terminal state. The
+returns are not cut at random actions: Q(lambda) of Peng and Williams 1994, "Incremental Multi-Step Q-Learning". Unlike
+there, epsilon changes with every step rather than with every rollout, and a last, smaller minibatch is padded and the
+padding is not counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms import optimizers, search
+from rejeu.algorithms.actor_critic import flat, masked_mean
+from rejeu.algorithms.config import with_widths
+from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy, epsilon_schedule, greedy, taken
+from rejeu.algorithms.minibatches import minibatches
+from rejeu.algorithms.rollout_config import RolloutConfig
+from rejeu.algorithms.search import SearchSpace
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout, clip, descend, value_and_grad
+from rejeu.networks import Network, PolicyConfig, Widths
+from rejeu.prng import nth
+from rejeu.schedules import Schedule, at
+from rejeu.spaces import check_discrete_action, leaves
+from rejeu.validation import assign, coerce, number, whole
+
+HIDDEN_LAYERS = (128, 128)
+"""Default widths of the network but on images, those of the authors' code."""
+
+
+@dataclass(frozen=True)
+class NormalizedConfig(PolicyConfig):
+    """The shape of the network, whose layers are normalized unless otherwise asked for."""
+
+    layer_norm: bool | None = None  # type: ignore[assignment]
+    """Normalize each hidden layer before its nonlinearity. None does so wherever it can be chosen: SimBa and a torso of
+    your own have a normalization of their own or none."""
+    cnn_layer_norm: bool = True
+    """Normalize the layers of the CNN of an image likewise, each pixel over its channels."""
+
+    def __post_init__(self) -> None:
+        if self.layer_norm is None:
+            assign(self, layer_norm=self.torso is None and self.architecture == "mlp")
+        PolicyConfig.__post_init__(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RolloutConfig):
+    """Hyper-parameters of PQN; the defaults are those of the authors for Atari, with 128 environments."""
+
+    learning_rate: float | Schedule = 2.5e-4
+    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    ``"lin_2.5e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
+    n_steps: int = 32
+    """Steps of each environment between two updates. A larger number bootstraps later and updates less often."""
+    batch_size: int = 128
+    """Steps per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
+    n_epochs: int = 2
+    """Passes over every rollout. More learn more from it, with targets that are further behind."""
+    q_lambda: float = 0.65
+    """Lambda of Q(lambda), in [0, 1]: 0 bootstraps after one step, 1 sums all rewards to the end of the episode or the
+    rollout. A larger value has less bias and more variance, and follows random actions for longer."""
+    exploration_fraction: float = 0.1
+    """Fraction of the run over which epsilon decreases, in (0, 1]."""
+    exploration_initial_eps: float = 1.0
+    """Initial probability of a random action, in [0, 1]."""
+    exploration_final_eps: float = 0.001
+    """Probability of a random action from ``exploration_fraction`` of the run on, in [0, 1]."""
+    exploration_schedule: Literal["linear", "exponential"] = "linear"
+    """How epsilon decreases: linearly, or by the same factor for equal parts of the run. The run is measured in what
+    ``learn`` was given: steps, episodes or minutes."""
+    max_grad_norm: float | None = 10.0
+    """Maximum Euclidean norm of the gradient over all parameters; larger gradients are scaled down. None: no limit."""
+    optimizer: Any = "radam"
+    """As for the other algorithms, such as ``"adam"`` or ``optax.lamb``; the authors use rectified Adam."""
+    policy_kwargs: NormalizedConfig = dataclasses.field(default_factory=NormalizedConfig)
+    """Shape of the network: ``net_arch``, ``activation_fn``, ``layer_norm`` and ``cnn_layer_norm`` (both on),
+    ``architecture``, branches (``state_layers``, ``common_layers``, ``critic_layers``), or modules of your own as
+    ``encoder``, ``torso`` and ``head``."""
+
+    name: ClassVar[str] = "PQN"
+    policy_kwargs_class: ClassVar[type[PolicyConfig]] = NormalizedConfig
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    search_space: ClassVar[SearchSpace] = search.PQN
+
+    def __post_init__(self) -> None:
+        RolloutConfig.__post_init__(self)
+        coerce(self, ("batch_size", "n_epochs"), whole, least=1)
+        coerce(self, "q_lambda", number, least=0, most=1)
+        check_epsilon(self)
+
+    def steps_per_gradient(self, n_envs: int) -> int:
+        """Returns the number of steps of ``n_envs`` environments per gradient step."""
+        return min(self.batch_size, self.n_steps * n_envs)
+
+    def learns_from_part(self, n: int, n_envs: int) -> bool:
+        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends: from a minibatch on."""
+        return n >= self.batch_size
+
+    def gradient_steps(self, n: int) -> int:
+        """Returns the number of gradient steps on a rollout of ``n`` steps."""
+        return self.n_epochs * -(-n // self.batch_size)
+
+
+class State(eqx.Module):
+    """Everything that PQN learns; every leaf is an array."""
+
+    network: Network
+    optimizer: PyTree
+    key: Array
+    """Root of the orders of the minibatches, ``uint32[2]``; never changes."""
+    n_updates: Array
+    """Gradient steps so far, ``int32[]``."""
+    n_rollouts: Array
+    """Rollouts learned from, ``int32[]``."""
+
+
+class Samples(NamedTuple):
+    """The steps of a rollout as the loss takes them, leaves ``(batch, ...)``."""
+
+    obs: PyTree
+    action: Array
+    target: Array
+    """The lambda-return ``R``."""
+    valid: Array
+    """Whether the step exists, ``bool``."""
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns PQN for these spaces.
+
+    Raises:
+        ValueError: if the action space is not Discrete.
+        TypeError: if the observation space holds something that is not an array.
+    """
+    n_actions = check_discrete_action(action_space, "PQN")
+    obs_leaves = leaves(observation_space)
+    shape = with_widths(config, obs_leaves).policy_kwargs
+    optimizer, epsilon = optimizers.make(config.optimizer), epsilon_schedule(config)
+
+    def init(key: Array) -> State:
+        network_key, update_key = jax.random.split(key)
+        network = Network(network_key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
+        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+
+    def explore(network: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
+        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key)
+
+    def exploit(network: Network, obs: PyTree) -> Array:
+        return greedy(network(obs))
+
+    def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
+        data = samples(state.network, rollout, config.q_lambda)
+        order_key = nth(state.key, state.n_rollouts)
+        minibatch, n_steps = minibatches(data, order_key, config.n_epochs, config.batch_size)
+        rate = at(config.learning_rate, clock.progress)
+
+        def step(i: Array, learned: tuple[Network, PyTree, Array]) -> tuple[Network, PyTree, Array]:
+            network, optimizer_state, sums = learned
+            network, optimizer_state, found = gradient_step(
+                network, optimizer_state, minibatch(i), optimizer, rate, config.max_grad_norm
+            )
+            return network, optimizer_state, sums + found
+
+        begin = (state.network, state.optimizer, jnp.zeros(2, jnp.float32))
+        network, optimizer_state, sums = jax.lax.fori_loop(0, n_steps, step, begin)
+        loss, q_value = sums / jnp.maximum(n_steps, 1).astype(jnp.float32)
+        metrics = {
+            "loss": loss,
+            "q_value": q_value,
+            "exploration_rate": jnp.asarray(at(epsilon, clock.progress), jnp.float32),
+            "gradient_steps": n_steps.astype(jnp.float32),
+            "learning_rate": jnp.asarray(rate, jnp.float32),
+        }
+        n_updates = state.n_updates + n_steps
+        return State(network, optimizer_state, state.key, n_updates, state.n_rollouts + 1), metrics
+
+    def value(carry: PyTree, network: Network, obs: PyTree, ended: Array) -> Array:
+        return jnp.max(network(obs), axis=-1)
+
+    values = lambda state, obs, action: state.network(obs)[None]  # noqa: E731
+    return Algorithm(
+        init, lambda state: state.network, explore, exploit, update, action_values=values, state_value=value
+    )
+
+
+def samples(network: Network, rollout: Rollout, q_lambda: float) -> Samples:
+    """Returns the steps of a rollout along one axis, with their targets by the network that collected it."""
+    next_value = jnp.max(network(flat(rollout.next_obs)), axis=-1).reshape(rollout.reward.shape)
+    last = jnp.concatenate([~rollout.valid[1:], jnp.ones_like(rollout.valid[:1])])
+    target = lambda_returns(rollout.reward, next_value, rollout.discount, rollout.ended | last, q_lambda)
+    return flat(Samples(rollout.obs, rollout.action, target, rollout.valid))
+
+
+def lambda_returns(reward: Array, next_value: Array, discount: Array, ended: Array, q_lambda: float) -> Array:
+    """Returns the targets ``R``, ``(steps, n_envs)``.
+
+    Args:
+        reward: ``(steps, n_envs)``, like all other arrays.
+        next_value: highest value in the true successor, also where an episode ended.
+        discount: gamma, and 0 where the MDP terminated.
+        ended: where an episode or the rollout ended.
+        q_lambda: in [0, 1]. With 1 the return is the discounted sum of rewards to that end, plus the value there unless the
+            MDP terminated; with 0 it is the TD target of one step.
+
+    >>> steps = lambda *values: jnp.array(values)[:, None]
+    >>> ended = steps(False, False, True)
+    >>> lambda_returns(steps(1.0, 2.0, 4.0), steps(0.0, 0.0, 8.0), steps(0.5, 0.5, 0.5), ended, 1.0)[:, 0]
+    Array([4., 6., 8.], dtype=float32)
+    """
+    mixing = jnp.where(ended, 0.0, q_lambda)
+    bootstrapped = reward + discount * (1.0 - mixing) * next_value
+    factor = discount * mixing
+
+    def back(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        bootstrapped, factor = step
+        result = bootstrapped + factor * following
+        return result, result
+
+    _, result = jax.lax.scan(back, jnp.zeros_like(reward[0]), (bootstrapped, factor), reverse=True)
+    return result
+
+
+def gradient_step(
+    network: Network,
+    optimizer_state: PyTree,
+    batch: Samples,
+    optimizer: optax.GradientTransformation,
+    rate: Any,
+    max_grad_norm: float | None,
+) -> tuple[Network, PyTree, Array]:
+    """Returns network and optimizer state after a step on a minibatch, and its loss and mean value, ``float32[2]``."""
+    (loss, q_value), gradients = value_and_grad(td_loss, has_aux=True)(network, batch)
+    network, optimizer_state = descend(network, clip(gradients, None, max_grad_norm), optimizer_state, optimizer, rate)
+    return network, optimizer_state, jnp.stack([loss, q_value])
+
+
+def td_loss(network: Network, batch: Samples) -> tuple[Array, Array]:
+    """Returns half the mean square of the TD errors ``Q(s, a) - R``, and the mean of ``Q(s, a)``."""
+    value = taken(network(batch.obs), batch.action)
+    return masked_mean(0.5 * jnp.square(value - batch.target), batch.valid), masked_mean(value, batch.valid)

@@ -1,0 +1,459 @@
+"""PQN's targets, losses and whole updates against float64 NumPy, its exploration, its network and what it refuses."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings as hypothesis_settings, strategies as st
+
+import rejeu
+from rejeu.algorithms import config as configs, pqn
+from rejeu.core import Clock
+from rejeu.envs.make import InProcess
+from rejeu.networks import Convolution, LayerNorm
+from rejeu.prng import nth
+from rejeu.spaces import leaves
+from tests.algorithms.test_gae import random_steps
+from tests.algorithms.test_ppo import LAST_STEP_MISSING, OBS_SPACE, random_rollout
+from tests.environments import Sampled
+from tests.sharing import shared_learners
+from tests.tiers import exhaustive
+
+ACTIONS = gym.spaces.Discrete(3)
+CLOCK = Clock(np.uint32(1), np.uint32(0), np.float32(0.25))
+IMAGE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
+RATE = 3e-2
+
+
+def make(**settings):
+    config = pqn.Config(**{"policy_kwargs": {"net_arch": [5, 4]}, "learning_rate": RATE, **settings})
+    algorithm = pqn.make(config, OBS_SPACE, ACTIONS)
+    return config, algorithm, algorithm.init(jax.random.PRNGKey(1))
+
+
+# An independent network in float64: its parameters by name, and how they are applied.
+
+
+def parameters(network):
+    """Returns copies of weight, bias, scale and offset of each layer in the order of use; the head has the first two."""
+    hidden = zip(network.torso.layers, network.torso.norms, strict=True)
+    parts = [[layer.weight, layer.bias, norm.scale, norm.offset] for layer, norm in hidden]
+    return [[np.array(x, np.float64) for x in part] for part in [*parts, [network.head.weight, network.head.bias]]]
+
+
+def forward(layers, x):
+    x = np.float64(x)
+    for weight, bias, scale, offset in layers[:-1]:
+        x = x @ weight + bias
+        x = (x - x.mean(axis=1, keepdims=True)) / np.sqrt(x.var(axis=1, keepdims=True) + 1e-5) * scale + offset
+        x = np.maximum(x, 0.0)
+    return x @ layers[-1][0] + layers[-1][1]
+
+
+def slopes_of(layers, loss, width=1e-6):
+    """Returns the gradient of ``loss()``, a function of ``layers``, by central differences."""
+    slopes = [[np.zeros_like(array) for array in layer] for layer in layers]
+    for layer, slope in zip(layers, slopes, strict=True):
+        for array, along in zip(layer, slope, strict=True):
+            for i in np.ndindex(array.shape):
+                kept = array[i]
+                array[i] = kept + width
+                above = loss()
+                array[i] = kept - width
+                along[i] = (above - loss()) / (2.0 * width)
+                array[i] = kept
+    return slopes
+
+
+def assert_equal(one, two, atol, rtol=0.0):
+    for a, b in zip(one, two, strict=True):
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_allclose(x, y, atol=atol, rtol=rtol)
+
+
+class Descent:
+    """Plain gradient descent."""
+
+    def __init__(self, layers):
+        self.layers = layers
+
+    def step(self, slopes, rate):
+        for layer, slope in zip(self.layers, slopes, strict=True):
+            for i, g in enumerate(slope):
+                layer[i][...] = layer[i] - rate * g
+
+
+class RAdam:
+    """Rectified Adam (Liu et al. 2020, arXiv 1908.03265, algorithm 2; rectified where rho is 5 or more, as in PyTorch)."""
+
+    def __init__(self, layers, b1=0.9, b2=0.999, eps=1e-8):
+        self.layers, self.b1, self.b2, self.eps, self.t = layers, b1, b2, eps, 0
+        self.m, self.v = ([[np.zeros_like(x) for x in layer] for layer in layers] for _ in range(2))
+
+    def step(self, slopes, rate):
+        self.t += 1
+        most = 2.0 / (1.0 - self.b2) - 1.0
+        rho = most - 2.0 * self.t * self.b2**self.t / (1.0 - self.b2**self.t)
+        for layer, slope, m, v in zip(self.layers, slopes, self.m, self.v, strict=True):
+            for i, g in enumerate(slope):
+                m[i] = self.b1 * m[i] + (1.0 - self.b1) * g
+                v[i] = self.b2 * v[i] + (1.0 - self.b2) * g**2
+                change = m[i] / (1.0 - self.b1**self.t)
+                if rho >= 5.0:
+                    r = np.sqrt((rho - 4) * (rho - 2) * most / ((most - 4) * (most - 2) * rho))
+                    change = r * change / (np.sqrt(v[i] / (1.0 - self.b2**self.t)) + self.eps)
+                layer[i][...] = layer[i] - rate * change
+
+
+# Targets.
+
+
+def by_definition(reward, next_value, discount, ended, q_lambda):
+    """The sum over n of (1 - lambda) lambda^(n-1) times the n-step return, the last of which has the remaining weight.
+
+    The n-step return sums n rewards and bootstraps from the highest value in the state that follows them. The last one ends
+    with the episode or the rollout.
+    """
+    reward, next_value, discount = map(np.float64, (reward, next_value, discount))
+    result = np.zeros_like(reward)
+    for t, env in np.ndindex(result.shape):
+        rewards, weight = 0.0, 1.0
+        for n, k in enumerate(range(t, len(reward)), start=1):
+            rewards += weight * reward[k, env]
+            weight *= discount[k, env]
+            is_last = ended[k, env] or k == len(reward) - 1
+            share = q_lambda ** (n - 1) * (1.0 if is_last else 1.0 - q_lambda)
+            result[t, env] += share * (rewards + weight * next_value[k, env])
+            if is_last:
+                break
+    return result
+
+
+returns = jax.jit(pqn.lambda_returns)
+
+
+@hypothesis_settings(max_examples=60)
+@given(
+    shape=st.sampled_from([(1, 1), (7, 2), (20, 3)]),
+    seed=st.integers(0, 2**32 - 1),
+    gamma=st.floats(0.0, 1.0),
+    q_lambda=st.floats(0.0, 1.0),
+)
+def test_targets_equal_the_average_of_n_step_returns_that_defines_them(shape, seed, gamma, q_lambda):
+    """A third of the steps each are terminal states, time limits and neither."""
+    reward, _, next_value, discount, ended = random_steps(shape, seed, gamma)
+    given = returns(reward, next_value, discount, with_last(ended), np.float32(q_lambda))
+    expected = by_definition(reward, next_value, discount, ended, np.float32(q_lambda))
+    np.testing.assert_allclose(given, expected, rtol=1e-4, atol=1e-5)
+
+
+def with_last(ended):
+    """The last step of a rollout ends it."""
+    return np.concatenate([ended[:-1], np.ones_like(ended[:1])])
+
+
+@pytest.mark.usefixtures("strict_dtypes")
+def test_lambda_0_gives_the_td_target_of_one_step():
+    reward, _, next_value, discount, ended = map(jnp.array, random_steps((9, 2), 0))
+    given = pqn.lambda_returns(reward, next_value, discount, ended, 0.0)
+    np.testing.assert_allclose(given, reward + discount * next_value, atol=1e-6)
+
+
+def test_a_terminal_state_is_worth_nothing_and_a_time_limit_what_it_was_reached_in():
+    """Four steps with lambda 1 and gamma 1/2: a terminal state after the second, a time limit after the fourth."""
+    reward, next_value = np.float32([[1], [2], [3], [4]]), np.float32([[100], [100], [100], [8]])
+    discount, ended = np.float32([[0.5], [0], [0.5], [0.5]]), np.array([[False], [True], [False], [True]])
+    given = returns(reward, next_value, discount, ended, np.float32(1.0))
+    np.testing.assert_allclose(given[:, 0], [1 + 0.5 * 2, 2, 3 + 0.5 * (4 + 0.5 * 8), 4 + 0.5 * 8])
+
+
+def test_nothing_flows_over_the_end_of_an_episode_or_from_one_environment_to_another():
+    reward, _, next_value, discount, ended = random_steps((8, 3), 4)
+    ended[3] = True
+    before = np.asarray(returns(reward, next_value, discount, ended, np.float32(0.9)))
+    reward[4:, 1] += 100.0
+    after = np.asarray(returns(reward, next_value, discount, ended, np.float32(0.9)))
+    np.testing.assert_array_equal(before[:4], after[:4])
+    np.testing.assert_array_equal(before[:, [0, 2]], after[:, [0, 2]])
+    assert (before[4:, 1] != after[4:, 1]).all()
+
+
+@pytest.mark.usefixtures("strict_dtypes")
+def test_targets_bootstrap_from_the_highest_value_in_the_true_successor():
+    """Also where the rollout ends and where padding follows: there the step is the last that counts."""
+    _, _, state = make()
+    rollout = random_rollout(ACTIONS, valid=LAST_STEP_MISSING)
+    data = pqn.samples(state.network, jax.tree.map(jnp.array, rollout), 0.7)
+    next_value = forward(parameters(state.network), rollout.next_obs.reshape(-1, 3)).max(axis=1)
+    next_value = next_value.reshape(rollout.reward.shape)
+    follows_padding = np.concatenate([~rollout.valid[1:], np.ones_like(rollout.valid[:1])])
+    ended = rollout.ended | follows_padding
+    expected = by_definition(rollout.reward, next_value, rollout.discount, ended, 0.7).reshape(-1)
+    valid = rollout.valid.reshape(-1)
+    np.testing.assert_allclose(np.asarray(data.target)[valid], expected[valid], atol=1e-5)
+    np.testing.assert_array_equal(data.valid, valid)
+    np.testing.assert_array_equal(data.action, rollout.action.reshape(-1))
+
+
+# Losses and updates.
+
+
+def batch_of(n=12):
+    rng = np.random.default_rng(0)
+    obs, target = rng.normal(size=(n, 3)).astype(np.float32), rng.normal(size=n).astype(np.float32)
+    action = rng.integers(3, size=n).astype(np.int32)
+    return pqn.Samples(jnp.array(obs), jnp.array(action), jnp.array(target), jnp.arange(n) % 4 > 0)
+
+
+def test_the_gradient_of_the_loss_equals_finite_differences_in_float64():
+    _, _, state = make()
+    batch, layers = batch_of(), parameters(state.network)
+    (loss, q_value), given = jax.value_and_grad(pqn.td_loss, has_aux=True)(state.network, batch)
+    valid = np.asarray(batch.valid)
+
+    def taken():
+        return forward(layers, batch.obs)[np.arange(len(valid)), batch.action][valid]
+
+    def expected():
+        return 0.5 * np.mean((taken() - np.float64(batch.target)[valid]) ** 2)
+
+    assert float(loss) == pytest.approx(expected(), rel=1e-5)
+    assert float(q_value) == pytest.approx(taken().mean(), rel=1e-4, abs=1e-6)
+    assert_equal(parameters(given), slopes_of(layers, expected), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "tolerance"),
+    [
+        ({"optimizer": "sgd", "max_grad_norm": None}, 2e-5),
+        ({"optimizer": "sgd", "max_grad_norm": 0.05, "q_lambda": 0.9, "learning_rate": rejeu.Linear(0.04, 0.0)}, 2e-5),
+        ({}, 5e-4),  # RAdam subtracts two numbers of about 2,000, and float32 knows the difference to about 0.02
+    ],
+)
+def test_three_updates_equal_numpy(settings, tolerance):
+    """14 of 15 steps exist: the last of four minibatches has two. A quarter of the way from 0.04 to 0 the rate is 0.03."""
+    config, algorithm, state = make(batch_size=4, n_epochs=2, **settings)
+    layers = parameters(state.network)
+    optimizer = (RAdam if config.optimizer == "radam" else Descent)(layers)
+    update = jax.jit(algorithm.update)
+    for k in range(3):
+        rollout = random_rollout(ACTIONS, seed=k, valid=LAST_STEP_MISSING)
+        orders = orders_of(state, rollout.valid, config)
+        next_value = forward(layers, rollout.next_obs.reshape(-1, 3)).max(axis=1).reshape(rollout.reward.shape)
+        ended = rollout.ended | np.concatenate([~rollout.valid[1:], np.ones_like(rollout.valid[:1])])
+        target = by_definition(rollout.reward, next_value, rollout.discount, ended, config.q_lambda).reshape(-1)
+        data = rollout.obs.reshape(-1, 3), rollout.action.reshape(-1), target
+        found = []
+        for order in orders:
+            for first in range(0, 14, 4):
+                index = order[first : min(first + 4, 14)]
+                batch = [part[index] for part in data]
+                slopes = slopes_of(layers, lambda batch=batch: loss_of(layers, *batch)[0])
+                norm = np.sqrt(sum(np.sum(x**2) for layer in slopes for x in layer))
+                scale = min(1.0, (config.max_grad_norm or np.inf) / norm)
+                found.append(loss_of(layers, *batch))
+                optimizer.step([[scale * x for x in layer] for layer in slopes], RATE)
+        state, metrics = update(state, rollout, CLOCK)
+        assert_equal(parameters(state.network), layers, atol=tolerance)
+        for field, expected in zip(("loss", "q_value"), np.mean(found, axis=0), strict=True):
+            assert float(metrics[field]) == pytest.approx(expected, rel=tolerance, abs=tolerance), field
+        assert float(metrics["gradient_steps"]) == len(found) == 8
+        assert float(metrics["learning_rate"]) == pytest.approx(RATE)
+    assert (int(state.n_updates), int(state.n_rollouts)) == (24, 3)
+
+
+def loss_of(layers, obs, action, target):
+    """Returns the loss of a minibatch and the mean value of its actions."""
+    value = forward(layers, obs)[np.arange(len(action)), action]
+    return 0.5 * np.mean((value - target) ** 2), value.mean()
+
+
+def orders_of(state, valid, config):
+    """The random order of the valid steps in each epoch: that of uniform numbers, as documented."""
+    drawn = jax.random.uniform(nth(state.key, state.n_rollouts), (config.n_epochs, valid.size))
+    index = np.flatnonzero(valid.reshape(-1))
+    return [index[np.argsort(np.asarray(row)[index], kind="stable")] for row in drawn]
+
+
+def test_padding_leaks_into_no_update():
+    _, algorithm, state = make(batch_size=4)
+    update, rollout = jax.jit(algorithm.update), random_rollout(ACTIONS, valid=LAST_STEP_MISSING)
+    spoil = lambda a: np.where(rollout.valid.reshape(*rollout.valid.shape, *[1] * (a.ndim - 2)), a, 50)  # noqa: E731
+    names = ("obs", "reward", "next_obs")
+    spoilt = rollout._replace(**{name: spoil(getattr(rollout, name)).astype(np.float32) for name in names})
+    for one, two in zip(*(jax.tree.leaves(update(state, r, CLOCK)) for r in (rollout, spoilt)), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+# Exploration.
+
+
+@pytest.mark.parametrize(
+    ("settings", "progress", "expected"),
+    [
+        ({}, 0.0, 1.0),
+        ({}, 0.05, 0.5 * (1.0 + 0.001)),
+        ({}, 0.5, 0.001),
+        ({"exploration_initial_eps": 0.8, "exploration_final_eps": 0.2, "exploration_fraction": 0.5}, 0.125, 0.65),
+        (
+            {
+                "exploration_schedule": "exponential",
+                "exploration_initial_eps": 0.8,
+                "exploration_final_eps": 0.2,
+                "exploration_fraction": 1.0,
+            },
+            0.5,
+            0.4,
+        ),
+    ],
+)
+def test_epsilon_follows_the_progress_of_the_run(settings, progress, expected):
+    """Of the share epsilon of actions, two thirds are not the best of three."""
+    _, algorithm, state = make(**settings)
+    clock = CLOCK._replace(progress=np.float32(progress))
+    obs = np.random.default_rng(0).normal(size=(1, 3)).astype(np.float32).repeat(20_000, axis=0)
+    action = algorithm.explore(state.network, obs, jax.random.PRNGKey(3), clock)
+    best = forward(parameters(state.network), obs[:1]).argmax()
+    np.testing.assert_array_equal(algorithm.exploit(state.network, obs[:1]), [best])
+    assert np.mean(np.asarray(action) != best) == pytest.approx(expected * 2 / 3, abs=0.012)
+    _, metrics = jax.jit(algorithm.update)(state, random_rollout(ACTIONS), clock)
+    assert float(metrics["exploration_rate"]) == pytest.approx(expected, rel=1e-4)
+
+
+# The network.
+
+
+def norms(network):
+    parts = jax.tree.leaves(network, is_leaf=lambda node: isinstance(node, LayerNorm))
+    return sum(isinstance(part, LayerNorm) for part in parts)
+
+
+def network_of(space, **shape):
+    config = configs.with_widths(pqn.Config(policy_kwargs=shape), leaves(space))
+    return jax.eval_shape(pqn.make(config, space, ACTIONS).init, jax.random.PRNGKey(0)).network
+
+
+def test_every_layer_but_the_last_is_normalized_by_default():
+    assert norms(network_of(OBS_SPACE)) == 2
+    assert norms(network_of(IMAGE)) == 3  # two convolutions and a linear layer
+    assert norms(network_of(gym.spaces.Dict(a=IMAGE, b=OBS_SPACE))) == 5
+    assert norms(network_of(IMAGE, cnn_layer_norm=False)) == 0
+    assert norms(network_of(OBS_SPACE, layer_norm=False)) == 0
+    assert norms(network_of(OBS_SPACE, architecture="simba", n_blocks=1)) == 2  # SimBa's own
+    assert [layer.bias.shape for layer in network_of(OBS_SPACE).torso.layers] == [(128,), (128,)]
+
+
+def test_the_cnn_normalizes_each_pixel_over_its_channels():
+    """Against a loop over pixels in float64, with scales and offsets that are not 1 and 0."""
+    network = pqn.make(pqn.Config(), IMAGE, ACTIONS).init(jax.random.PRNGKey(0)).network
+    cnn = network.encoder.images[0]
+    shifted = [jax.tree.map(lambda x: x + 0.1 * jnp.arange(len(x)) / len(x), norm) for norm in cnn.norms]
+    obs = np.random.default_rng(0).integers(0, 256, (2, 8, 8, 1)).astype(np.uint8)
+    x = np.float64(obs) / 255.0
+    for layer, norm in zip(cnn.layers, shifted[:-1], strict=True):
+        x = np.maximum(normalized(convolved(layer, x), norm), 0.0)
+    x = normalized(x.reshape(2, -1) @ np.float64(cnn.linear.weight) + np.float64(cnn.linear.bias), shifted[-1])
+    given = eqx.tree_at(lambda c: c.norms, cnn, tuple(shifted))(obs)
+    np.testing.assert_allclose(given, np.maximum(x, 0.0), atol=1e-4)
+
+
+def convolved(layer: Convolution, x):
+    kernel, stride = layer.weight.shape[0], layer.stride
+    n = (x.shape[1] - kernel) // stride + 1
+    out = np.zeros((len(x), n, n, layer.weight.shape[-1]))
+    for i, j in np.ndindex(n, n):
+        patch = x[:, i * stride : i * stride + kernel, j * stride : j * stride + kernel]
+        out[:, i, j] = np.tensordot(patch, np.float64(layer.weight), 3) + np.float64(layer.bias)
+    return out
+
+
+def normalized(x, norm):
+    centered = x - x.mean(axis=-1, keepdims=True)
+    scaled = centered / np.sqrt((centered**2).mean(axis=-1, keepdims=True) + 1e-5)
+    return scaled * np.float64(norm.scale) + np.float64(norm.offset)
+
+
+@exhaustive
+@pytest.mark.parametrize(
+    ("policy", "space"), [("CnnPolicy", IMAGE), ("MultiInputPolicy", gym.spaces.Dict(a=IMAGE, b=OBS_SPACE))]
+)
+def test_images_are_learned_from_and_saved(policy, space, tmp_path):
+    env = lambda: InProcess([Sampled(space, ACTIONS) for _ in range(2)], seed=0)  # noqa: E731
+    agent = rejeu.PQN(policy, env(), n_steps=5, batch_size=5, policy_kwargs={"net_arch": [4]}, seed=0)
+    before = agent.get_parameters()
+    agent.learn(20)
+    after = agent.get_parameters()
+    moved = {name for name in before if (before[name] != after[name]).any()}
+    assert {name for name in before if name.startswith("network.") and "norms" in name} <= moved
+    loaded = rejeu.load(agent.save(tmp_path / "model"))
+    obs = space.sample()
+    np.testing.assert_array_equal(loaded.q_values(obs), agent.q_values(obs))
+
+
+# Settings.
+
+
+def test_the_defaults_are_those_of_the_authors():
+    """Config ``pqn_atari.yaml`` of the authors' code: 32 minibatches of 128 environments times 32 steps have 128 steps."""
+    theirs = {
+        "learning_rate": 2.5e-4,
+        "n_steps": 32,
+        "batch_size": 128 * 32 // 32,
+        "n_epochs": 2,
+        "gamma": 0.99,
+        "q_lambda": 0.65,
+        "exploration_fraction": 0.1,
+        "exploration_initial_eps": 1.0,
+        "exploration_final_eps": 0.001,
+        "max_grad_norm": 10.0,
+        "optimizer": "radam",
+    }
+    config = pqn.Config()
+    assert {key: getattr(config, key) for key in theirs} == theirs
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"q_lambda": 1.1}, "q_lambda=1.1 must be a finite number, at least 0 and at most 1"),
+        ({"n_epochs": 0}, "n_epochs=0 must be a whole number of at least 1"),
+        ({"batch_size": 2.5}, "batch_size=2.5 must be a whole number"),
+        ({"exploration_fraction": 0}, "exploration_fraction=0 must be a finite number, above 0"),
+        ({"exploration_final_eps": 0, "exploration_schedule": "exponential"}, "try 0.01, or the linear schedule"),
+        ({"policy_kwargs": {"architecture": "simba", "layer_norm": True}}, "conflicts with layer_norm"),
+    ],
+)
+def test_an_impossible_setting_is_refused_in_one_line(settings, message):
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
+        pqn.Config(**settings)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["gae_lambda", "ent_coef", "use_sde", "buffer_size", "tau"])
+def test_settings_of_a_policy_or_a_replay_buffer_are_unknown(name):
+    with pytest.raises(TypeError, match=f"PQN has no setting '{name}'"):
+        rejeu.PQN("MlpPolicy", "CartPole-v1", **{name: 0.5})
+
+
+def test_other_actions_are_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"PQN needs a Discrete action space, got Box.*; for this environment use SAC"):
+        pqn.make(pqn.Config(), OBS_SPACE, gym.spaces.Box(-1.0, 1.0, (1,)))
+
+
+# In one program.
+
+
+def test_seeds_in_one_program_are_the_runs_alone():
+    settings = {"n_steps": 8, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "exploration_fraction": 0.5}
+    agents = rejeu.train_seeds(rejeu.PQN, "MlpPolicy", "jax/CartPole-v1", 64, seeds=[3, 5], n_envs=2, **settings)
+    for agent in agents:
+        with shared_learners():
+            alone = rejeu.PQN("MlpPolicy", rejeu.make_vector("jax/CartPole-v1", 2), seed=agent.seed, **settings)
+        alone.learn(64)
+        for name, value in alone.get_parameters().items():
+            np.testing.assert_allclose(agent.get_parameters()[name], value, rtol=1e-3, atol=1e-4, err_msg=name)
+        assert agent.n_updates == alone.n_updates == 2 * 64 // 8
