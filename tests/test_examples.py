@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,29 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "examples"
 EXAMPLES = sorted(path for path in FOLDER.glob("*.py") if path.stem != "awac")
 """``awac.py`` registers an algorithm; ``test_own_algorithm`` tests it."""
+ARGUMENTS = {"many_agents": ["--agents", "3", "--steps", "2000"]}
+"""Arguments that shorten an example which does not call ``learn``."""
 
 
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
 def test_example_runs(script, short, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(script), *ARGUMENTS.get(script.stem, [])])
     if script.stem == "parking":
         pytest.importorskip("highway_env")
     runpy.run_path(str(script), run_name="__main__")
+
+
+def test_the_agents_of_the_example_differ_and_their_returns_are_counted(monkeypatch, capsys):
+    script = FOLDER / "many_agents.py"
+    monkeypatch.setattr(sys, "argv", [str(script), "--agents", "4", "--steps", "2000"])
+    names = runpy.run_path(str(script), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert "mean of 4 returns" in lines[0]
+    histogram = [int(line.split()[3]) for line in lines if " to " in line]
+    assert (len(histogram), sum(histogram)) == (10, 4)
+    one, two = (names["begin"](seed)[0].network.head.weight for seed in (0, 1))
+    assert (one != two).any()
 
 
 def test_examples_are_found():
