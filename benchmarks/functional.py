@@ -122,6 +122,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--only", nargs="*", default=[*CASES])
+    parser.add_argument("--out", type=Path, default=RESULT)
     given = parser.parse_args()
     rows = []
     for env_id in given.only:
@@ -134,9 +135,9 @@ def main() -> None:
         "cores": cores(),
         "load": os.getloadavg()[0],
     }
-    command = shlex.join(["python", *sys.argv])
+    command = shlex.join(["python", "benchmarks/functional.py", *sys.argv[1:]])
     data = {"command": command, "machine": machine, "versions": versions(), "results": rows}
-    RESULT.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    given.out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

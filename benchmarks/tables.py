@@ -132,7 +132,11 @@ def peers(data: dict[str, Any]) -> str:
         "rollouts of 128 steps and batches of 256; DQN and SAC have one environment, and a gradient step on 256 transitions "
         "for every step."
     )
-    shown = [text for case in ("all", "ppo", "dqn", "sac") for text in data["differences"][case]]
+    shown = [
+        text if case == "all" else f"{case.upper()}: {text}"
+        for case in ("all", *device_peers.CASES)
+        for text in data["differences"][case]
+    ]
     notes = "\n".join(
         textwrap.fill(text, WIDTH, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False)
         for text in shown
