@@ -67,8 +67,20 @@ class Reach(GoalEnv):
         return {"observation": state.position, "achieved_goal": state.position, "desired_goal": state.goal}
 
 
+class Undefined(Reach):
+    """A :class:`Reach` whose reward function returns NaN if a goal right of 1 is reached exactly, which ``step`` hides."""
+
+    def step(self, key: Array, state: Point, action: Array) -> tuple[Point, Any, Array, Array, Array]:
+        after, obs, reward, *flags = super().step(key, state, action)
+        return after, obs, jnp.nan_to_num(reward), *flags
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array:
+        is_bad = ((achieved_goal == desired_goal) & (achieved_goal > 1.0))[..., 0]
+        return jnp.where(is_bad, jnp.nan, super().compute_reward(achieved_goal, desired_goal))
+
+
 class Breaks(FunctionalEnv):
-    """Returns NaN in an observation or a reward in the step ``at`` of every episode."""
+    """Returns NaN in an observation or a reward in the step ``at`` of every episode, or from some resets."""
 
     at: int = eqx.field(static=True, default=25)
     what: str = eqx.field(static=True, default="reward")
@@ -83,10 +95,45 @@ class Breaks(FunctionalEnv):
         return spaces.Discrete(2)
 
     def reset(self, key: Array) -> tuple[Array, Array]:
-        return jnp.zeros((), jnp.int32), jnp.zeros(2)
+        bad = (self.what == "reset") & (jax.random.uniform(key) < 0.1)
+        return jnp.zeros((), jnp.int32), jnp.where(bad, jnp.nan, jnp.zeros(2))
 
     def step(self, key: Array, state: Array, action: Array) -> tuple[Array, Array, Array, Array, Array]:
         broken = jnp.where(state + 1 == self.at, jnp.nan, 0.0)
-        reward, obs = (broken, 0.0) if self.what == "reward" else (jnp.float32(0.0), broken)
+        reward = broken if self.what == "reward" else jnp.float32(0.0)
+        obs = broken if self.what == "observation" else jnp.float32(0.0)
         never = jnp.zeros((), bool)
-        return state + 1, jnp.full(2, obs), reward, never, never
+        return state + 1, jnp.full(2, obs), reward, never, (state % 5 == 4) if self.what == "reset" else never
+
+
+class Rules(NamedTuple):
+    """Which actions are allowed, and the number of steps of the episode."""
+
+    allowed: Array
+    time: Array
+
+
+class Forbidden(FunctionalEnv):
+    """All actions but one are allowed, which changes; the reward is -1 for the one that is not."""
+
+    max_episode_steps: int | None = eqx.field(static=True, default=10)
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        return spaces.Box(-1, 1, (2,), np.float32)
+
+    @property
+    def action_space(self) -> spaces.Discrete:
+        return spaces.Discrete(3)
+
+    def reset(self, key: Array) -> tuple[Rules, Array]:
+        return Rules(jnp.array([True, True, False]), jnp.zeros((), jnp.int32)), jnp.zeros(2)
+
+    def step(self, key: Array, state: Rules, action: Array) -> tuple[Rules, Array, Array, Array, Array]:
+        after = Rules(jnp.roll(state.allowed, 1), state.time + 1)
+        reward = jnp.where(state.allowed[action], 0.0, -1.0)
+        truncated = time_is_up(after.time, self.max_episode_steps)
+        return after, jnp.zeros(2), reward, jnp.zeros((), bool), truncated
+
+    def action_mask(self, state: Rules) -> Array:
+        return state.allowed

@@ -37,7 +37,7 @@ class NonFiniteError(RuntimeError):
         self.step = step
         """Environment steps at the start of the update."""
         self.n_updates = n_updates
-        """Total number of gradient steps."""
+        """Total number of gradient steps, with that of the error."""
         self.batch = batch
         """Path of the saved batch, None if there is none."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -97,6 +98,7 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: s
         ("CartPole-v1", {"train_freq": [1, "episode"]}, "updates depend on episodes"),
         ("jax/CartPole-v1", {"gamma": [0.9, 0.99]}, "gamma cannot differ"),
         ("jax/CartPole-v1", {"batch_size": [8, 16]}, "batch_size cannot differ"),
+        ("jax/CartPole-v1", {"train_freq": (1, "episode")}, "updates depend on episodes"),
         ("jax/CartPole-v1", {"priorities": {}}, "prioritized replay"),
     ],
 )
@@ -106,6 +108,27 @@ def test_what_cannot_be_one_program_is_refused(env: str, settings: dict[str, Any
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    ("env", "seeds", "message"),
+    [
+        (gym.make("CartPole-v1"), 2, "env is a TimeLimit.* every run needs environments of its own; give an id"),
+        (rejeu.make_vector("CartPole-v1", 2), 2, "env is a InProcess.* give an id, such as 'Pendulum-v1'"),
+        (rejeu.make_vector("jax/CartPole-v1"), 2, "env is a JaxVector.* or a FunctionalEnv"),
+        ("jax/CartPole-v1", 0, "seeds=0 must be a whole number of at least 1"),
+        ("jax/CartPole-v1", True, "seeds=True must be a whole number"),
+        ("jax/CartPole-v1", 2.5, "seeds=2.5 must be a whole number"),
+        ("jax/CartPole-v1", "2", "seeds='2' must be a whole number"),
+        ("jax/CartPole-v1", [], r"seeds=\[\] must be a number of at least 1, or different seeds"),
+        ("jax/CartPole-v1", [1, 1], r"seeds=\[1, 1\] must be .* different seeds"),
+        ("jax/CartPole-v1", [1, -1], "seed=-1 must be a whole number"),
+    ],
+)
+def test_environments_that_would_be_shared_and_wrong_seeds_are_refused(env: Any, seeds: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        rejeu.train_seeds(rejeu.DQN, "MlpPolicy", env, 60, seeds=seeds, **SMALL)
+    assert "\n" not in str(raised.value)
+
+
 def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
     def callbacks(agent: Any) -> list[Any]:
         agent.report_folder = tmp_path / str(agent.config.learning_rate)

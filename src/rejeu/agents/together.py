@@ -33,6 +33,7 @@ from rejeu.loops.device.variants import Variants
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Sink
+from rejeu.validation import whole
 
 A = TypeVar("A", bound=Agent)
 STATIC = ("buffer_size", "learning_starts", "batch_size", "n_steps", "n_epochs")
@@ -92,11 +93,10 @@ def train_seeds(
     """
     if not isinstance(env, str | FunctionalEnv):
         raise ValueError(
-            f"env={env!r}: every run needs environments of its own; give an id, such as 'Pendulum-v1', or a FunctionalEnv"
+            f"env is a {type(env).__name__}, and every run needs environments of its own; give an id, such as 'Pendulum-v1', "
+            "or a FunctionalEnv"
         )
-    numbers = [*range(seeds)] if isinstance(seeds, int) else [whole_seed(one) for one in seeds]
-    if not numbers:
-        raise ValueError(f"seeds={seeds!r} must be a number of at least 1, or a sequence of seeds")
+    numbers = numbers_of(seeds)
     lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
     fixed = {name: value for name, value in settings.items() if name not in lists}
     values = [dict(zip(lists, one, strict=True)) for one in itertools.product(*lists.values())]
@@ -114,6 +114,23 @@ def train_seeds(
     callbacks = [training.listed(None if callback is None else callback(agent)) for agent in agents]
     learn_together(agents, calls, callbacks, progress_bar=progress_bar, differing=tuple(lists))
     return agents
+
+
+def numbers_of(seeds: int | Iterable[int]) -> list[int]:
+    """Returns the seeds that a number of seeds, or the seeds themselves, stand for.
+
+    Raises:
+        ValueError: if there is none, or one twice.
+
+    >>> numbers_of(2), numbers_of([7, 3])
+    ([0, 1], [7, 3])
+    """
+    if not isinstance(seeds, Iterable) or isinstance(seeds, str):
+        return [*range(whole("seeds", seeds, least=1))]
+    numbers = [whole_seed(one) for one in seeds]
+    if not numbers or len({*numbers}) < len(numbers):
+        raise ValueError(f"seeds={seeds!r} must be a number of at least 1, or different seeds")
+    return numbers
 
 
 def start_device(n_runs: int) -> None:
@@ -253,12 +270,12 @@ def common_stops(
 def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
     """Returns why an agent cannot be trained with others in one program, None if it can."""
     assert agent.env is not None
+    if isinstance(agent.config, OffPolicyConfig) and not isinstance(agent.config.train_freq, int):
+        return f"updates depend on episodes (train_freq={agent.config.train_freq!r})"
     if agent.env.backend == "jax":
         return device.reason_against(agent, callbacks)
     if not isinstance(agent.config, OffPolicyConfig):
         return f"{agent.name} is on-policy, and the backend of {agent.env.env_id} is {agent.env.backend!r}, not 'jax'"
-    if not isinstance(agent.config.train_freq, int):
-        return f"updates depend on episodes (train_freq={agent.config.train_freq!r})"
     return device.reason_against_callbacks(callbacks)
 
 

@@ -34,6 +34,12 @@ TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
 LOG_FOLDER = "logs"
 """Folder of the folders of logs, in the current folder."""
+HIDDEN = (
+    "rejeu: progress.action, progress.result and progress.last_obs are None, because callbacks are called between chunks of "
+    "turns here; to be called after every step, set agent.on_device = False, or derive the callback from "
+    "rejeu.callbacks.TrainingCallback with every_step = True"
+)
+"""What is added to the error of a callback that needs what a chunk hides."""
 DETERMINISTIC = ("DDPG", "TD3")
 """Algorithms whose policy for continuous actions does not explore by itself."""
 LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
@@ -163,12 +169,22 @@ def session(
 
         def record(turn: Progress) -> bool:
             record_turn(agent, call, turn, outputs)
-            answers = [callback(agent, turn) for callback in callbacks]
+            answers = [called(callback, agent, turn) for callback in callbacks]
             agent.failed_writes.retry_if_due()
             stopped = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
             return stopped or call.is_over(turn.step, agent.run.episode)
 
         yield record
+
+
+def called(callback: Callback, agent: BaseAgent, turn: Progress) -> bool | None:
+    """Returns the answer of a callback; an error because it looked at a single step of a chunk says so."""
+    try:
+        return callback(agent, turn)
+    except (AttributeError, TypeError) as error:
+        if turn.result is None and "NoneType" in str(error):
+            error.add_note(HIDDEN)
+        raise
 
 
 def horizon(agent: BaseAgent, call: TrainingCall) -> tuple[int | None, Callable[[int], float]]:

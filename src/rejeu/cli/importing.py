@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rejeu.envs.functional.registry import REGISTRY
 from rejeu.envs.registry import is_plain_id
 
 
@@ -40,6 +41,7 @@ def find_id(name: str) -> str:
     module = import_source(source)
     new = set(gym.registry) - before
     new |= {key for key, spec in gym.registry.items() if str(spec.entry_point).partition(":")[0] == module.__name__}
+    new |= {key for key, entry in REGISTRY.items() if getattr(entry.kind, "__module__", None) == module.__name__}
     if env_id in gym.registry:
         return env_id
     found = " and ".join(sorted(new))

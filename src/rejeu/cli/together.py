@@ -12,6 +12,7 @@ from rejeu.agents.device import reason_against, require_memory
 from rejeu.agents.together import learn_together, start_device
 from rejeu.cli import run_folder, seeds, sweep
 from rejeu.cli.commands import Train
+from rejeu.cli.importing import find_id
 from rejeu.cli.output import echo, header
 from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Session, Stopwatch
@@ -26,8 +27,11 @@ Begin = Callable[[Train, int, Session | None, ExitStack], Session]
 
 
 def is_possible(arguments: Train) -> bool:
-    """Returns whether seeds are trained in one program: in a JAX environment without wrappers, and without ``--jobs``."""
-    return is_functional(arguments.env) and not arguments.wrapper and arguments.jobs is None
+    """Returns whether seeds are trained in one program: in a JAX environment without wrappers, and without ``--jobs``.
+
+    Imports the environment if it is one of the user's own.
+    """
+    return arguments.jobs is None and not arguments.wrapper and is_functional(find_id(arguments.env))
 
 
 def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:

@@ -63,25 +63,26 @@ def reported(agent: Any, update: NonFiniteUpdate) -> NonFiniteError:
     run, learner, clock = agent.run, agent.learner, update.clock
     run.td_errors, run.obs, run.action = [], None, None
     run.state = run.state if update.state is None else update.state
-    state, found, batch = learner.state(run.state), Found([], [], []), update.batches
+    state, found, batch, n_updates = learner.state(run.state), Found([], [], []), update.batches, update.n_updates
     for i, one in enumerate(_one_by_one(update.batches)):
         after, found = effect(learner, state, one, clock)
         if found:
-            batch = one
+            batch, n_updates = one, n_updates + i
             run.state = learner.pack(state) if i > 0 else run.state
             break
         state = after
+    run.n_updates = n_updates + (update.state is None)  # an update that was skipped counts
     names = [text.split(" ")[0] for text in (*found.metrics, *found.leaves)]
-    path, saved = _save(agent, batch, clock, names)
+    path, saved = _save(agent, batch, clock, names, n_updates + 1)
     what = _describe(found)
     if update.in_a_row >= MAX_SKIPPED:
         what = f"{update.in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {what}"
     model = f"; last saved model: {agent.last_saved}" if agent.last_saved is not None else ""
     message = (
-        f"{what}, at environment step {int(clock.step)}, update {run.n_updates}. The agent is as it was before that update. "
+        f"{what}, at environment step {int(clock.step)}, update {n_updates + 1}. The agent is as it was before that update. "
         f"{saved}{model}. {_advice(agent, found, batch)}"
     )
-    return NonFiniteError(message, names=names, step=int(clock.step), n_updates=run.n_updates, batch=path)
+    return NonFiniteError(message, names=names, step=int(clock.step), n_updates=n_updates + 1, batch=path)
 
 
 def _one_by_one(batches: Transition | Rollout) -> list[Any]:
@@ -127,14 +128,16 @@ def folder_of(agent: Any) -> Path:
     return Path.cwd() if agent.tensorboard_log is None else Path(agent.tensorboard_log)
 
 
-def _save(agent: Any, batch: Transition | Rollout, clock: Clock, names: list[str]) -> tuple[Path | None, str]:
+def _save(
+    agent: Any, batch: Transition | Rollout, clock: Clock, names: list[str], n_updates: int
+) -> tuple[Path | None, str]:
     """Writes the batch; returns its path, None if writing failed, and a sentence that says so."""
     run, step = agent.run, int(clock.step)
     header = {
         "algorithm": agent.name,
         "env_id": None if run.env is None else run.env.env_id,
         "clock": {"step": step, "episode": int(clock.episode), "progress": float(clock.progress)},
-        "n_updates": run.n_updates,
+        "n_updates": n_updates,
         "names": names,
     }
     try:

@@ -74,7 +74,6 @@ def first_of_n(
         timer.lap("replay")
         n_unread = len(run.monitor)
         update(run, learner, samples, clock)
-        run.n_updates += n_updates
         if not config.overlap:
             chosen = choose(run, learner, config, clock, step.which)
         run.action = run.action.copy()

@@ -99,13 +99,22 @@ def bad_leaves(tree: PyTree) -> list[str]:
 class NonFiniteUpdate(Exception):
     """An update left NaN or infinity; :func:`rejeu.loops.finite.reported` explains it."""
 
-    def __init__(self, state: PackedState | None, batches: Transition | Rollout, clock: Clock, in_a_row: int) -> None:
+    def __init__(
+        self, state: PackedState | None, batches: Transition | Rollout, clock: Clock, in_a_row: int, n_updates: int
+    ) -> None:
         super().__init__("an update left numbers that are not finite")
         self.state = state
         """The state before it; None if the update was undone."""
+        self.n_updates = n_updates
+        """Total number of gradient steps before it."""
         self.batches, self.clock, self.in_a_row = batches, clock, in_a_row
         self.which = 0
         """Its run, where several are trained together."""
+
+
+def gradient_steps(reward: Array | np.ndarray) -> int:
+    """Returns the number of gradient steps on samples, by their rewards: 1 on a batch, or one on each of several."""
+    return 1 if reward.ndim == 1 else len(reward)
 
 
 class Call(NamedTuple):
@@ -117,6 +126,8 @@ class Call(NamedTuple):
     """Of an update, the batches and the clock."""
     readings: Readings | None
     """What an update reported; None for other functions."""
+    n_updates: int
+    """Total number of gradient steps before it."""
 
 
 class NonFiniteMonitor:
@@ -155,14 +166,24 @@ class NonFiniteMonitor:
             self.read()
             self._begin(state)
 
-    def record(self, state: PackedState, function: Callable[..., Any], *arguments: Any, readings: Any = None) -> None:
-        """Records a call of ``function`` that returned ``state``; an update also has ``readings``."""
+    def record(
+        self,
+        state: PackedState,
+        function: Callable[..., Any],
+        *arguments: Any,
+        readings: Any = None,
+        n_updates: int = 0,
+    ) -> None:
+        """Records a call of ``function`` that returned ``state``.
+
+        An update also has ``readings``, and ``n_updates``, the total number of gradient steps before it.
+        """
         if readings is not None:
             if len(self._calls) < 2:
                 n_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[0]))
                 self._most = min(max(MAX_BYTES // max(n_bytes, 1), 1), MAX_CALLS)
             self._unread.append(len(self._calls))
-        self._calls.append(Call(function, arguments, readings))
+        self._calls.append(Call(function, arguments, readings, n_updates))
         self._newest = state
 
     def read(self, n: int | None = None) -> None:
@@ -213,7 +234,7 @@ class NonFiniteMonitor:
             if call.readings is not None and not self._is_finite(state):
                 state, place = before, i
                 break
-        batches, clock = self._calls[place].arguments
+        (batches, clock), n_updates = self._calls[place].arguments, self._calls[place].n_updates
         in_a_row, self._in_a_row = self._in_a_row, 0
         self._begin(None)
-        return NonFiniteUpdate(state, batches, clock, in_a_row)
+        return NonFiniteUpdate(state, batches, clock, in_a_row, n_updates)

@@ -27,6 +27,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Clock
 from rejeu.loops.checks import check_obs, check_state, check_step, checked_reset
 from rejeu.loops.learner import Learner
+from rejeu.loops.nonfinite import gradient_steps
 from rejeu.loops.run import Progress, Run, clock_of, record_step, restart
 from rejeu.loops.timing import Timer
 from rejeu.spaces import action_scaler, random_action
@@ -92,7 +93,6 @@ def off_policy(
         timer.lap("replay")
         n_unread = len(run.monitor)
         update(run, learner, samples, clock)
-        run.n_updates += n_updates
         if not config.overlap:
             chosen = choose(run, learner, config, clock)
         run.action = np.asarray(chosen)
@@ -131,12 +131,16 @@ def observe(run: Run, learner: Learner) -> None:
 
 
 def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Clock) -> None:
-    """Starts the updates on samples of the replay buffer, and sets priorities by the TD errors of the last ones."""
+    """Starts the updates on samples of the replay buffer, and sets priorities by the TD errors of the last ones.
+
+    The updates are counted.
+    """
     run.replay.update_priorities(run.td_errors)
     run.td_errors = []
     for batch, drawn in samples:
         run.state, run.metrics, td_error = learner.update(run.state, batch, clock)
-        run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics)
+        run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics, n_updates=run.n_updates)
+        run.n_updates += gradient_steps(batch.reward)
         if td_error is not None:
             run.td_errors.append((drawn, td_error))
 

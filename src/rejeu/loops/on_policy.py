@@ -84,9 +84,13 @@ def on_policy(
             clock, batch = clock_of(run, progress(run.step - first)), rollout.rollout()
             run.monitor.follow(run.state)
             run.state, run.metrics, _ = learner.update(run.state, batch, clock)
-            run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics)
-            n_updates = config.gradient_steps(rollout.size())
-            run.n_updates += int(run.metrics["gradient_steps"]) if config.stops_early else n_updates
+            run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics, n_updates=run.n_updates)
+            n_updates: float = config.gradient_steps(rollout.size())
+            if config.stops_early:
+                n_updates = np.nan_to_num(
+                    run.metrics["gradient_steps"], nan=n_updates
+                )  # NaN of an update that was undone
+            run.n_updates += int(n_updates)
             begin(run, config)
         timer.lap("update")
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)

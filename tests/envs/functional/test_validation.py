@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
+import sys
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import gymnasium as gym
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 import rejeu
+from rejeu.cli import main
 from rejeu.envs.functional import FunctionalEnv, GoalEnv, make
 from rejeu.envs.functional.registry import REGISTRY
 from rejeu.envs.functional.validation import check
@@ -20,9 +26,11 @@ ZERO, NO = jnp.float32(0.0), jnp.bool_(False)
 
 
 class Walk(FunctionalEnv):
-    """Moves by the action; ``wrong`` returns other values from a step."""
+    """Moves by the action; ``begin`` and ``wrong`` return other values from a reset and a step."""
 
     wrong: Any = eqx.field(static=True, default=None)
+    begin: Any = eqx.field(static=True, default=None)
+    mask: Any = eqx.field(static=True, default=None)
     max_episode_steps: int | None = eqx.field(static=True, default=None)
 
     @property
@@ -34,15 +42,28 @@ class Walk(FunctionalEnv):
         return spaces.Box(-1, 1, (1,), np.float32)
 
     def reset(self, key):
-        return jnp.zeros(1), jnp.zeros(1)
+        return (jnp.zeros(1), jnp.zeros(1)) if self.begin is None else self.begin()
 
     def step(self, key, state, action):
         after = state + action
         return (after, after, -after[0], NO, NO) if self.wrong is None else self.wrong(after)
 
+    def action_mask(self, state):
+        return None if self.mask is None else self.mask(state)
+
 
 def if_on_a_value(x):
     return x, x, ZERO if x[0] > 0 else -ZERO, NO, NO
+
+
+def write_in_place(x):
+    x[0] = 0.0
+    return x, x, ZERO, NO, NO
+
+
+def counts_itself(x, env=Walk()):  # noqa: B008 - never changed
+    env.time = 1
+    return x, x, ZERO, NO, NO
 
 
 @pytest.mark.parametrize(
@@ -50,14 +71,27 @@ def if_on_a_value(x):
     [
         (if_on_a_value, r"Walk.step cannot be compiled \(TracerBoolConversionError.*jnp.where instead of if"),
         (lambda x: (x, x, float(x[0]), NO, NO), "Walk.step cannot be compiled"),
+        (lambda x: (x, x, math.sin(x[0]), NO, NO), "Walk.step cannot be compiled"),
+        (lambda x: (x, np.clip(np.asarray(x), 0, 1), ZERO, NO, NO), r"cannot be compiled \(TracerArrayConversionError"),
         (lambda x: (x, x, x[np.nonzero(x)[0]].sum(), NO, NO), "Walk.step cannot be compiled"),
+        (lambda x: (x, x[x > 0], ZERO, NO, NO), r"cannot be compiled \(NonConcreteBooleanIndexError"),
+        (write_in_place, r"Walk.step cannot be compiled \(TypeError: .*immutable.*: return new arrays"),
+        (counts_itself, r"Walk.step cannot be compiled \(FrozenInstanceError.*time.*: return new arrays"),
+        (lambda x: (x, x + jnp.zeros(3)[:2] * jnp.zeros(3), ZERO, NO, NO), r"cannot be compiled \(TypeError: "),
+        (lambda x: ("far", x, ZERO, NO, NO), r"cannot be compiled \(TypeError: "),
         (lambda x: (x, x, ZERO, NO), r"returned 4 values, expected \(state, obs, reward"),
+        (lambda x: x, r"Walk.step returned one array, expected \(state, obs, reward"),
+        (lambda x: [x, x, ZERO, NO, NO], r"Walk.step returned one list, expected \(state, obs, reward"),
+        (lambda x: (x, x, ZERO, NO, NO, {}), r"returned 6 values, expected \(state, obs, reward"),
         (lambda x: (x, jnp.append(x, x), ZERO, NO, NO), r"an observation of shape \(2,\), expected \(1,\)"),
-        (lambda x: (x, (x,), ZERO, NO, NO), "returned the observation PyTreeDef"),
+        (lambda x: (x, (x,), ZERO, NO, NO), r"Walk.step returned the observation \(\*,\), expected one array as in"),
         (lambda x: (x, x.astype(int), ZERO, NO, NO), "dtype int32, expected float32: use .astype"),
         (lambda x: (jnp.append(x, x), x, ZERO, NO, NO), r"changed state from float32\[1\] in reset to float32\[2\]"),
-        (lambda x: ((x, x), x, ZERO, NO, NO), "a state of another structure than reset"),
+        (lambda x: (x.astype(int), x, ZERO, NO, NO), r"changed state from float32\[1\] in reset to int32\[1\]"),
+        (lambda x: ((x, x), x, ZERO, NO, NO), r"returned the state \(\*, \*\), expected one array as from reset"),
         (lambda x: (x, x, x, NO, NO), r"returned reward as float32\[1\], expected a float"),
+        (lambda x: (x, x, jnp.int32(1), NO, NO), r"returned reward as int32\[\], expected a float"),
+        (lambda x: (x, x, None, NO, NO), r"returned reward as None, expected a float"),
         (lambda x: (x, x, ZERO, ZERO, NO), r"returned terminated as float32\[\], expected a bool"),
         (lambda x: (x, x, ZERO, NO, None), "returned truncated as None, expected a bool"),
     ],
@@ -68,10 +102,41 @@ def test_a_wrong_step_is_named(wrong, said):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("begin", "said"),
+    [
+        (lambda: jnp.zeros(1), r"Walk.reset returned one array, expected \(state, obs\)"),
+        (lambda: (jnp.zeros(1), jnp.zeros(1), {}), r"Walk.reset returned 3 values, expected \(state, obs\)"),
+        (lambda: (jnp.zeros(1), {}), r"Walk.reset returned the observation \{\}, expected one array"),
+        (lambda: (jnp.zeros(1), jnp.zeros(())), r"Walk.reset returned an observation of shape \(\), expected \(1,\)"),
+        (lambda: (jnp.zeros(1), jnp.zeros(1, bool)), "dtype bool, expected float32"),
+        (lambda: (jnp.zeros(1), np.random.default_rng(None)), r"Walk.reset cannot be compiled \(TypeError"),
+    ],
+)
+def test_a_wrong_reset_is_named(begin, said):
+    with pytest.raises(BadEnvironmentError, match=said) as raised:
+        rejeu.make_vector(Walk(begin=begin))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("mask", "said"),
+    [
+        (lambda x: jnp.ones(3) if x[0] > 0 else None, "Walk.action_mask cannot be compiled"),
+        (lambda x: jnp.ones((2, 1), bool), r"Walk.action_mask returned bool\[2, 1\], expected a bool for each"),
+        (lambda x: jnp.ones(3), r"Walk.action_mask returned float32\[3\], expected a bool for each"),
+    ],
+)
+def test_a_wrong_mask_is_named(mask, said):
+    with pytest.raises(BadEnvironmentError, match=said):
+        rejeu.make_vector(Walk(mask=mask))
+
+
 class Reach(GoalEnv):
     """An environment whose goal is the origin."""
 
     rewarded: Any = eqx.field(static=True, default=None)
+    judged: Any = eqx.field(static=True, default=None)
     max_episode_steps: int | None = eqx.field(static=True, default=None)
 
     @property
@@ -89,24 +154,119 @@ class Reach(GoalEnv):
         return state, dict.fromkeys(self.observation_space, state), ZERO, NO, NO
 
     def compute_reward(self, achieved_goal, desired_goal, info=None):
-        return self.rewarded(achieved_goal, desired_goal)
+        if self.rewarded is not None:
+            return self.rewarded(achieved_goal, desired_goal)
+        return -jnp.abs(achieved_goal - desired_goal).sum(axis=-1)
+
+    def compute_terminated(self, achieved_goal, desired_goal, info=None):
+        return None if self.judged is None else self.judged(achieved_goal, desired_goal)
 
 
-@pytest.mark.parametrize(
-    ("rewarded", "said"),
-    [
-        (lambda a, d: np.linalg.norm(a - d), "Reach.compute_reward cannot be compiled"),
-        (lambda a, d: jnp.linalg.norm(a - d), r"of 3 goals returned the shape \(\), expected \(3,\)"),
-        (lambda a, d: a - d, r"of 3 goals returned the shape \(3, 2\), expected \(3,\)"),
-    ],
-)
-def test_a_wrong_reward_function_is_named(rewarded, said):
-    with pytest.raises(BadEnvironmentError, match=said):
-        rejeu.make_vector(Reach(rewarded=rewarded))
+FUNCTIONS = [
+    (lambda a, d: np.linalg.norm(a - d), r"cannot be compiled \(TracerArrayConversionError.*jnp instead of np"),
+    (lambda a, d: np.float32(0) if (a == d).all() else np.float32(-1), "cannot be compiled.*jnp.where instead of if"),
+    (lambda a, d: float(a[0, 0]), r"cannot be compiled .*no float\(\)"),
+    (lambda a, d: a @ d, r"cannot be compiled \(TypeError"),
+    (lambda a, d: jnp.linalg.norm(a - d), r"of 3 goals returned the shape \(\), expected the shape \(3,\)"),
+    (lambda a, d: a - d, r"of 3 goals returned the shape \(3, 2\), expected the shape \(3,\)"),
+    (lambda a, d: (a, d), r"of 3 goals returned \(ShapeDtypeStruct.*, expected the shape \(3,\)"),
+]
+
+
+@pytest.mark.parametrize(("function", "said"), FUNCTIONS)
+@pytest.mark.parametrize("name", ["compute_reward", "compute_terminated"])
+def test_a_wrong_function_of_goals_is_named(name, function, said):
+    field = {"compute_reward": "rewarded", "compute_terminated": "judged"}[name]
+    with pytest.raises(BadEnvironmentError, match=f"Reach.{name} {said}") as raised:
+        rejeu.make_vector(Reach(**{field: function}))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_reward_function_that_returns_nothing_is_named():
+    with pytest.raises(BadEnvironmentError, match=r"Reach.compute_reward of 3 goals returned None, expected the shape"):
+        rejeu.make_vector(Reach(rewarded=lambda a, d: None))
+
+
+class NearlyReach(Walk):
+    """Has a reward function, but is not a :class:`GoalEnv`."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info=None):
+        return ZERO
+
+
+def test_a_reward_function_of_an_environment_without_goals_is_named():
+    with pytest.raises(BadEnvironmentError, match="NearlyReach has compute_reward, but does not derive from .*GoalEnv"):
+        rejeu.make_vector(NearlyReach())
 
 
 def test_right_environments_pass():
     check(Walk())
-    check(Reach(rewarded=lambda a, d: -jnp.abs(a - d).sum(axis=-1)))
+    check(Walk(mask=lambda state: jnp.ones(3, bool)))
+    check(Walk(begin=lambda: (np.zeros(1, np.float32), np.zeros(1, np.float32))))
+    check(Reach())
+    check(Reach(judged=lambda a, d: (a == d).all(axis=-1)))
     for env_id in REGISTRY:
         check(make(env_id))
+
+
+@pytest.mark.parametrize("begin", [lambda: (0.0, jnp.zeros(1)), lambda: (np.float32(0), np.zeros(1, np.float32))])
+def test_numbers_of_python_and_numpy_may_begin_a_state_that_trains_on_the_device(begin):
+    agent = rejeu.PPO(
+        "MlpPolicy",
+        rejeu.make_vector(Walk(begin=begin, wrong=lambda x: (x.sum(), x.reshape(1), ZERO, NO, NO)), 2),
+        n_steps=4,
+        batch_size=4,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    )
+    agent.on_device = True
+    assert agent.learn(16).num_timesteps == 16
+
+
+def test_observations_far_outside_of_their_bounds_are_reported_on_the_device():
+    env = Walk(wrong=lambda x: (x, x + 1e6, ZERO, NO, NO))
+    agent = rejeu.SAC("MlpPolicy", rejeu.make_vector(env), policy_kwargs={"net_arch": [8]}, seed=0)
+    agent.on_device = True
+    with pytest.warns(UserWarning, match="Walk returned .*Networks learn badly from large numbers"):
+        agent.learn(8)
+
+
+SOURCE = """
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from rejeu.envs.functional import FunctionalEnv, register
+
+
+class Walk(FunctionalEnv):
+    max_episode_steps: int | None = None
+    observation_space = spaces.Box(-9, 9, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, key):
+        return jnp.zeros(1), jnp.zeros(1)
+
+    def step(self, key, state, action):
+        reward = 1.0 if state[0] > 0 else 0.0
+        return state, state, reward, jnp.bool_(False), jnp.bool_(False)
+
+
+register("jax/BadWalk-v0", Walk)
+"""
+
+
+@pytest.mark.parametrize("options", [["train", "--steps", "8"], ["train", "--seeds", "2", "--steps", "8"], ["check"]])
+def test_the_command_line_says_it_in_one_line(options, tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "bad_walk.py").write_text(SOURCE)
+    try:
+        command, *options = options
+        assert main([command, "bad_walk.py", *options]) == 2
+    finally:
+        gym.registry.pop("jax/BadWalk-v0", None)
+        REGISTRY.pop("jax/BadWalk-v0", None)
+        sys.modules.pop("bad_walk", None)
+    error = capsys.readouterr().err.strip()
+    assert "Walk.step cannot be compiled (TracerBoolConversionError" in error.splitlines()[-1]
+    assert len(error.splitlines()) == 1

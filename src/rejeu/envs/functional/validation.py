@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import FrozenInstanceError
 from typing import Any
 
 import jax
@@ -15,6 +16,8 @@ from rejeu.spaces import check_goal_space, leaves, narrow, structure
 
 UNTRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 """What JAX raises where Python needs a value that is not known yet."""
+MISTAKES = (TypeError, ValueError, FrozenInstanceError)
+"""What other mistakes raise, such as writing into an array or a field, or adding arrays whose shapes do not fit."""
 N_GOALS = 3
 """Number of goals with which goal functions are checked."""
 
@@ -46,24 +49,43 @@ def check(env: FunctionalEnv) -> None:
     success = _traced(f"{name}.success", env.success, after)
     if success is not None:
         _check_scalar(f"{name}.success", "success", success, "b")
+    mask = _traced(f"{name}.action_mask", env.action_mask, after)
+    if mask is not None:
+        _check_mask(f"{name}.action_mask", mask)
     if isinstance(env, GoalEnv):
         _check_goals(env, name)
+    elif hasattr(env, "compute_reward"):
+        raise BadEnvironmentError(
+            f"{name} has compute_reward, but does not derive from rejeu.envs.functional.GoalEnv: derive it from GoalEnv, "
+            "so that hindsight uses it, or rename the function"
+        )
 
 
 def _traced(said: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
     except UNTRACEABLE as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
         raise BadEnvironmentError(
-            f"{said} cannot be compiled ({type(error).__name__}: {reason[:150]}); it needs a value before there is one: use "
-            "jnp instead of np, jnp.where instead of if, and no float(), int() or bool() of arrays"
+            f"{said} cannot be compiled ({_line(error)}); it needs a value before there is one: use jnp instead of np, "
+            "jnp.where instead of if, and no float(), int() or bool() of arrays"
         ) from error
+    except MISTAKES as error:
+        raise BadEnvironmentError(
+            f"{said} cannot be compiled ({_line(error)}); arguments are arrays without values, and nothing may be changed "
+            "in place: return new arrays"
+        ) from error
+
+
+def _line(error: Exception) -> str:
+    """Returns the kind of an error and the beginning of its message."""
+    reason = str(error).partition("\n")[0].rstrip(".")
+    return f"{type(error).__name__}: {reason[:150]}"
 
 
 def _unpack(answer: Any, n: int, said: str, expected: str) -> tuple[Any, ...]:
     if not isinstance(answer, tuple) or len(answer) != n:
-        what = f"{len(answer)} values" if isinstance(answer, tuple) else f"a {type(answer).__name__}"
+        kind = "array" if isinstance(answer, jax.ShapeDtypeStruct) else type(answer).__name__
+        what = f"{len(answer)} values" if isinstance(answer, tuple) else f"one {kind}"
         raise BadEnvironmentError(f"{said} returned {what}, expected {expected}")
     return answer
 
@@ -76,7 +98,8 @@ def _check_obs(said: str, space: spaces.Space, obs: Any) -> None:
     """Compares an observation with its space, but accepts 64-bit floats, which occur with ``jax_enable_x64``."""
     if jax.tree.structure(obs) != structure(space):
         raise BadEnvironmentError(
-            f"{said} returned the observation {jax.tree.structure(obs)}, expected {structure(space)} as in observation_space"
+            f"{said} returned the observation {_shown(jax.tree.structure(obs))}, expected {_shown(structure(space))} as in "
+            "observation_space"
         )
     for leaf, array in zip(leaves(space), jax.tree.leaves(obs), strict=True):
         where = f" under {leaf.path!r}" if leaf.path else ""
@@ -95,7 +118,7 @@ def _check_state(said: str, before: Any, after: Any) -> None:
     trees: list[Any] = [jax.tree.structure(before), jax.tree.structure(after)]
     if trees[0] != trees[1]:
         raise BadEnvironmentError(
-            f"{said} returned a state of another structure than reset: {trees[1]}, expected {trees[0]}"
+            f"{said} returned the state {_shown(trees[1])}, expected {_shown(trees[0])} as from reset"
         )
     pairs = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
     for (path, old), new in pairs:
@@ -104,6 +127,19 @@ def _check_state(said: str, before: Any, after: Any) -> None:
                 f"{said} changed state{jax.tree_util.keystr(path)} from {old.dtype}{list(old.shape)} in reset to "
                 f"{new.dtype}{list(new.shape)}; shapes and dtypes must stay the same"
             )
+
+
+def _shown(structure: Any) -> str:
+    """Returns the structure of a tree, in which every array is an asterisk."""
+    text = str(structure).removeprefix("PyTreeDef(").removesuffix(")")
+    return "one array" if text == "*" else f"{text[:200]}"
+
+
+def _check_mask(said: str, mask: Any) -> None:
+    shape, dtype = getattr(mask, "shape", ()), getattr(mask, "dtype", None)
+    if len(shape) != 1 or np.dtype(dtype).kind not in "biu":
+        got = type(mask).__name__ if dtype is None else f"{dtype}{list(shape)}"
+        raise BadEnvironmentError(f"{said} returned {got}, expected a bool for each action, with one axis")
 
 
 def _check_scalar(said: str, what: str, value: Any, kind: str) -> None:
@@ -123,11 +159,12 @@ def _check_goals(env: GoalEnv, name: str) -> None:
         raise BadEnvironmentError(f"{name}: {error}") from None
     goal = env.observation_space["achieved_goal"]  # type: ignore[index]
     goals = jax.ShapeDtypeStruct((N_GOALS, *goal.shape), narrow(goal.dtype))
-    for function in (env.compute_reward, env.compute_terminated):
+    for function, may_be_none in ((env.compute_reward, False), (env.compute_terminated, True)):
         said = f"{name}.{function.__name__}"
         result = _traced(said, function, goals, goals)
-        if result is not None and getattr(result, "shape", None) != (N_GOALS,):
+        if getattr(result, "shape", None) != (N_GOALS,) and not (result is None and may_be_none):
+            got = f"the shape {result.shape}" if hasattr(result, "shape") else f"{result!r:.60}"
             raise BadEnvironmentError(
-                f"{said} of {N_GOALS} goals returned the shape {getattr(result, 'shape', None)}, expected ({N_GOALS},); "
-                "compute over the last axis"
+                f"{said} of {N_GOALS} goals returned {got}, expected the shape ({N_GOALS},): compute over the last axis, "
+                "and return an array"
             )

@@ -112,7 +112,7 @@ def train(
 def raise_fault(machine: Any, which: int, run: Run, limits: Limits) -> None:
     """Raises the error of a run in a chunk; an error of an update says which run it is."""
     try:
-        machine.raise_fault(run, limits)
+        machine.raise_fault(which, run, limits)
     except NonFiniteUpdate as error:
         error.which = which
         raise

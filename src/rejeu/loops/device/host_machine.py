@@ -18,7 +18,7 @@ from rejeu.loops.checks import check_step, checked_reset
 from rejeu.loops.device.driver import MAX_TURNS
 from rejeu.loops.device.turns import NO_LIMIT, Limits
 from rejeu.loops.learner import Learner, is_finite
-from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
+from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate, gradient_steps
 from rejeu.loops.off_policy import batch_shapes, due
 from rejeu.loops.packing import PackedState, Readings
 from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step
@@ -188,10 +188,12 @@ class HostMachine:
             run.metrics = Readings(self.readings.names, self.readings.vector[which])
         return Progress(run.step, self.episodes[which], run.metrics, rollout_ended=self.readings is not None)
 
-    def raise_fault(self, run: Run, limits: Limits) -> NoReturn:
+    def raise_fault(self, which: int, run: Run, limits: Limits) -> NoReturn:
         """Raises the error of the first bad update of the last chunk, with the state before it and its batch."""
-        which = [one is run for one in self.runs].index(True)
+        which = self.order.index(which)
         state, learner = [jax.numpy.array(part[which]) for part in self.before], self.learner
+        rewards = [call.arguments[0].reward[which] for call in self.calls if call.is_update]
+        n_updates = run.n_updates - sum(gradient_steps(reward) for reward in rewards)
         for call in self.calls:
             own = jax.tree.map(lambda part: part[which], call.arguments)
             kept = learner.copy(state)
@@ -199,7 +201,9 @@ class HostMachine:
                 state, readings, _ = learner.update(state, *own)
                 if readings.n_bad or not is_finite(state):
                     batch, clock = own
-                    raise NonFiniteUpdate(None if learner.skips else kept, batch, clock, int(self.in_a_row[which]))
+                    in_a_row = int(self.in_a_row[which])
+                    raise NonFiniteUpdate(None if learner.skips else kept, batch, clock, in_a_row, n_updates)
+                n_updates += gradient_steps(own[0].reward)
             else:
                 assert learner.observe is not None
                 state = learner.observe(state, *own)

@@ -8,13 +8,14 @@ from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rejeu.core import Clock, Rollout, Transition
 from rejeu.envs.base import Step
-from rejeu.loops.checks import check_finite
+from rejeu.loops.checks import check_bounds, check_finite, check_obs
 from rejeu.loops.device.sharing import filled, mesh_of, over_runs, spread
-from rejeu.loops.device.transfer import copies, episodes_of, put_players, unstacked
+from rejeu.loops.device.transfer import copies, episodes_of, put_players, unstacked, vector_of
 from rejeu.loops.device.turns import Limits, Report
 from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.loops.packing import Readings
@@ -35,7 +36,7 @@ class Machine(ABC):
 
         ``size`` is the number of runs for which the program is compiled, a multiple of that of the devices.
         """
-        self.env, self.program = runs[0].env.env, program
+        self.env, self.program = vector_of(runs[0]).env, program
         self.mesh = mesh_of(size, devices)
         """The devices that share the runs; None if one computes all."""
         self.n = size
@@ -51,6 +52,8 @@ class Machine(ABC):
         """Of the last chunk."""
         self.reports: list[Report] = []
         """The same on the host, by run."""
+        self.in_a_row: list[int] = []
+        """How many of the newest updates before the last chunk were not finite, by run."""
 
     @property
     def capacity(self) -> int:
@@ -89,6 +92,7 @@ class Machine(ABC):
         """Puts the runs onto the device, with the counters of ``leader``."""
         runs = filled(runs, self.n)
         self.begin(runs)
+        self.carries = []
         if self.n == 1:
             self.carry, self.store = self.carry_of(leader, progress), self.store_of(leader)
             return
@@ -104,6 +108,7 @@ class Machine(ABC):
 
     def start(self, limits: Limits) -> None:
         """Starts a chunk of turns, and does not wait for it."""
+        self.in_a_row = [int(one.in_a_row) for one in self.carries] or [0] * self.n
         if self.n == 1:
             self.carry, self.store, self.report = take_chunk((self.program, self.env, self.carry, limits), self.store)
         else:
@@ -140,47 +145,61 @@ class Machine(ABC):
             values = [*report.metrics.values(), report.n_bad]
             run.metrics = Readings(tuple(report.metrics), np.array(values, np.float32))  # type: ignore[arg-type]
         self.put(run, carry, self.experience[which])
+        if run.step >= run.next_look:
+            check_bounds(run, run.obs)
         episodes = episodes_of(run, report.log, first_step, run.step)
         return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))
 
-    def raise_fault(self, run: Run, limits: Limits) -> NoReturn:
+    def raise_fault(self, which: int, run: Run, limits: Limits) -> NoReturn:
         """Raises the error of a chunk of which nothing was pulled; the run is put before the fault.
 
         Raises:
             BadEnvironmentError: if a reward or an observation is not finite.
             NonFiniteUpdate: if an update left numbers that are not finite.
         """
-        self.n, self.mesh = 1, None
+        in_a_row, self.n, self.mesh = self.in_a_row[which], 1, None
         for i in range(int(limits.n_turns)):
-            progress = np.roll(limits.progress, -i)
-            one = limits._replace(n_turns=np.int32(1), progress=progress)
-            self.push([run], run, float(progress[0]))
-            self.call(one)
+            one = limits._replace(n_turns=np.int32(1), progress=np.roll(limits.progress, -i))
+            self._repeat(run, one, in_a_row)
             if self.carries[0].players.bad:
-                outcome: Any = self.reports[0].outcome
-                step = Step(outcome.obs, outcome.reward, outcome.terminated, outcome.truncated, None)
-                check_finite(run, step, run.step)
+                self._raise_bad_environment(run)
             if self.fault(0):
-                self._raise_bad_update(run, one)
+                self._raise_bad_update(run, one, in_a_row)
+            in_a_row = int(self.carries[0].in_a_row)
             self.pull(0, run)
         raise AssertionError("the chunk was not finite, and its turns are")
 
-    def _raise_bad_update(self, run: Run, limits: Limits) -> NoReturn:
+    def _repeat(self, run: Run, limits: Limits, in_a_row: int) -> None:
+        """Takes a chunk from the state of the run, after so many bad updates in a row."""
+        self.push([run], run, float(limits.progress[0]))
+        self.carry = self.carry._replace(in_a_row=jnp.int32(in_a_row))
+        self.call(limits)
+
+    def _raise_bad_environment(self, run: Run) -> NoReturn:
+        """Raises the error of a reward or an observation of the turn that was taken."""
+        outcome: Any = self.reports[0].outcome
+        run.action = outcome.action
+        step = Step(outcome.obs, outcome.reward, outcome.terminated, outcome.truncated, None)
+        check_finite(run, step, run.step)
+        carry = self.carries[0]
+        check_obs(run, carry.players.obs, int(carry.counts.step), "reset returned")
+        raise AssertionError("the environment was not finite, and what it returned is")
+
+    def _raise_bad_update(self, run: Run, limits: Limits, in_a_row: int) -> NoReturn:
         """Raises the error of the first bad update of the next turn, with the state before it and its batch."""
-        in_a_row = int(self.carries[0].in_a_row) if self.program.skips else 0
         number = 0
         while True:
-            self.push([run], run, float(limits.progress[0]))
-            self.call(limits._replace(most_updates=np.int32(number + 1)))
+            self._repeat(run, limits._replace(most_updates=np.int32(number + 1)), in_a_row)
             if self.fault(0):
                 break
             number += 1
-        self.push([run], run, float(limits.progress[0]))
-        self.call(limits._replace(most_updates=np.int32(number)))
+        skipped = int(self.carries[0].in_a_row) if self.program.skips else 0
+        self._repeat(run, limits._replace(most_updates=np.int32(number)), in_a_row)
         carry = self.carries[0]
         clock = Clock(carry.counts.step, carry.players.episode, limits.progress[1])
         batch = self.batch(run, clock, number)
-        raise NonFiniteUpdate(None if self.program.skips else self.carry.state, batch, clock, in_a_row)
+        before = None if self.program.skips else self.carry.state
+        raise NonFiniteUpdate(before, batch, clock, skipped, run.n_updates + number)
 
 
 @eqx.filter_jit(donate="all-except-first")

@@ -8,7 +8,7 @@ environment step, so a run needs no state of a generator.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,7 +113,7 @@ class OffPolicyProgram:
             return program.algorithm.update(state, draw(program.replay, env, ring, nth(key, jnp.uint32(0))), clock)
 
         learned = nothing_learned(update, state, carry.in_a_row, ring, carry.key)
-        loop = Loop(carry, ring, learned, no_outcome(carry.players))
+        loop = Loop(carry, ring, learned, no_outcome(carry.players, carry.action))
 
         def continues(loop: tuple[Array, Loop]) -> Array:
             more = loop[0] < limits.n_turns

@@ -117,7 +117,7 @@ class OnPolicyProgram:
             return program.algorithm.update(state, rollout_of(steps, jnp.int32(0)), clock)
 
         learned = nothing_learned(update, state, carry.in_a_row, steps)
-        loop = Loop(carry, steps, learned, no_outcome(carry.players))
+        loop = Loop(carry, steps, learned, no_outcome(carry.players, steps.action[0]))
 
         def may_go_on(i: Array, loop: Loop) -> Array:
             more = i < limits.n_turns
@@ -159,6 +159,7 @@ def turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limit
     action, explorer = program.explorer.act(
         carry.explorer, actor, before.obs, before.ended, nth(carry.key, clock.step), clock
     )
+    action = action.astype(steps.action.dtype)
     kept = kept_steps(counts.step, limits.last, program.n_envs)
     players, outcome = play(env, before, action, kept, config.gamma, i)
     put = lambda stores, values: jax.tree.map(lambda s, v: s.at[t].set(v.astype(s.dtype)), stores, values)  # noqa: E731
@@ -181,7 +182,7 @@ def turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limit
 def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
     """Returns what is passed on after learning from the rollout; the next one begins."""
     carry, batch = loop.carry, rollout_of(loop.steps, loop.carry.counts.length)
-    learned = learn(program.algorithm, loop.learned, batch, clock, program.skips)
+    learned, _ = learn(program.algorithm, loop.learned, batch, clock, program.skips)
     steps = loop.steps._replace(started=carry.players.ended, carry=carry.explorer)
     counts = carry.counts._replace(length=jnp.zeros_like(carry.counts.length))
     return loop._replace(carry=carry._replace(counts=counts), steps=steps, learned=learned)

@@ -12,15 +12,24 @@ import numpy as np
 from rejeu import spaces
 from rejeu.core import PyTree
 from rejeu.envs.base import success_by
+from rejeu.envs.functional.vector import JaxVector
+from rejeu.envs.masks import functional_vector
 from rejeu.loops.device.turns import Log, Players
 from rejeu.loops.run import Episode, Run
+
+
+def vector_of(run: Run) -> JaxVector:
+    """Returns the environments in JAX of a run."""
+    vector = functional_vector(run.env)
+    assert vector is not None
+    return vector
 
 
 def players_of(run: Run) -> Players:
     """Returns the environments of a run and their episodes, with an empty log of no size."""
     nothing = jnp.zeros((0, run.env.n_envs), jnp.float32)
     return Players(
-        env=run.env.state,
+        env=vector_of(run).state,
         obs=jax.tree.map(jnp.array, run.obs),
         ended=jnp.array(run.ended),
         value=jnp.array(run.episode_return, jnp.float32),
@@ -39,7 +48,7 @@ def put_players(run: Run, players: Any) -> None:
         run: mutated.
         players: :class:`Players` with arrays on the host, apart from the state of the environments.
     """
-    run.env.state = players.env
+    vector_of(run).state = players.env
     run.obs = players.obs
     run.ended = players.ended
     run.episode_return = players.value.astype(np.float64)

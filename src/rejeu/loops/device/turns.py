@@ -85,6 +85,8 @@ class Outcome(NamedTuple):
 
 
 class Report(NamedTuple):
+    action: Array
+    """What was done, in the range of algorithms."""
     """What a chunk says of its turns."""
 
     metrics: Metrics
@@ -152,8 +154,8 @@ def begun(players: Players, capacity: int) -> Players:
     return players._replace(log=empty_log(capacity, len(players.ended)), bad=jnp.bool(False))
 
 
-def no_outcome(players: Players) -> Outcome:
-    """Returns the outcome before the first turn of a chunk."""
+def no_outcome(players: Players, action: Array) -> Outcome:
+    """Returns the outcome before the first turn of a chunk; ``action`` has the shape of actions."""
     n_envs = len(players.ended)
     never = jnp.zeros(n_envs, bool)
     return Outcome(players.obs, jnp.zeros(n_envs, jnp.float32), never, never, never)
@@ -219,7 +221,7 @@ def play(
         bad,
         log,
     )
-    return after, Outcome(obs, reward, terminated, truncated, kept)
+    return after, Outcome(obs, reward, terminated, truncated, kept, action)
 
 
 def all_finite(*arrays: Array) -> Array:

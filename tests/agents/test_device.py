@@ -1,0 +1,95 @@
+"""When agents train on the device, and what callbacks are told if they need what a chunk hides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rejeu
+from rejeu.callbacks import TrainingCallback
+from rejeu.cli import main
+from rejeu.sb3.common.callbacks import BaseCallback
+from tests.loops.device.test_off_policy import make
+
+
+def rewards_of(agent: Any, progress: Any) -> None:
+    """Looks at the rewards of a step."""
+    assert progress.result.reward.shape == (1,)
+
+
+class Rewards(TrainingCallback):
+    """Looks at the rewards of every step."""
+
+    every_step = True
+
+    def __call__(self, agent: Any, progress: Any) -> None:
+        rewards_of(agent, progress)
+
+
+class Rewards3(BaseCallback):
+    """Likewise, as in Stable-Baselines3."""
+
+    def _on_step(self) -> bool:
+        return bool(self.locals["rewards"].shape == (1,))
+
+
+def test_a_callback_that_looks_at_single_steps_is_told_what_to_do() -> None:
+    agent = make(rejeu.DQN, "jax/CartPole-v1")
+    with pytest.raises(AttributeError, match="'NoneType' object has no attribute 'reward'") as raised:
+        agent.learn(30, rewards_of)
+    (note,) = raised.value.__notes__
+    assert "progress.result" in note
+    assert "agent.on_device = False" in note
+    assert "\n" not in note
+    agent.on_device = False
+    assert agent.learn(30, rewards_of).num_timesteps == 30
+
+
+def test_other_errors_of_callbacks_are_left_alone() -> None:
+    def fails(agent: Any, progress: Any) -> None:
+        raise TypeError("no such option")
+
+    with pytest.raises(TypeError) as raised:
+        make(rejeu.DQN, "jax/CartPole-v1").learn(30, fails)
+    assert not hasattr(raised.value, "__notes__")
+
+
+@pytest.mark.parametrize("callback", [Rewards, Rewards3])
+def test_callbacks_of_every_step_train_on_the_host_and_are_named(callback: Any) -> None:
+    agent = make(rejeu.DQN, "jax/CartPole-v1")
+    with pytest.warns(UserWarning, match=f"the callback {callback.__name__} must be called after every step"):
+        agent.learn(30, callback())
+    assert agent.num_timesteps == 30
+    agent.on_device = True
+    with pytest.raises(ValueError, match=f"on_device=True is not possible: the callback {callback.__name__} must"):
+        agent.learn(30, callback())
+
+
+def test_an_agent_that_must_train_on_the_device_says_why_it_cannot() -> None:
+    agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1"), policy_kwargs={"net_arch": [8]})
+    agent.on_device = True
+    with pytest.raises(ValueError, match="the backend of CartPole-v1 is 'gymnasium', not 'jax'"):
+        agent.learn(30)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--seeds", "0"], "--seeds=0 must be a whole number of at least 1"),
+        (["--seeds", "2", "--pause", "10"], "--pause is for a single run; leave it out, or --seeds"),
+        (["--seeds", "2", "--set", "learning_rate=[1e-3,1e-4]"], "learning_rate=[0.001, 0.0001]"),
+        (["--seeds", "2", "--algo", "MaskablePPO"], "CartPole.action_mask returned None, expected a mask"),
+        (["--seeds", "2", "--wait-for", "1"], "wait_for"),
+    ],
+)
+def test_what_seeds_cannot_be_combined_with_is_said_in_one_line(
+    options: list[str], said: str, tmp_path: Path, capsys: Any
+) -> None:
+    argv = ["train", "jax/CartPole-v1", "--algo", "DQN", "--steps", "30", "--out", str(tmp_path / "runs")]
+    assert main([*argv, *options]) == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert "\n" not in error
+    assert not (tmp_path / "runs").exists()
