@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 
 from rejeu import spaces
+from rejeu.buffers import device_priorities
 from rejeu.buffers.device import DeviceReplay, below, uploaded
 from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
+from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.functional.vector import goal_functions
 from rejeu.loops.device.off_policy import draws
+from rejeu.schedules import Linear
 from tests.jax_environments import Reach
 from tests.loops.device.same_draws import use_same_draws
 
@@ -73,14 +76,20 @@ def assert_same_batches(replay: DeviceReplay, buffer: Any, stops: bool, exact: b
     """Asserts that device and host return equal batches for equal random numbers."""
     env, key = Reach(stops=stops), jnp.array([3, 4], jnp.uint32)
     ring = uploaded(replay, buffer.ring)
+    if buffer.priorities is not None:
+        ring = ring._replace(priorities=device_priorities.uploaded(buffer.priorities, [], 1, BATCH))
     terminated = env.compute_terminated if stops else None
     for step in range(3):
         run = SimpleNamespace(replay=buffer, key=key, step=step, rng=None)
-        batch = jax.jit(lambda ring, key: replay.draw(ring, key, env.compute_reward, terminated))(
-            ring, jax.random.fold_in(draws(key, jnp.uint32(step)), 1)
-        )
+        progress = step / 2
+        batch, rows = jax.jit(
+            lambda ring, key, progress: replay.draw(ring, key, progress, env.compute_reward, terminated)
+        )(ring, jax.random.fold_in(draws(key, jnp.uint32(step)), 1), jnp.float32(progress))
         use_same_draws(run)
-        expected = run.replay.draw(run.rng, (BATCH,))[0]
+        expected, drawn = run.replay.draw(run.rng, (BATCH,), progress)
+        if buffer.priorities is not None:
+            np.testing.assert_array_equal(rows.position, drawn.position)
+            np.testing.assert_array_equal(rows.time, drawn.time)
         del buffer.draw
         if isinstance(buffer, HerReplayBuffer):
             del buffer.goal_index
@@ -112,6 +121,62 @@ def test_hindsight_batches_equal_those_of_the_host(strategy: str, n: int, n_step
     buffer = HerReplayBuffer(filled(N_ENVS, n), 0.9, config, goals, n_steps)
     replay = device_replay(N_ENVS, n_steps=n_steps, strategy=strategy)
     assert_same_batches(replay, buffer, stops, n_steps == 1)
+
+
+def prioritized(ring: Ring) -> Priorities:
+    """Returns priorities of the steps of a ring, some of which were drawn before."""
+    priorities = Priorities(ring, PriorityConfig(beta=Linear(0.4, 1.0)))
+    priorities.restore()
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        _, _, drawn = priorities.draw(rng, BATCH, 0.0)
+        priorities.update([(drawn, rng.exponential(size=BATCH))])
+    return priorities
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize(("n_envs", "n"), [(1, 15), (3, 100)])
+def test_batches_by_priority_equal_those_of_the_host(n_envs: int, n: int, n_steps: int) -> None:
+    ring = filled(n_envs, n)
+    buffer = ReplayBuffer(ring, 0.9, n_steps, prioritized(ring))
+    replay = device_replay(n_envs, n_steps=n_steps, priorities=buffer.priorities.config)
+    assert_same_batches(replay, buffer, False, False)
+
+
+def test_hindsight_batches_by_priority_equal_those_of_the_host() -> None:
+    ring, goals = filled(N_ENVS, 100), goal_functions(Reach(stops=True))
+    assert goals is not None
+    buffer = HerReplayBuffer(ring, 0.9, HindsightConfig(), goals, 1, prioritized(ring))
+    replay = device_replay(N_ENVS, strategy="future", priorities=buffer.priorities.config)
+    assert_same_batches(replay, buffer, True, False)
+
+
+@pytest.mark.parametrize("n", [5, 60])
+def test_priorities_of_new_steps_equal_those_of_the_host(n: int) -> None:
+    ring = ring_of(N_ENVS)
+    buffer = ReplayBuffer(ring, 0.9, 1, Priorities(ring, PriorityConfig()))
+    buffer.begin(observations(np.random.default_rng(0), N_ENVS))
+    buffer.priorities.largest = 3.0
+    replay = device_replay(N_ENVS, priorities=buffer.priorities.config)
+    on_device = uploaded(replay, ring)._replace(priorities=device_priorities.uploaded(buffer.priorities, [], 1, BATCH))
+
+    @jax.jit
+    def write(on_device: Any, step: Any, kept: Any) -> Any:
+        action, reward, terminated, next_obs, ended, first = step
+        on_device = replay.add(on_device, action, reward, terminated, next_obs, kept)
+        return replay.begin(on_device, first, ended)
+
+    for i, (action, reward, terminated, next_obs, ended, first) in enumerate(steps(N_ENVS, n)):
+        kept = np.arange(N_ENVS) < (2 if i % 7 == 0 else N_ENVS)
+        ended = ended | ~kept
+        on_device = write(on_device, (action, reward, terminated, next_obs, ended, first), kept)
+        buffer.add(action, reward, terminated, next_obs, np.flatnonzero(kept))
+        if ended.any():
+            buffer.begin(first, np.flatnonzero(ended))
+        values = buffer.priorities.tree[np.arange(ROWS * N_ENVS)]
+        np.testing.assert_array_equal(on_device.priorities.values[: len(values)], values)
+        assert int(on_device.priorities.count) == len(ring)
+    np.testing.assert_allclose(on_device.priorities.sums.sum(), buffer.priorities.tree.total)
 
 
 @pytest.mark.parametrize("n", [5, 60])

@@ -18,6 +18,7 @@ from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.envs.functional.vector import JaxVector
 from rejeu.loops.device import memory
 from rejeu.loops.device.driver import MAX_TURNS, Stops
+from rejeu.loops.device.off_policy import most_updates
 from rejeu.loops.run import Progress
 from rejeu.loops.training_call import TrainingCall
 
@@ -90,8 +91,8 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
         return f"the replay buffer {type(buffer).__name__} is your own"
     if strategy is not None and strategy not in STRATEGIES:
         return "goal_selection_strategy is a function of your own"
-    if config.priorities is not None:
-        return "prioritized replay exists on the host only"
+    if config.priorities is not None and most_updates(config, buffer.ring.n_envs) is None:
+        return "priorities with gradient_steps=-1 after whole episodes exist on the host only"
     if config.frame_stack is not None:
         return "frame_stack exists on the host only"
     if buffer.ring.rows < 3:

@@ -6,7 +6,7 @@ then writes one number instead of one into each of its rows.
 
 Batches are those that :class:`~rejeu.buffers.uniform.ReplayBuffer` and :class:`~rejeu.buffers.hindsight.HerReplayBuffer`
 return for the same content and the same random numbers, bit for bit. Only the sums of n-step returns may differ in their
-last bit, because the host adds them up in 64 bits.
+last bit, because the host adds them up in 64 bits; for priorities see :mod:`rejeu.buffers.device_priorities`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from rejeu import schedules
+from rejeu.buffers import device_priorities
+from rejeu.buffers.device_priorities import DevicePriorities
+from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.buffers.uniform import bootstrap_discount
 from rejeu.core import PyTree, Transition
@@ -52,6 +56,8 @@ class DeviceRing(NamedTuple):
     """Absolute time of each environment's newest row, ``int32 (n_envs,)``."""
     n_begun: Array
     """Number of episodes that each environment has begun, ``int32 (n_envs,)``."""
+    priorities: DevicePriorities | None = None
+    """None if steps are drawn uniformly."""
 
 
 class DeviceRows(NamedTuple):
@@ -81,6 +87,10 @@ class DeviceReplay:
     achieved: int = 0
     """Index of the leaf of the achieved goal."""
     desired: int = 0
+    priorities: PriorityConfig | None = None
+    """None to draw steps uniformly."""
+    most_updates: int = 1
+    """Gradient steps of a turn at most; needed for priorities."""
 
     def positions(self, env: Array, time: Array) -> Array:
         """Returns the positions of rows given by environment and absolute time."""
@@ -98,7 +108,12 @@ class DeviceReplay:
             reward=put(ring.reward, index, reward),
             kind=put(ring.kind, index, kind),
         )
-        return self._advance(ring, next_obs, kept)
+        ring = self._advance(ring, next_obs, kept)
+        if ring.priorities is None:
+            return ring
+        following = jnp.where(kept, self.positions(envs, ring.head), device_priorities.NOWHERE)
+        index = jnp.where(kept, index, device_priorities.NOWHERE)
+        return ring._replace(priorities=device_priorities.add(ring.priorities, index, following))
 
     def begin(self, ring: DeviceRing, obs: PyTree, which: Array) -> DeviceRing:
         """Returns the ring after episodes began with ``obs`` in the environments ``which``; see :meth:`Ring.begin`.
@@ -115,7 +130,11 @@ class DeviceReplay:
             ends = put(put(ring.ends, old, ring.head), new, jnp.full(self.n_envs, RUNNING, jnp.int32))
             ring = ring._replace(ends=ends, begins=put(ring.begins, new, ring.head + 1))
         ring = ring._replace(n_begun=ring.n_begun + which.astype(jnp.int32))
-        return self._advance(ring, obs, which)
+        ring = self._advance(ring, obs, which)
+        if ring.priorities is None:
+            return ring
+        index = jnp.where(which, self.positions(envs, ring.head), device_priorities.NOWHERE)
+        return ring._replace(priorities=device_priorities.changed(ring.priorities, index, jnp.zeros(self.n_envs)))
 
     def _advance(self, ring: DeviceRing, obs: PyTree, which: Array) -> DeviceRing:
         """Returns the ring with a further row for the observations of the environments ``which``."""
@@ -133,6 +152,24 @@ class DeviceReplay:
     def oldest(self, ring: DeviceRing) -> Array:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
         return jnp.maximum(ring.head - self.rows + 1, 0)
+
+    def draw_by_priority(self, ring: DeviceRing, key: Array, progress: Array | float) -> tuple[DeviceRows, Array]:
+        """Returns the steps of a batch drawn by priority, and their importance weights, ``float32 (batch_size,)``."""
+        assert ring.priorities is not None
+        assert self.priorities is not None
+        beta = schedules.at(self.priorities.beta, progress)
+        position, weight = device_priorities.draw(ring.priorities, key, self.batch_size, beta)
+        env = position // self.rows
+        head = ring.head[env]
+        return DeviceRows(env, head - (head - position % self.rows) % self.rows, position), weight
+
+    def update_priorities(self, ring: DeviceRing, n_pending: Array) -> DeviceRing:
+        """Returns the ring after the first ``n_pending`` of the gradient steps that are pending set their priorities."""
+        if ring.priorities is None:
+            return ring
+        assert self.priorities is not None
+        after = device_priorities.updated(ring.priorities, self.priorities, self.rows, ring.head, n_pending)
+        return ring._replace(priorities=after)
 
     def draw_rows(self, ring: DeviceRing, key: Array, n: int) -> DeviceRows:
         """Returns ``n`` steps drawn uniformly, with replacement; rows that are ``LAST`` are drawn again.
@@ -166,24 +203,34 @@ class DeviceReplay:
         return DeviceRows(env, time, self.positions(env, time))
 
     def draw(
-        self, ring: DeviceRing, key: Array, reward: GoalFunction | None = None, terminated: GoalFunction | None = None
-    ) -> Transition:
-        """Returns a batch of transitions.
+        self,
+        ring: DeviceRing,
+        key: Array,
+        progress: Array | float = 1.0,
+        reward: GoalFunction | None = None,
+        terminated: GoalFunction | None = None,
+    ) -> tuple[Transition, DeviceRows]:
+        """Returns a batch of transitions, and its rows.
 
         Args:
             ring: the rows. Some environment must have taken a step.
             key: of the random numbers.
+            progress: the schedule's progress for importance weights.
             reward: the reward of achieved and desired goals, for hindsight.
             terminated: whether they end the episode; None if relabeled steps keep their own flags.
         """
         rows_key, goals_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
-        rows = self.draw_rows(ring, rows_key, self.batch_size)
+        if self.priorities is None:
+            rows, weight = self.draw_rows(ring, rows_key, self.batch_size), None
+        else:
+            rows, weight = self.draw_by_priority(ring, rows_key, progress)
         if self.strategy is None:
-            return self.batch(ring, rows)
+            return self.batch(ring, rows)._replace(weight=weight), rows
         assert reward is not None
         n = self.n_relabeled
         goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
-        return self.relabeled(ring, rows, ring.obs[self.achieved][goal_rows], reward, terminated)
+        goal = ring.obs[self.achieved][goal_rows]
+        return self.relabeled(ring, rows, goal, reward, terminated)._replace(weight=weight), rows
 
     @property
     def n_relabeled(self) -> int:

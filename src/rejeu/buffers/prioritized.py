@@ -150,6 +150,11 @@ class Priorities:
                 self.tree.set(index[kept], priority[kept])
             self.largest = max(self.largest, float(priority.max(where=finite, initial=0.0)))
 
+    def load(self, values: np.ndarray, largest: float) -> None:
+        """Replaces all priorities by others, ``(rows * n_envs,)``, such as those that a loop on the device left."""
+        self.tree.fill(values)
+        self.largest = largest
+
     def state(self) -> dict[str, Any]:
         """Returns the state for :meth:`restore`."""
         n = self.ring.rows * self.ring.n_envs

@@ -94,15 +94,10 @@ class Learner:
         after, metrics = step(before, batches) if is_one else jax.lax.scan(step, before, batches)
         # Without the barrier XLA would compute the optimizer's step once more for the check.
         state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack)(after))
-        td_error = metrics.pop(TD_ERROR, None)
-        is_weighted = isinstance(batches, Transition) and batches.weight is not None
-        if is_weighted and (td_error is None or td_error.shape != batches.reward.shape):
-            raise ValueError(
-                "prioritized replay needs the absolute TD error of each transition: return it from update among the metrics, "
-                f"as TD_ERROR of shape (batch,); it returned {'none' if td_error is None else td_error.shape}"
-            )
+        td_error = td_error_of(metrics, batches)
+        metrics.pop(TD_ERROR, None)
         vectors = state[: len(self.packing.groups)]  # large arrays are checked by the monitor
-        return state, nonfinite.readings(vectors, metrics), td_error if is_weighted else None
+        return state, nonfinite.readings(vectors, metrics), td_error
 
     def _init(self, key: Array) -> PackedState:
         """Returns the state before learning."""
@@ -152,6 +147,23 @@ class Learner:
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""
         return self.explorer.init(self.algorithm.actor(self.shapes), n_envs)
+
+
+def td_error_of(metrics: Metrics, batches: Transition | Rollout) -> Array | None:
+    """Returns the absolute TD errors of an update, shaped like the rewards; None if the batches have no importance weights.
+
+    Raises:
+        ValueError: if there are none for batches with importance weights; runs while tracing.
+    """
+    if not isinstance(batches, Transition) or batches.weight is None:
+        return None
+    td_error = metrics.get(TD_ERROR)
+    if td_error is None or td_error.shape != batches.reward.shape:
+        raise ValueError(
+            "prioritized replay needs the absolute TD error of each transition: return it from update among the metrics, "
+            f"as TD_ERROR of shape (batch,); it returned {'none' if td_error is None else td_error.shape}"
+        )
+    return td_error
 
 
 def is_finite(state: PackedState) -> bool:

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rejeu.buffers.device_priorities import order
 from rejeu.buffers.hindsight import HerReplayBuffer
+from rejeu.buffers.prioritized import Draw
 from rejeu.loops.device.actions import random_action
 from rejeu.loops.device.off_policy import draws
 from rejeu.loops.run import Run
@@ -44,6 +46,11 @@ class SameDraws:
         size = self.sizes[self.part]
         return np.asarray(jax.random.bits(key, (size,), jnp.uint32), np.float64)[:n] / 2.0**32
 
+    def shuffle(self, index: np.ndarray) -> None:
+        """Shuffles the steps of a batch that were drawn by priority."""
+        key = jax.random.fold_in(jax.random.fold_in(self._root(), self.batches), 0)
+        index[:] = index[np.asarray(order(key, len(index)))]
+
     def begin_batch(self, n: int, n_goals: int) -> None:
         """Says that the rows of a batch follow."""
         if self.step != self.run.step:
@@ -71,8 +78,11 @@ def use_same_draws(run: Run) -> None:
 
     def announced_draw(rng: Any, shape: tuple[int, ...], progress: float = 1.0) -> Any:
         if len(shape) > 1:  # the device draws one batch after the other
-            batches = [announced_draw(rng, shape[1:], progress)[0] for _ in range(shape[0])]
-            return jax.tree.map(lambda *leaves: np.stack(leaves), *batches), None
+            batches, drawn = zip(*(announced_draw(rng, shape[1:], progress) for _ in range(shape[0])), strict=True)
+            if drawn[0] is not None:
+                position, time = (np.concatenate(parts) for parts in zip(*(one[:2] for one in drawn), strict=True))
+                drawn = (Draw(position, time, drawn[0].version),)
+            return jax.tree.map(lambda *leaves: np.stack(leaves), *batches), drawn[0]
         k = buffer.config.n_sampled_goal if isinstance(buffer, HerReplayBuffer) else 0
         rng.begin_batch(shape[0], int(shape[0] * k / (k + 1)))
         return draw(rng, shape, progress)

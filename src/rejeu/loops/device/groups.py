@@ -16,14 +16,12 @@ class Groups:
     def __init__(self, machines: Sequence[Machine], size: int, active: Sequence[int]) -> None:
         """Takes the machine of each group of ``size`` runs, and the indices of the runs that are trained, which may change."""
         self.machines, self.size, self.active = machines, size, active
-        self.runs: Sequence[Run] = ()
         self.capacity = machines[0].capacity
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
         return self.machines[0].uses_part(run, n_turns, last)
 
     def push(self, runs: Sequence[Run], leader: Run, progress: float) -> None:
-        self.runs = runs
         for i, machine in enumerate(self.machines):
             machine.push(runs[i * self.size : (i + 1) * self.size], leader, progress)
 
@@ -41,6 +39,5 @@ class Groups:
     def pull(self, which: int, run: Run) -> Progress:
         return self.machines[which // self.size].pull(which % self.size, run)
 
-    def raise_fault(self, run: Run, limits: Limits) -> NoReturn:
-        which = [one is run for one in self.runs].index(True)
-        self.machines[which // self.size].raise_fault(run, limits)
+    def raise_fault(self, which: int, run: Run, limits: Limits) -> NoReturn:
+        self.machines[which // self.size].raise_fault(which % self.size, run, limits)

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.device import DeviceReplay, DeviceRing
+from rejeu.buffers.device import DeviceReplay, DeviceRing, DeviceRows
+from rejeu.buffers.device_priorities import Pending, noted
 from rejeu.core import Algorithm, Clock, Explorer, Metrics, PyTree, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
 from rejeu.loops.device.actions import random_action
@@ -50,6 +51,8 @@ class Counts(NamedTuple):
     """See :attr:`rejeu.loops.run.Run.owed`, ``int32[]``."""
     since_update: Array
     """Environment steps since the last update, ``int32[]``."""
+    pending: Array
+    """Gradient steps of the last turn, whose TD errors set priorities in the next, ``int32[]``."""
 
 
 class Carry(NamedTuple):
@@ -110,7 +113,8 @@ class OffPolicyProgram:
 
         def update(state: PyTree, ring: DeviceRing, key: Array) -> tuple[PyTree, Metrics]:
             clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
-            return program.algorithm.update(state, draw(program.replay, env, ring, nth(key, jnp.uint32(0))), clock)
+            batch, _ = draw(program.replay, env, ring, nth(key, jnp.uint32(0)), clock.progress)
+            return program.algorithm.update(state, batch, clock)
 
         learned = nothing_learned(update, state, carry.in_a_row, ring, carry.key)
         loop = Loop(carry, ring, learned, no_outcome(carry.players, carry.action))
@@ -145,18 +149,27 @@ def turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limi
     n_ended = (players.episode - carry.players.episode).astype(jnp.int32)
     n, counts = due(config, carry.counts, jnp.sum(kept, dtype=jnp.int32), n_ended, limits.learn_from)
     clock = Clock(counts.step, players.episode, limits.progress[i + 1])
+    n_pending = jnp.where(n <= limits.most_updates, carry.counts.pending, 0)
     carry = carry._replace(players=players, counts=counts)
     root = draws(carry.key, clock.step)
 
-    def one(u: Array, learned: Learned) -> Learned:
-        batch = draw(replay, env, ring, jax.random.fold_in(root, u + 1))
-        return learn(algorithm, learned, batch, clock, program.skips)
+    def one(u: Array, passed: tuple[Learned, Pending | None]) -> tuple[Learned, Pending | None]:
+        learned, pending = passed
+        batch, rows = draw(replay, env, ring, jax.random.fold_in(root, u + 1), clock.progress)
+        learned, td_error = learn(algorithm, learned, batch, clock, program.skips)
+        if pending is not None and td_error is not None:
+            pending = noted(pending, u, rows.position, rows.time, td_error)
+        return learned, pending
 
     if config.overlap:
         carry = choose(program, env, carry, learned.state, clock)
-    learned = jax.lax.fori_loop(0, jnp.minimum(n, limits.most_updates), one, learned)
+    pending = None if ring.priorities is None else ring.priorities.pending
+    learned, pending = jax.lax.fori_loop(0, jnp.minimum(n, limits.most_updates), one, (learned, pending))
     if not config.overlap:
         carry = choose(program, env, carry, learned.state, clock)
+    ring = replay.update_priorities(ring, n_pending)  # all batches of the turn have been drawn
+    if pending is not None and ring.priorities is not None:
+        ring = ring._replace(priorities=ring.priorities._replace(pending=pending))
     return Loop(carry, ring, learned, outcome)
 
 
@@ -185,14 +198,17 @@ def choose(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, state: P
     return carry._replace(action=action, explorer=explorer)
 
 
-def draw(replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array) -> Transition:
-    """Returns a batch; with hindsight, the rewards of new goals are those of ``env``."""
+def draw(
+    replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array, progress: Array
+) -> tuple[Transition, DeviceRows]:
+    """Returns a batch and its rows; with hindsight, the rewards of new goals are those of ``env``."""
     if replay.strategy is None:
-        return replay.draw(ring, key)
+        return replay.draw(ring, key, progress)
     assert isinstance(env, GoalEnv)
     goal = ring.obs[replay.achieved][:1]
     judges = jax.eval_shape(env.compute_terminated, goal, goal) is not None
-    return replay.draw(ring, key, env.compute_reward, env.compute_terminated if judges else None)  # type: ignore[arg-type]
+    terminated: Any = env.compute_terminated if judges else None
+    return replay.draw(ring, key, progress, env.compute_reward, terminated)
 
 
 def due(config: OffPolicyConfig, counts: Counts, taken: Array, ended: Array, learn_from: Array) -> tuple[Array, Counts]:
@@ -208,4 +224,16 @@ def due(config: OffPolicyConfig, counts: Counts, taken: Array, ended: Array, lea
     times, owed = jnp.divmod(owed, every)
     n = since if config.gradient_steps == -1 else times * config.gradient_steps
     n = jnp.where(times > 0, n, 0)
-    return n, Counts(step, owed, jnp.where(times > 0, 0, since))
+    return n, Counts(step, owed, jnp.where(times > 0, 0, since), n)
+
+
+def most_updates(config: OffPolicyConfig, n_envs: int) -> int | None:
+    """Returns the largest number of gradient steps of a turn; None if it depends on the length of episodes.
+
+    >>> most_updates(OffPolicyConfig(train_freq=4, gradient_steps=2), n_envs=10)
+    6
+    """
+    every = config.train_freq if isinstance(config.train_freq, int) else config.train_freq[0]
+    if config.gradient_steps != -1:
+        return (every - 1 + n_envs) // every * config.gradient_steps
+    return every - 1 + n_envs if isinstance(config.train_freq, int) else None

@@ -14,12 +14,15 @@ from jax.sharding import Mesh
 
 from rejeu import spaces
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.buffers import device_priorities
 from rejeu.buffers.device import DeviceReplay, DeviceRing, uploaded, written
+from rejeu.buffers.device_priorities import DevicePriorities
+from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.loops.device.driver import Stops, capacity_of
 from rejeu.loops.device.machine import Machine
-from rejeu.loops.device.off_policy import Carry, Counts, OffPolicyProgram, choose, draw, draws
+from rejeu.loops.device.off_policy import Carry, Counts, OffPolicyProgram, choose, draw, draws, most_updates
 from rejeu.loops.device.sharing import over_runs
 from rejeu.loops.device.transfer import copies, players_of, rounded_up, unstacked
 from rejeu.loops.device.variants import Variants
@@ -75,7 +78,12 @@ class OffPolicyMachine(Machine):
             explorer=jax.tree.map(jnp.asarray, run.carry),
             action=jnp.array(action),
             players=players_of(run),
-            counts=Counts(jnp.uint32(run.step), jnp.int32(run.owed), jnp.int32(run.steps_since_update)),
+            counts=Counts(
+                jnp.uint32(run.step),
+                jnp.int32(run.owed),
+                jnp.int32(run.steps_since_update),
+                jnp.int32(sum(len(draw.position) for draw, _ in run.td_errors) // self.program.replay.batch_size),
+            ),
             in_a_row=jnp.int32(0),
             hyper={name: jnp.float32(value) for name, value in self.hyper.get(id(run), {}).items()},
         )
@@ -86,9 +94,21 @@ class OffPolicyMachine(Machine):
 
     def begin(self, runs: Sequence[Run]) -> None:
         self.heads = np.stack([run.replay.ring.head for run in runs])
+        replay = self.program.replay
+        for run in runs:
+            version = run.replay.ring.version
+            run.td_errors = [(draw, td_error) for draw, td_error in run.td_errors if draw.version == version]
+            if not device_priorities.fit(run.td_errors, replay.most_updates, replay.batch_size):
+                run.replay.update_priorities(run.td_errors)
+                run.td_errors = []
 
     def store_of(self, run: Run) -> DeviceRing:
-        return uploaded(self.program.replay, run.replay.ring)
+        replay, buffer = self.program.replay, run.replay
+        ring = uploaded(replay, buffer.ring)
+        if buffer.priorities is None:
+            return ring
+        sizes = (replay.most_updates, replay.batch_size)
+        return ring._replace(priorities=device_priorities.uploaded(buffer.priorities, run.td_errors, *sizes))
 
     def fetch(self, carries: Sequence[Any]) -> list[Any]:
         heads = np.asarray(self.store.head).astype(np.int64).reshape(self.n, -1)
@@ -99,16 +119,32 @@ class OffPolicyMachine(Machine):
         else:
             rows = rows_from(self.program.replay, self.store, first[0], size)
         self.heads = heads
-        return list(zip(heads, unstacked(jax.device_get(rows), self.n), strict=True))
+        priorities: list[Any] = [None] * self.n
+        if self.store.priorities is not None:
+            priorities = unstacked(jax.device_get(self.store.priorities._replace(sums=None)), self.n)
+        return list(zip(heads, unstacked(jax.device_get(rows), self.n), priorities, strict=True))
 
     def put(self, run: Run, carry: Any, experience: Any) -> None:
         run.action = np.array(carry.action)
         run.owed, run.steps_since_update = int(carry.counts.owed), int(carry.counts.since_update)
-        run.replay.ring.write(*experience)
+        head, rows, priorities = experience
+        run.replay.ring.write(head, rows)
+        if priorities is not None:
+            put_priorities(run, priorities, int(carry.counts.pending))
 
     def batch(self, run: Run, clock: Clock, number: int) -> Transition:
-        batch = drawn(self.program.replay, self.env, self.store, self.carry.key, clock.step, np.uint32(number + 1))
-        return copies(batch)
+        return copies(drawn(self.program.replay, self.env, self.store, self.carry.key, clock, np.uint32(number + 1)))
+
+
+def put_priorities(run: Run, priorities: DevicePriorities, n_pending: int) -> None:
+    """Puts priorities on the host, and the gradient steps that are pending, into a run."""
+    ring, pending = run.replay.ring, priorities.pending
+    n = ring.rows * ring.n_envs
+    run.replay.priorities.load(np.asarray(priorities.values[:n], np.float64), float(priorities.largest))
+    run.td_errors = [
+        (Draw(position.astype(np.int64), time.astype(np.int64), ring.version), jnp.array(td_error))
+        for position, time, td_error in zip(*(part[:n_pending] for part in pending), strict=True)
+    ]
 
 
 @eqx.filter_jit
@@ -121,10 +157,10 @@ def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, pr
 
 @eqx.filter_jit
 def drawn(
-    replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array, step: Array, number: Any
+    replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array, clock: Clock, number: Any
 ) -> Transition:
     """Returns the batch of a gradient step of a turn."""
-    return draw(replay, env, ring, jax.random.fold_in(draws(key, step), number))
+    return draw(replay, env, ring, jax.random.fold_in(draws(key, clock.step), number), clock.progress)[0]
 
 
 @eqx.filter_jit
@@ -159,4 +195,6 @@ def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:
         config.n_steps,
         buffer.each_reward,
         **goals,
+        priorities=config.priorities,
+        most_updates=1 if config.priorities is None else most_updates(config, ring.n_envs) or 1,
     )

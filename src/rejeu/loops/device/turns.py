@@ -18,6 +18,7 @@ from rejeu.loops import nonfinite
 from rejeu.loops.device.actions import scale
 
 NO_LIMIT = 2**32 - 1
+from rejeu.loops.learner import td_error_of
 """Stands for no last step; steps are counted in ``uint32``."""
 
 
@@ -117,18 +118,26 @@ class Learned(NamedTuple):
     """How many of the newest updates were not finite, ``int32[]``."""
 
 
-def learn(algorithm: Algorithm, learned: Learned, batch: Transition | Rollout, clock: Clock, skips: bool) -> Learned:
-    """Returns what is learned from a batch; with ``skips``, an update that leaves NaN is undone."""
+def learn(
+    algorithm: Algorithm, learned: Learned, batch: Transition | Rollout, clock: Clock, skips: bool
+) -> tuple[Learned, Array | None]:
+    """Returns what is learned from a batch, and the TD errors if the batch has importance weights.
+
+    With ``skips``, an update that leaves NaN is undone, and its TD errors are NaN.
+    """
     after, found = algorithm.update(learned.state, batch, clock)
     found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
     n = found["gradient_steps"].astype(jnp.int32) if "gradient_steps" in found else 1
+    td_error = td_error_of(found, batch)
     if skips:
         after, found = nonfinite.undo(learned.state, after, found)
         is_bad = ~found.pop(nonfinite.FINITE)
     else:
         is_bad = ~nonfinite.check((), found)
-    in_a_row = jnp.where(is_bad, learned.in_a_row + 1, 0)
-    return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row)
+        td_error = None if td_error is None else jnp.where(is_bad, jnp.nan, td_error)
+    is_over = learned.in_a_row >= nonfinite.MAX_SKIPPED  # the turns after it, in the same chunk, do not count
+    in_a_row = jnp.where(is_bad | is_over, learned.in_a_row + ~is_over, 0)
+    return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
 
 
 def nothing_learned(
