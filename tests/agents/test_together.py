@@ -10,7 +10,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Evaluate
-from tests.jax_environments import Reach
+from tests.jax_environments import Forbidden, Reach
 from tests.sharing import shared_learners
 
 SMALL: dict[str, Any] = {
@@ -43,6 +43,8 @@ def train_alone(kind: Any, env: Any, n_steps: int, n_envs: int, seed: int, setti
     [
         (rejeu.DQN, "jax/CartPole-v1", SMALL, {"learning_rate": [1e-4, 1e-3]}),
         pytest.param(rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}, marks=pytest.mark.exhaustive),
+        pytest.param(rejeu.MaskablePPO, Forbidden(), ON_POLICY, {}, marks=pytest.mark.exhaustive),
+        pytest.param(rejeu.DQN, "jax/CartPole-v1", {**SMALL, "priorities": {}}, {}, marks=pytest.mark.exhaustive),
         (rejeu.DQN, "CartPole-v1", {**SMALL, "priorities": {}}, {}),
         pytest.param(rejeu.TD3, "Pendulum-v1", {**SMALL, "normalize": True, "action_noise": 0.1, "overlap": False}, {},
                      marks=pytest.mark.exhaustive),
@@ -96,6 +98,7 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: s
     [
         ("CartPole-v1", {"learning_rate": [1e-3, 1e-4]}, "in JAX environments only"),
         ("CartPole-v1", {"train_freq": [1, "episode"]}, "updates depend on episodes"),
+        ("jax/CartPole-v1", {"train_freq": (1, "episode")}, "updates depend on episodes"),
         ("jax/CartPole-v1", {"gamma": [0.9, 0.99]}, "gamma cannot differ"),
         ("jax/CartPole-v1", {"batch_size": [8, 16]}, "batch_size cannot differ"),
     ],
@@ -105,7 +108,6 @@ def test_what_cannot_be_one_program_is_refused(env: str, settings: dict[str, Any
         rejeu.train_seeds(rejeu.DQN, "MlpPolicy", env, 60, seeds=2, **{**SMALL, **settings})
 
 
-@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("env", "seeds", "message"),
     [
@@ -127,6 +129,7 @@ def test_environments_that_would_be_shared_and_wrong_seeds_are_refused(env: Any,
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.exhaustive
 def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
     def callbacks(agent: Any) -> list[Any]:
         agent.report_folder = tmp_path / str(agent.config.learning_rate)

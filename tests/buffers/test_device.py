@@ -175,7 +175,7 @@ def test_priorities_of_new_steps_equal_those_of_the_host(n: int) -> None:
             buffer.begin(first, np.flatnonzero(ended))
         values = buffer.priorities.tree[np.arange(ROWS * N_ENVS)]
         np.testing.assert_array_equal(on_device.priorities.values[: len(values)], values)
-        assert int(on_device.priorities.count) == len(ring)
+        assert int(on_device.priorities.n_steps) == len(ring)
     np.testing.assert_allclose(on_device.priorities.sums.sum(), buffer.priorities.tree.total)
 
 

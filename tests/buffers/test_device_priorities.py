@@ -78,7 +78,7 @@ def test_changes_keep_the_sums_that_the_priorities_have() -> None:
         padded[: len(index)] = index
         priorities = change(priorities, jnp.asarray(padded), jnp.asarray(np.resize(new, 60)))
     np.testing.assert_array_equal(priorities.values[:n], values)
-    assert int(priorities.count) == np.count_nonzero(values)
+    assert int(priorities.n_steps) == np.count_nonzero(values)
     blocks = np.pad(values, (0, -n % WIDTH)).reshape(-1, WIDTH)
     np.testing.assert_array_equal(priorities.sums[: len(blocks)], added_up(blocks))  # bit for bit
     assert not priorities.sums[len(blocks) :].any()

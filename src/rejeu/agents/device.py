@@ -15,7 +15,7 @@ from rejeu.buffers.device import STRATEGIES
 from rejeu.buffers.hindsight import HerReplayBuffer
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
-from rejeu.envs.functional.vector import JaxVector
+from rejeu.envs.masks import functional_vector
 from rejeu.loops.device import memory
 from rejeu.loops.device.driver import MAX_TURNS, Stops
 from rejeu.loops.device.off_policy import most_updates
@@ -38,7 +38,7 @@ def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[Any]) -> 
         raise ValueError(
             f"on_device=True is not possible: {reason}; leave it at None to train with the loop of the host"
         )
-    if isinstance(agent.run.env, JaxVector):
+    if functional_vector(agent.run.env) is not None:
         warnings.warn(
             f"{agent.run.env.env_id} trains with the loop of the host, which is slower than one on the device: {reason}; "
             "set agent.on_device = False to say that this is intended",
@@ -67,14 +67,12 @@ def stops_at(call: TrainingCall, callbacks: Sequence[Any]) -> Stops:
 def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
     """Returns why an agent cannot train on the device, None if it can."""
     run, config = agent.run, agent.config
-    if not isinstance(run.env, JaxVector):
+    if functional_vector(run.env) is None:
         return f"the backend of {run.env.env_id} is {run.env.backend!r}, not 'jax'"
     if reason := reason_against_callbacks(callbacks):
         return reason
     if isinstance(config, OffPolicyConfig):
         return reason_against_replay(run.replay, config)
-    if agent.takes_masks:
-        return "action masks exist on the host only"
     return None if config.n_episodes is None else "rollouts of n_episodes whole episodes exist on the host only"
 
 

@@ -175,7 +175,7 @@ def sibling(agent: A, env: Any, seed: int) -> A:
     other.made_from_id = agent.made_from_id
     other.observation_space, other.action_space = agent.observation_space, agent.action_space
     other.obs_leaves, other.learner = agent.obs_leaves, agent.learner
-    other.start_run(env)
+    other.start_run(other.make_envs(env, seed=seed))
     return other
 
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu import schedules
 from rejeu.buffers.prioritized import Draw, Priorities, PriorityConfig
 
 WIDTH = 128
@@ -47,7 +46,7 @@ class DevicePriorities(NamedTuple):
     """The priorities by position, ``float32``, padded to whole blocks; 0 of rows that cannot be drawn."""
     sums: Array
     """The sum of each block, ``float32``, padded to whole groups."""
-    count: Array
+    n_steps: Array
     """Number of steps that can be drawn, ``int32[]``."""
     largest: Array
     """Largest priority so far, and the priority of new steps, ``float32[]``."""
@@ -73,7 +72,7 @@ def changed(priorities: DevicePriorities, index: Array, value: Array) -> DeviceP
     return priorities._replace(
         values=values,
         sums=priorities.sums.at[block].set(sums, mode="drop"),  # of repeated blocks all sums are equal
-        count=priorities.count + jnp.sum(more),
+        n_steps=priorities.n_steps + jnp.sum(more),
     )
 
 
@@ -94,7 +93,7 @@ def draw(priorities: DevicePriorities, key: Array, n: int, beta: Array | float) 
     bits = jax.random.bits(jax.random.fold_in(key, 0), (n,), jnp.uint32)
     index, total = find(priorities, (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-24))
     index = index[order(key, n)]
-    weight = (priorities.count.astype(jnp.float32) * (priorities.values[index] / total)) ** -beta
+    weight = (priorities.n_steps.astype(jnp.float32) * (priorities.values[index] / total)) ** -beta
     return index, weight / jnp.max(weight)
 
 
@@ -185,7 +184,7 @@ def uploaded(
     for draw, td_error in td_errors:
         size = len(draw.position)
         for array, part in zip(pending, (draw.position, draw.time, np.asarray(td_error)), strict=True):
-            array.reshape(-1)[first : first + size] = part.reshape(-1)  # type: ignore[attr-defined]
+            array.reshape(-1)[first : first + size] = part.reshape(-1)
         first += size
     largest = np.clip(np.float32(priorities.largest), LEAST, MOST)
     host = DevicePriorities(values, sums, np.int32(np.count_nonzero(values)), largest, pending)  # type: ignore[arg-type]

@@ -86,10 +86,8 @@ def on_policy(
             run.state, run.metrics, _ = learner.update(run.state, batch, clock)
             run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics, n_updates=run.n_updates)
             n_updates: float = config.gradient_steps(rollout.size())
-            if config.stops_early:
-                n_updates = np.nan_to_num(
-                    run.metrics["gradient_steps"], nan=n_updates
-                )  # NaN of an update that was undone
+            if config.stops_early:  # NaN of an update that was undone
+                n_updates = float(np.nan_to_num(run.metrics["gradient_steps"], nan=n_updates))
             run.n_updates += int(n_updates)
             begin(run, config)
         timer.lap("update")

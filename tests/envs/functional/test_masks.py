@@ -2,52 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 import rejeu
 from rejeu.core import Masked
-from rejeu.envs.functional import FunctionalEnv
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.masks import make_masked
 from rejeu.errors import BadEnvironmentError
-
-
-class State(NamedTuple):
-    allowed: jax.Array
-    time: jax.Array
-
-
-class Forbidden(FunctionalEnv):
-    """All actions but one are allowed, which changes; the reward is -1 for the one that is not."""
-
-    max_episode_steps: int | None = eqx.field(static=True, default=10)
-
-    @property
-    def observation_space(self):
-        return spaces.Box(-1, 1, (2,), np.float32)
-
-    @property
-    def action_space(self):
-        return spaces.Discrete(3)
-
-    def reset(self, key):
-        state = State(jnp.array([True, True, False]), jnp.zeros((), jnp.int32))
-        return state, jnp.zeros(2)
-
-    def step(self, key, state, action):
-        after = State(jnp.roll(state.allowed, 1), state.time + 1)
-        reward = jnp.where(state.allowed[action], 0.0, -1.0)
-        return after, jnp.zeros(2), reward, jnp.zeros((), bool), after.time >= self.max_episode_steps
-
-    def action_mask(self, state):
-        return state.allowed
+from tests.jax_environments import Forbidden
 
 
 def test_masks_are_passed_with_the_observations():
@@ -62,10 +25,11 @@ def test_masks_are_passed_with_the_observations():
     assert vector.reset_done(np.array([True, False])).mask[0].tolist() == [True, True, False]
 
 
-def test_maskable_ppo_never_takes_a_forbidden_action():
+@pytest.mark.parametrize("on_device", [True, False])
+def test_maskable_ppo_never_takes_a_forbidden_action(on_device):
     vector = rejeu.make_vector(Forbidden(), 2, seed=0)
     agent = rejeu.MaskablePPO("MlpPolicy", vector, n_steps=16, policy_kwargs={"net_arch": [8]}, seed=0)
-    agent.on_device = False
+    agent.on_device = on_device
     agent.learn(96)
     assert agent.num_timesteps == 96
     assert set(agent.history["return"]) == {0.0}

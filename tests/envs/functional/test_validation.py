@@ -9,7 +9,6 @@ from typing import Any
 
 import equinox as eqx
 import gymnasium as gym
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -195,7 +194,9 @@ class NearlyReach(Walk):
 
 
 def test_a_reward_function_of_an_environment_without_goals_is_named():
-    with pytest.raises(BadEnvironmentError, match="NearlyReach has compute_reward, but does not derive from .*GoalEnv"):
+    with pytest.raises(
+        BadEnvironmentError, match=r"NearlyReach has compute_reward, but does not derive from .*GoalEnv"
+    ):
         rejeu.make_vector(NearlyReach())
 
 

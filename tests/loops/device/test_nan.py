@@ -75,8 +75,8 @@ def assert_same_errors(device: Any, host: Any, folder: Path) -> str:
         (rejeu.DDPG, Undefined(), HINDSIGHT, "the batch held reward .nan.*compute_reward"),
         pytest.param(rejeu.DDPG, Undefined(), {**HINDSIGHT, "n_steps": 2}, "the batch held reward .nan",
                      marks=pytest.mark.exhaustive),
-        pytest.param(rejeu.DQN, "jax/CartPole-v1", {**HUGE, "nonfinite": "skip", "train_freq": 1}, "100 updates in a row were skipped",
-                     marks=pytest.mark.exhaustive),
+        pytest.param(rejeu.DQN, "jax/CartPole-v1", {**HUGE, "nonfinite": "skip", "train_freq": 1},
+                     "100 updates in a row were skipped", marks=pytest.mark.exhaustive),
     ],
 )  # fmt: skip
 def test_nan_of_an_update_is_reported_as_on_the_host(

@@ -11,14 +11,16 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu import spaces
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Rollout, Transition
+from rejeu.core import TD_ERROR, Algorithm, Clock, Masked, Metrics, PyTree, Rollout, Transition
+from rejeu.envs.functional.masks import MaskInObservation
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
+from rejeu.envs.masks import masked
 from rejeu.loops import nonfinite
 from rejeu.loops.device.actions import scale
+from rejeu.loops.learner import td_error_of
 
 NO_LIMIT = 2**32 - 1
-from rejeu.loops.learner import td_error_of
 """Stands for no last step; steps are counted in ``uint32``."""
 
 
@@ -83,11 +85,11 @@ class Outcome(NamedTuple):
     truncated: Array
     kept: Array
     """Which of the steps count, ``bool (n_envs,)``; all but in the last turn."""
+    action: Array
+    """What was done, in the range of algorithms."""
 
 
 class Report(NamedTuple):
-    action: Array
-    """What was done, in the range of algorithms."""
     """What a chunk says of its turns."""
 
     metrics: Metrics
@@ -126,15 +128,15 @@ def learn(
     With ``skips``, an update that leaves NaN is undone, and its TD errors are NaN.
     """
     after, found = algorithm.update(learned.state, batch, clock)
+    td_error = td_error_of(found, batch)
     found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
     n = found["gradient_steps"].astype(jnp.int32) if "gradient_steps" in found else 1
-    td_error = td_error_of(found, batch)
     if skips:
         after, found = nonfinite.undo(learned.state, after, found)
         is_bad = ~found.pop(nonfinite.FINITE)
+        td_error = None if td_error is None else jnp.where(is_bad, jnp.nan, td_error)
     else:
         is_bad = ~nonfinite.check((), found)
-        td_error = None if td_error is None else jnp.where(is_bad, jnp.nan, td_error)
     is_over = learned.in_a_row >= nonfinite.MAX_SKIPPED  # the turns after it, in the same chunk, do not count
     in_a_row = jnp.where(is_bad | is_over, learned.in_a_row + ~is_over, 0)
     return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
@@ -167,7 +169,15 @@ def no_outcome(players: Players, action: Array) -> Outcome:
     """Returns the outcome before the first turn of a chunk; ``action`` has the shape of actions."""
     n_envs = len(players.ended)
     never = jnp.zeros(n_envs, bool)
-    return Outcome(players.obs, jnp.zeros(n_envs, jnp.float32), never, never, never)
+    return Outcome(players.obs, jnp.zeros(n_envs, jnp.float32), never, never, never, action)
+
+
+def observed(env: FunctionalEnv, obs: PyTree) -> PyTree:
+    """Returns a batch of observations as agents see them: with the mask apart if there is one."""
+    if isinstance(env, MaskInObservation):
+        parts = masked(obs)
+        return Masked(observed(env.env, parts.obs), parts.mask)
+    return plain(env.observation_space, obs)
 
 
 def plain(space: gym.Space, obs: PyTree) -> PyTree:
@@ -203,7 +213,7 @@ def play(
     """
     assert players.env is not None
     vstate, obs, reward, terminated, truncated, success = step_all(env, players.env, scale(env.action_space, action))
-    obs, reward = plain(env.observation_space, obs), reward.astype(jnp.float32)
+    obs, reward = observed(env, obs), reward.astype(jnp.float32)
     value = players.value + jnp.where(kept, reward, 0.0)
     length = players.length + kept
     over = terminated | truncated
@@ -217,7 +227,7 @@ def play(
         ),
     )
     vstate, fresh = reset_done(env, vstate, ended)
-    fresh = plain(env.observation_space, fresh)
+    fresh = observed(env, fresh)
     bad = players.bad | ~all_finite(reward) | ~all_finite(*jax.tree.leaves(obs)) | ~all_finite(*jax.tree.leaves(fresh))
     after = Players(
         vstate,
