@@ -12,6 +12,7 @@ import numpy as np
 from rejeu import devices
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.envs.functional.vector import reset_all
+from rejeu.loops.device.transfer import vector_of
 from rejeu.loops.learner import Learner
 from rejeu.loops.run import Run
 
@@ -54,7 +55,7 @@ def of_run(run: Run, learner: Learner, batch_size: int) -> int:
     update = COPIES * total(leaves) + 4 * rows * outputs
     if run.env.backend != "jax":
         return update
-    players = jax.eval_shape(lambda: reset_all(run.env.env, jax.random.key(0), run.env.n_envs))
+    players = jax.eval_shape(lambda: reset_all(vector_of(run).env, jax.random.key(0), run.env.n_envs))
     return update + total(jax.tree.leaves(players)) + of_experience(run.replay)
 
 
@@ -62,10 +63,9 @@ def of_experience(buffer: Any) -> int:
     """Returns the bytes of a replay buffer or rollout buffer on the device."""
     if isinstance(buffer, RolloutBuffer):
         return buffer.nbytes
-    tables = (
-        3 * 4 * len(buffer.ring.kind) if buffer.ring.counters else 0
-    )  # instead of the counters: the tables of episodes
-    return buffer.ring.nbytes + tables
+    n = len(buffer.ring.kind)
+    tables = 3 * 4 * n if buffer.ring.counters else 0  # instead of the counters: the tables of episodes
+    return buffer.ring.nbytes + tables + (0 if buffer.priorities is None else 4 * n)
 
 
 def unwritten(run: Run) -> int:
