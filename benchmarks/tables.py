@@ -97,11 +97,10 @@ def device_seeds(data: dict[str, Any]) -> str:
     good = [one for one in data["results"] if "error" not in one]
     numbers = sorted({one["n_seeds"] for one in good} - {1})
     rows = []
-    for name in device.CASES:
+    for name, case in device.CASES.items():
         for kind, where in (("device", "in JAX"), ("host", "on the host")):
-            rates = {
-                one["n_seeds"]: one["steps_per_second"] for one in good if (one["case"], one["kind"]) == (name, kind)
-            }
+            same = [one for one in good if (one["case"], one["kind"], one["n_envs"]) == (name, kind, case.n_envs)]
+            rates = {one["n_seeds"]: one["steps_per_second"] for one in same}
             if 1 in rates and len(rates) > 1:
                 cells = (f"{n * rates[1] / rates[n]:.1f}" if n in rates else "" for n in numbers)
                 rows.append((f"{name}, {where}", *cells))

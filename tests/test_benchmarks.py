@@ -83,6 +83,7 @@ def test_the_tables_of_the_device_compare_with_the_host_and_with_one_seed():
         measured("sac", "host", 1, 1, 300.0),
         measured("sac, 64-64", "host", 1, 1, 100.0),
         measured("sac, 64-64", "host", 1, 8, 200.0),
+        measured("sac, 64-64", "host", 4, 1, 999.0),
         {"case": "ppo", "kind": "device", "n_envs": 16, "n_seeds": 1, "error": "no memory"},
     ]
     data = {**PROVENANCE, "results": results}
