@@ -20,16 +20,16 @@ from rejeu.core import Clock, Rollout
 from rejeu.envs.functional import make
 from rejeu.envs.functional.vector import reset_all, reset_done, step_all
 
-N_ENVS, N_STEPS, N_PARTS = 8, 16, 10
+N_ENVS, N_STEPS, N_PARTS = 4, 32, 10
 config = pqn.Config(
     n_steps=N_STEPS,
-    batch_size=64,
-    n_epochs=2,
+    batch_size=32,
+    n_epochs=4,
     q_lambda=0.9,
-    learning_rate="lin_2e-3",
+    learning_rate="lin_3e-3",
     optimizer=optax.radam,  # the step of "radam" is compiled for one agent: to one kernel, in one thread
     exploration_fraction=0.5,
-    exploration_final_eps=0.02,
+    exploration_final_eps=0.05,
     policy_kwargs=dict(net_arch=[32, 32]),
 )
 env = make("jax/CartPole-v1")
@@ -43,7 +43,10 @@ def begin(seed):
 
 
 def learn(agent, envs, key, progress):
-    """Returns agent and environments after one rollout for each number of ``progress``, the fractions of training done."""
+    """Returns agent and environments after one rollout for each number of ``progress``, the fractions of training done.
+
+    The third value is the share of steps that ended an episode.
+    """
 
     def step(carry, key):
         agent, envs, clock = carry
@@ -60,11 +63,12 @@ def learn(agent, envs, key, progress):
         keys = jax.random.split(jax.random.fold_in(key, agent.n_rollouts), N_STEPS)
         (_, envs, _), steps = jax.lax.scan(step, (agent, envs, clock), keys)
         valid, unused = jnp.ones((N_STEPS, N_ENVS), bool), ()
-        agent, metrics = algorithm.update(agent, Rollout(*steps, valid, unused, unused, unused), clock)
-        return (agent, envs), metrics["loss"]
+        rollout = Rollout(*steps, valid, unused, unused, unused)
+        agent, _ = algorithm.update(agent, rollout, clock)
+        return (agent, envs), jnp.mean(rollout.ended, dtype=jnp.float32)
 
-    (agent, envs), loss = jax.lax.scan(update, (agent, envs), progress)
-    return agent, envs, jnp.mean(loss)
+    (agent, envs), ended = jax.lax.scan(update, (agent, envs), progress)
+    return agent, envs, jnp.mean(ended)
 
 
 def evaluate(agent, seed):
@@ -85,7 +89,7 @@ def evaluate(agent, seed):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--agents", type=int, default=2048)
-    parser.add_argument("--steps", type=int, default=20_000, help="environment steps of each agent")
+    parser.add_argument("--steps", type=int, default=30_000, help="environment steps of each agent")
     arguments = parser.parse_args()
     n_rollouts = max(arguments.steps // (N_ENVS * N_STEPS * N_PARTS), 1) * N_PARTS
     seeds = jnp.arange(arguments.agents)
@@ -96,9 +100,11 @@ def main():
 
     began = time.perf_counter()
     for progress in np.linspace(0, 1, n_rollouts, dtype=np.float32).reshape(N_PARTS, -1):
-        agents, envs, _ = learn_all(agents, envs, keys, progress)
-        returns = np.asarray(evaluate_all(agents, seeds + 2_000_000))
-        print(f"{time.perf_counter() - began:6.1f} s   mean of {arguments.agents:,} returns {returns.mean():6.1f}")
+        agents, envs, ended = learn_all(agents, envs, keys, progress)
+        length = 1 / np.mean(ended)
+        print(f"{time.perf_counter() - began:6.1f} s   mean length of an episode {length:6.1f}", flush=True)
+    returns = np.asarray(evaluate_all(agents, seeds + 2_000_000))
+    print(f"mean return of {arguments.agents:,} greedy policies: {returns.mean():.1f}")
     low, *quartiles, high = np.quantile(returns, [0.0, 0.25, 0.5, 0.75, 1.0])
     print(f"lowest {low:.1f}, quartiles {', '.join(f'{q:.1f}' for q in quartiles)}, highest {high:.1f}")
     counts, edges = np.histogram(returns, bins=10, range=(0, env.max_episode_steps))

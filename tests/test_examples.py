@@ -29,7 +29,7 @@ def test_the_agents_of_the_example_differ_and_their_returns_are_counted(monkeypa
     monkeypatch.setattr(sys, "argv", [str(script), "--agents", "4", "--steps", "2000"])
     names = runpy.run_path(str(script), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
-    assert "mean of 4 returns" in lines[0]
+    assert "mean return of 4 greedy policies" in lines[10]
     histogram = [int(line.split()[3]) for line in lines if " to " in line]
     assert (len(histogram), sum(histogram)) == (10, 4)
     one, two = (names["begin"](seed)[0].network.head.weight for seed in (0, 1))
