@@ -104,7 +104,7 @@ def train_seeds(
         start_device(len(numbers) * len(values))
     agents: list[A] = []
     for one in values:
-        vector = lambda seed: first_envs(kind, env, n_envs, seed)  # noqa: E731
+        vector = lambda seed: first_envs(env, n_envs, seed)  # noqa: E731
         first = kind(policy, vector(numbers[0]), seed=numbers[0], device=device, **fixed, **one)
         if not agents:
             require_memory(first, len(numbers) * len(values))
@@ -140,7 +140,7 @@ def start_device(n_runs: int) -> None:
         xla.start_device(xla.cores() // n_devices, n_devices)
 
 
-def first_envs(kind: type[Agent], env: Any, n_envs: int, seed: int) -> Any:
+def first_envs(env: Any, n_envs: int, seed: int) -> Any:
     """Returns the environments of a run."""
     from rejeu.envs.make import make_vector
 
@@ -287,6 +287,8 @@ def check_differing(agent: Agent, names: Iterable[str]) -> None:
             f"{', '.join(names)}: hyperparameters can differ between the runs of one program in JAX environments only"
         )
     for name in names:
+        if name not in kinds:
+            raise ValueError(f"{name} is no hyperparameter of {agent.name} and is equal for all runs; give one value")
         if name in STATIC or "float" not in kinds[name] or (name in IN_REPLAY and hasattr(agent.config, "buffer_size")):
             raise ValueError(
                 f"{name} cannot differ between the runs of one program, which is compiled for its value; give one number, or "
