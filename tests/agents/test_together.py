@@ -102,6 +102,7 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: s
         ("jax/CartPole-v1", {"gamma": [0.9, 0.99]}, "gamma cannot differ"),
         ("jax/CartPole-v1", {"batch_size": [8, 16]}, "batch_size cannot differ"),
         ("jax/CartPole-v1", {"verbose": [0, 1]}, "verbose is no hyperparameter of DQN"),
+        ("jax/CartPole-v1", {"seed": 3}, "seed=3: the runs have different seeds; give them as seeds"),
     ],
 )
 def test_what_cannot_be_one_program_is_refused(env: str, settings: dict[str, Any], message: str) -> None:

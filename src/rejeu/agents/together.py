@@ -96,6 +96,10 @@ def train_seeds(
             f"env is a {type(env).__name__}, and every run needs environments of its own; give an id, such as 'Pendulum-v1', "
             "or a FunctionalEnv"
         )
+    if "seed" in settings:
+        raise ValueError(
+            f"seed={settings['seed']!r}: the runs have different seeds; give them as seeds, such as seeds=[3, 4]"
+        )
     numbers = numbers_of(seeds)
     lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
     fixed = {name: value for name, value in settings.items() if name not in lists}
