@@ -60,9 +60,15 @@ def train(
         BadEnvironmentError: if a reward or an observation is not finite.
         NonFiniteError: if the state is not finite when training begins.
         NonFiniteUpdate: if an update leaves numbers that are not finite.
+        ValueError: if the steps are too many to be counted with 32 bits.
     """
     n_envs, first = runs[0].env.n_envs, runs[active[0]].step
     last = None if n_steps is None else first + n_steps
+    if last is not None and last >= NO_LIMIT:
+        raise ValueError(
+            f"the run would end at step {last:,}, and steps are counted up to {NO_LIMIT - 1:,} here; give fewer "
+            "total_timesteps, or minutes"
+        )
     for run in runs:
         check_state(run, learner)
     timers = [Timer(run.seconds) for run in runs]
