@@ -74,6 +74,19 @@ def test_an_agent_that_must_train_on_the_device_says_why_it_cannot() -> None:
         agent.learn(30)
 
 
+def test_more_steps_than_32_bits_count_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"would end at step 5,000,000,000, and steps are counted up to 4,294,967,294"):
+        make(rejeu.DQN, "jax/CartPole-v1").learn(5_000_000_000)
+
+
+def test_the_progress_bar_counts_the_steps_of_a_first_chunk_of_many_turns(capsys: Any) -> None:
+    agent = make(rejeu.DQN, "jax/CartPole-v1")
+    agent.learn(30, progress_bar=True)
+    assert "100%  30/30 steps" in capsys.readouterr().out
+    agent.learn(31, progress_bar=True)
+    assert "100%  31/31 steps" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

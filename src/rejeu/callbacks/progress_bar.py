@@ -82,9 +82,14 @@ class ProgressBar(TrainingCallback):
         self._refresh_at = 0.0
         self._taken, self._spent = taken, spent
         self._first_step = 0
+        self._step_before: int | None = None
         self._latest: tuple[TrainedAgent, int] | None = None
         self._shown_step = -1
         self._marks: deque[_Mark] = deque()
+
+    def before_training(self, agent: TrainedAgent) -> None:
+        """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""
+        self._step_before = agent.run.step
 
     def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
         """Refreshes the bar if it is due."""
@@ -110,7 +115,9 @@ class ProgressBar(TrainingCallback):
             self._bar.stop()
 
     def _start(self, agent: TrainedAgent, progress: Progress, now: float) -> None:
-        before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
+        before = self._step_before
+        if before is None:
+            before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
         self._first_step = before - self._taken
         self._marks.append(_Mark(self._began, before, agent.seconds))
         if self._animated:
