@@ -21,9 +21,9 @@ from rejeu.algorithms.actor_critic import (
     action_kind,
     explained_variance,
     is_value,
+    shuffled,
     standardized,
 )
-from rejeu.algorithms.minibatches import shuffled
 from rejeu.core import Clock, Rollout, clip
 from rejeu.distributions import Bernoulli, Categorical, Normal
 from rejeu.prng import nth

@@ -44,10 +44,10 @@ from rejeu.algorithms.actor_critic import (
     explained_variance,
     explorer_of,
     masked_mean,
+    minibatches,
     samples,
     standardized,
 )
-from rejeu.algorithms.minibatches import minibatches
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth

@@ -30,10 +30,9 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.actor_critic import flat, masked_mean
+from rejeu.algorithms.actor_critic import flat, masked_mean, minibatches
 from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy, epsilon_schedule, greedy, taken
-from rejeu.algorithms.minibatches import minibatches
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout, clip, descend, value_and_grad

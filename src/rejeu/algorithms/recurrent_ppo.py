@@ -34,10 +34,10 @@ from rejeu.algorithms.actor_critic import (
     checked,
     flat,
     orthogonal,
+    shuffled,
     unmasked,
     with_advantages,
 )
-from rejeu.algorithms.minibatches import shuffled
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout

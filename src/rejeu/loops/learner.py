@@ -150,11 +150,7 @@ class Learner:
 
 
 def td_error_of(metrics: Metrics, batches: Transition | Rollout) -> Array | None:
-    """Returns the absolute TD errors of an update, shaped like the rewards; None if the batches have no importance weights.
-
-    Raises:
-        ValueError: if there are none for batches with importance weights; runs while tracing.
-    """
+    """Returns the absolute TD errors of weighted batches, or raises ``ValueError`` if there are none; None for others."""
     if not isinstance(batches, Transition) or batches.weight is None:
         return None
     td_error = metrics.get(TD_ERROR)

@@ -131,10 +131,7 @@ def observe(run: Run, learner: Learner) -> None:
 
 
 def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Clock) -> None:
-    """Starts the updates on samples of the replay buffer, and sets priorities by the TD errors of the last ones.
-
-    The updates are counted.
-    """
+    """Starts and counts the updates on samples, and sets priorities by the TD errors of the last ones."""
     run.replay.update_priorities(run.td_errors)
     run.td_errors = []
     for batch, drawn in samples:
