@@ -271,3 +271,9 @@ def test_the_command_line_says_it_in_one_line(options, tmp_path: Path, capsys, m
     error = capsys.readouterr().err.strip()
     assert "Walk.step cannot be compiled (TracerBoolConversionError" in error.splitlines()[-1]
     assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("limit", [0, -1, 2.5, "5", True])
+def test_a_time_limit_that_is_no_positive_whole_number_is_refused(limit: Any) -> None:
+    with pytest.raises(ValueError, match=r"max_episode_steps=.* must be a whole number of at least 1"):
+        rejeu.make_vector("jax/CartPole-v1", max_episode_steps=limit)

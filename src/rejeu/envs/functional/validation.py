@@ -13,6 +13,7 @@ from gymnasium import spaces
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import check_goal_space, leaves, narrow, structure
+from rejeu.validation import whole
 
 UNTRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 """What JAX raises where Python needs a value that is not known yet."""
@@ -29,8 +30,12 @@ def check(env: FunctionalEnv) -> None:
         BadEnvironmentError: if a function cannot be traced, or what it returns has another structure, shape or dtype than
             declared; in one line, with the fix.
         TypeError: if a space is of a kind that agents do not support.
+        ValueError: if the time limit is no positive whole number.
     """
     name = type(env).__name__
+    limit: Any = env.max_episode_steps
+    if limit is not None:
+        whole("max_episode_steps", limit.item() if isinstance(limit, np.generic) else limit, least=1)
     key = jax.eval_shape(lambda: jax.random.key(0))
     state, obs = _unpack(_traced(f"{name}.reset", env.reset, key), 2, f"{name}.reset", "(state, obs)")
     _check_obs(f"{name}.reset", env.observation_space, obs)
