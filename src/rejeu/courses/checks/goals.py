@@ -367,7 +367,8 @@ def parking_reward(student: Any) -> None:
 @exercise
 def saving(save_all: Any, load_all: Any, agent: Any, env: Any) -> None:
     """Checks ``save_all(agent, folder)`` and ``load_all(folder, env)`` with an agent that has been trained."""
-    observation = {name: space.sample() for name, space in agent.observation_space.spaces.items()}
+    spaces = agent.observation_space.spaces
+    observations = {name: np.stack([space.sample() for _ in range(256)]) for name, space in spaces.items()}
     with tempfile.TemporaryDirectory() as folder:
         call(lambda: (save_all(agent, Path(folder)), True))
         loaded = call(lambda: load_all(Path(folder), env))
@@ -383,7 +384,7 @@ def saving(save_all: Any, load_all: Any, agent: Any, env: Any) -> None:
                 "load_all renvoie l'agent d'origine, et non celui des fichiers. Que trouverait-elle après un "
                 "redémarrage de l'ordinateur ?",
             )
-        actions = [one.predict(observation, deterministic=True)[0] for one in (agent, loaded)]
+        actions = [one.predict(observations, deterministic=True)[0] for one in (agent, loaded)]
         if not np.array_equal(*actions):
             raise Wrong(
                 "the loaded agent acts differently: these are not the weights that were saved.",
