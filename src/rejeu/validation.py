@@ -145,6 +145,7 @@ ELSEWHERE = {
     "optimizer_class": "the optimizer is called optimizer: optimizer='adamw', or an Optax optimizer",
     "optimize_memory_usage": "observations are stored once anyway",
     "n_envs": "give make_vector(id, n_envs=...) as env, or --envs",
+    "seeds": "several runs at once are rejeu.train_seeds(rejeu.PPO, policy, env, steps, seeds=...), or rejeu train --seeds",
     "total_timesteps": "it is an argument of learn(), or --steps",
 }
 """Where to find what goes by another name elsewhere; only asked for names that are unknown."""

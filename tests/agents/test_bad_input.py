@@ -39,6 +39,11 @@ MISTAKES = {
         TypeError,
         "SAC has no setting 'learning_rat'; did you mean learning_rate?",
     ),
+    "several seeds": (
+        sac(Counter(), seeds=3),
+        TypeError,
+        "SAC has no setting 'seeds'; several runs at once are rejeu.train_seeds",
+    ),
     "hyper-parameter of nothing": (sac(Counter(), zzz=1), TypeError, "SAC has no setting 'zzz'; known: learning_rate"),
     "misspelt argument": (sac(Counter(), verbos=1), TypeError, "no setting 'verbos'; did you mean verbose"),
     "unbounded actions": (
