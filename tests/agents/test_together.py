@@ -150,6 +150,7 @@ def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
         )
     assert raised.value.batch is not None
     assert raised.value.batch.parent == tmp_path / "1e+30"
+    assert str(raised.value).startswith("seed 0, learning_rate=1e+30: ")
 
 
 @pytest.mark.exhaustive

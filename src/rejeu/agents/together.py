@@ -243,7 +243,9 @@ def learn_together(
             for agent in agents:
                 agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
         except NonFiniteUpdate as broken:
-            raise finite.reported(agents[broken.which], broken) from None
+            which = agents[broken.which]
+            values = [f"{name}={getattr(which.config, name):g}" for name in differing]
+            raise finite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
         finally:
             for agent in agents:
                 agent.run.state = [jax.numpy.array(part) for part in agent.run.state]  # views until now

@@ -55,10 +55,10 @@ def settle(agent: Any) -> None:
         raise reported(agent, update) from None
 
 
-def reported(agent: Any, update: NonFiniteUpdate) -> NonFiniteError:
+def reported(agent: Any, update: NonFiniteUpdate, of: str = "") -> NonFiniteError:
     """Puts the agent into the state before a bad update, saves its batch, and returns the error that explains it.
 
-    The running episodes end: the actions chosen since are invalid.
+    The running episodes end: the actions chosen since are invalid. ``of`` names the run where there are several.
     """
     run, learner, clock = agent.run, agent.learner, update.clock
     run.td_errors, run.obs, run.action = [], None, None
@@ -79,8 +79,8 @@ def reported(agent: Any, update: NonFiniteUpdate) -> NonFiniteError:
         what = f"{update.in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {what}"
     model = f"; last saved model: {agent.last_saved}" if agent.last_saved is not None else ""
     message = (
-        f"{what}, at environment step {int(clock.step)}, update {n_updates + 1}. The agent is as it was before that update. "
-        f"{saved}{model}. {_advice(agent, found, batch)}"
+        f"{of}{what}, at environment step {int(clock.step)}, update {n_updates + 1}. The agent is as it was before that "
+        f"update. {saved}{model}. {_advice(agent, found, batch)}"
     )
     return NonFiniteError(message, names=names, step=int(clock.step), n_updates=n_updates + 1, batch=path)
 
