@@ -424,7 +424,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "device-replay": lambda: tables.device_replay(load("device_replay.json")),
     "parking-transfer": lambda: tables.transfer(load("parking_transfer.json")),
     "sweep": lambda: tables.sweep(load("sweep.json")),
-    "sweep-kills": lambda: tables.sweep_kills(load("sweep_kills.json", TRIALS)),
+    "sweep-kills": lambda name="sweep_kills": tables.sweep_kills(load(f"{name}.json", TRIALS)),
     "remote": lambda: tables.remote(load("remote.json")),
     "first-of-n": lambda: tables.first_of_n(load("first_of_n.json")),
     "tune": lambda: tables.tune(load("tune.json")),
