@@ -30,7 +30,7 @@ SEEDS = (0, 1, 2)
 WINDOW, POINTS = 20, 100
 ENVIRONMENTS = {
     **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ", "PPO"), "Pendulum-v1"),
-    **dict.fromkeys(("DQN", "QRDQN", "A2C"), "CartPole-v1"),
+    **dict.fromkeys(("DQN", "QRDQN", "A2C", "PQN"), "CartPole-v1"),
     "RecurrentPPO": "rejeu/CartPoleNoVelocity-v0",
 }
 WITHOUT_PRESET = {

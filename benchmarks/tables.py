@@ -209,6 +209,20 @@ def sweep_kills(data: dict[str, Any]) -> str:
     return f"{paragraph(intro)}\n\n{table(header, rows)}"
 
 
+def pqn(data: dict[str, Any]) -> str:
+    """How long PQN takes in one program until the greedy policy reaches a return."""
+    reached = [run["reached"] for run in data["runs"] if run["reached"]]
+    seconds, steps = [one["seconds"] for one in reached], [one["steps"] for one in reached]
+    compiling = max(run["whole_run"]["compile_seconds"] for run in data["runs"])
+    text = (
+        f"In `{data['env']}`, in one program, the greedy policy has a mean return of {data['target']:g} in "
+        f"{data['episodes']} episodes after {min(seconds):.1f} to {max(seconds):.1f} s and {min(steps):,} to {max(steps):,} "
+        f"steps ({len(reached)} of {len(data['runs'])} seeds; `{data['command']}`, {data['machine']['cores']} cores). "
+        f"Compiling, which is not counted, takes up to {compiling:.1f} s with a filled compilation cache."
+    )
+    return paragraph(text)
+
+
 def remote(data: dict[str, Any]) -> str:
     """Shares of the ideal number of steps, in lockstep and with the first results."""
     rows = []

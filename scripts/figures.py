@@ -425,6 +425,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "parking-transfer": lambda: tables.transfer(load("parking_transfer.json")),
     "sweep": lambda: tables.sweep(load("sweep.json")),
     "sweep-kills": lambda name="sweep_kills": tables.sweep_kills(load(f"{name}.json", TRIALS)),
+    "pqn": lambda: tables.pqn(load("pqn.json")),
     "remote": lambda: tables.remote(load("remote.json")),
     "first-of-n": lambda: tables.first_of_n(load("first_of_n.json")),
     "tune": lambda: tables.tune(load("tune.json")),

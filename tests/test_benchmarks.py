@@ -136,3 +136,12 @@ def test_table_of_the_replay_buffer_on_the_device():
     text = tables.device_replay({**PROVENANCE, "results": [entry]})
     assert "of 3 rounds" in text
     assert "| SAC | 2 (1 to 3) | 5 (4 to 6) | 1 |" in text
+
+
+def test_sentence_on_pqn_counts_the_seeds_that_reached_the_return():
+    run = {"reached": {"seconds": 1.25, "steps": 2_000}, "whole_run": {"compile_seconds": 0.5}}
+    missed = {"reached": None, "whole_run": {"compile_seconds": 0.75}}
+    data = {**PROVENANCE, "env": "jax/CartPole-v1", "target": 500.0, "episodes": 20, "runs": [run, missed]}
+    text = " ".join(tables.pqn(data).split())
+    assert "after 1.2 to 1.2 s and 2,000 to 2,000 steps (1 of 2 seeds" in text
+    assert "up to 0.8 s" in text
