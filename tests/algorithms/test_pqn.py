@@ -20,6 +20,7 @@ from rejeu.spaces import leaves
 from tests.algorithms.test_gae import random_steps
 from tests.algorithms.test_ppo import LAST_STEP_MISSING, OBS_SPACE, random_rollout
 from tests.environments import Sampled
+from tests.numpy_networks import gradient
 from tests.sharing import shared_learners
 from tests.tiers import exhaustive
 
@@ -52,21 +53,6 @@ def forward(layers, x):
         x = (x - x.mean(axis=1, keepdims=True)) / np.sqrt(x.var(axis=1, keepdims=True) + 1e-5) * scale + offset
         x = np.maximum(x, 0.0)
     return x @ layers[-1][0] + layers[-1][1]
-
-
-def slopes_of(layers, loss, width=1e-6):
-    """Returns the gradient of ``loss()``, a function of ``layers``, by central differences."""
-    slopes = [[np.zeros_like(array) for array in layer] for layer in layers]
-    for layer, slope in zip(layers, slopes, strict=True):
-        for array, along in zip(layer, slope, strict=True):
-            for i in np.ndindex(array.shape):
-                kept = array[i]
-                array[i] = kept + width
-                above = loss()
-                array[i] = kept - width
-                along[i] = (above - loss()) / (2.0 * width)
-                array[i] = kept
-    return slopes
 
 
 def assert_equal(one, two, atol, rtol=0.0):
@@ -223,7 +209,7 @@ def test_the_gradient_of_the_loss_equals_finite_differences_in_float64():
 
     assert float(loss) == pytest.approx(expected(), rel=1e-5)
     assert float(q_value) == pytest.approx(taken().mean(), rel=1e-4, abs=1e-6)
-    assert_equal(parameters(given), slopes_of(layers, expected), atol=1e-5, rtol=1e-4)
+    assert_equal(parameters(given), gradient(layers, expected), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -252,7 +238,7 @@ def test_three_updates_equal_numpy(settings, tolerance):
             for first in range(0, 14, 4):
                 index = order[first : min(first + 4, 14)]
                 batch = [part[index] for part in data]
-                slopes = slopes_of(layers, lambda batch=batch: loss_of(layers, *batch)[0])
+                slopes = gradient(layers, lambda batch=batch: loss_of(layers, *batch)[0])
                 norm = np.sqrt(sum(np.sum(x**2) for layer in slopes for x in layer))
                 scale = min(1.0, (config.max_grad_norm or np.inf) / norm)
                 found.append(loss_of(layers, *batch))
