@@ -157,6 +157,15 @@ def test_a_combination_has_an_action_of_its_own():
     assert box.action(["a", "w"], 0).tolist() == [0.5, 0.5]
 
 
+def test_arguments_that_change_the_actions_of_an_environment_change_its_keys():
+    box = lambda n, bound: Box(-bound, bound, (n,), np.float32)  # noqa: E731
+    assert actions("rejeu/Ball-v0", box(1, 2), "a", "", "d") == [[-2], [0], [2]]
+    assert actions("rejeu/Ball-v0", box(3, 2), "d+w+l") == [[2, 2, 2]]
+    assert actions("LunarLander-v3", box(2, 1), "a+w") == [[1, -1]]  # continuous=True
+    assert actions("LunarLanderContinuous-v3", LANDER, "a") == [1]
+    assert actions("CarRacing-v3", Discrete(5), "3") == [3]  # continuous=False
+
+
 def test_an_arrow_bound_itself_is_no_longer_a_letter():
     bound = keys_for("MountainCar-v0", MOUNTAIN, {"left": 2})
     assert [int(bound.action([key], 0)) for key in ("left", "a", "right")] == [2, 0, 2]

@@ -87,6 +87,22 @@ def test_goals_and_continuous_actions_are_recorded(tmp_path, monkeypatch):
     assert len(episode.observations["desired_goal"]) == len(episode.actions) + 1
 
 
+def test_the_dataset_has_the_spaces_and_arguments_of_the_environment_that_was_played(tmp_path, monkeypatch):
+    command = ["play", "rejeu/Ball-v0", "--env-kwargs", "dimension=3", "--record", str(tmp_path / "played")]
+    perform(hold(["d", "w"], 4, lambda e: None, []), main, command)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
+    dataset = minari.load_dataset("rejeu/Ball-v0/human-v0")
+    assert dataset[0].actions.tolist() == [[2, 2, 0]] * len(dataset[0].actions)
+    assert (dataset.observation_space.shape, dataset.recover_environment().observation_space.shape) == ((3,), (3,))
+
+
+def test_an_environment_without_an_id_is_recorded(tmp_path, monkeypatch):
+    perform(hold(["d"], 4, lambda e: None, []), play, Lever, record=tmp_path / "played")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
+    dataset = minari.load_dataset("Lever/human-v0")
+    assert (dataset[0].actions.tolist()[:3], dataset.env_spec) == ([2, 2, 2], None)
+
+
 def test_nothing_played_leaves_nothing_behind(tmp_path, capsys):
     assert perform(lambda window, game: iter(()), main, ["play", LEVER, "--record", str(tmp_path / "played")]) == 0
     assert "nothing was played" in capsys.readouterr().out

@@ -74,7 +74,7 @@ def play(
             stack.callback(opponent_env.close)
             players.append(Player(_name(against), opponent_env, _policy(against)))
         if record is not None:
-            by_hand.recording = Recording(record, env_id, fps)
+            by_hand.recording = Recording(record, playing_env, fps)
             stack.callback(by_hand.recording.close)
         game = Game(players, seed, keys_of_env.names, episodes, rest=round(REST_SECONDS * fps))
         _run(Window(f"rejeu play {env_id}"), game, keys_of_env, fps)

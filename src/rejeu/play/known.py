@@ -62,6 +62,11 @@ KNOWN["jax/PointMaze-v0"] = {
     "w": ([0.0, 1.0], "up"),
     "s": ([0.0, -1.0], "down"),
 }
+OTHER_ACTIONS = {
+    "LunarLander-v3": "LunarLanderContinuous-v3",
+    "LunarLanderContinuous-v3": "LunarLander-v3",
+}
+"""Environments whose keys an environment has with other arguments."""
 
 
 def full_name(name: str) -> str:
@@ -80,6 +85,28 @@ def full_name(name: str) -> str:
     return SHORT_NAMES.get(name.lower(), name)
 
 
+def known_keys(env_id: str, space: gym.Space) -> dict[str, tuple[Any, str]] | None:
+    """Returns the entry of ``KNOWN`` for an environment, None if there is none that fits its action space.
+
+    Arguments of an environment may change its actions, such as ``continuous=True`` of the lander and ``dimension=3`` of the
+    ball.
+    """
+    for name in (env_id, OTHER_ACTIONS.get(env_id)):
+        entry = KNOWN.get(name or "")
+        if entry is not None and fits(space, {key: action for key, (action, _) in entry.items()}):
+            return entry
+    return None
+
+
+def fits(space: gym.Space, actions: Mapping[str, Any]) -> bool:
+    """Returns whether actions by keys are actions of a space."""
+    try:
+        keys.bind(space, actions)
+    except ValueError:
+        return False
+    return True
+
+
 def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None) -> KeyMap:
     """Returns the key map of an environment: its default keys, or those of its action space, updated by ``own``.
 
@@ -91,9 +118,10 @@ def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None
     """
     own = dict(own or {})
     labels: list[tuple[Any, str]] = []
-    if env_id in KNOWN:
-        actions = {key: action for key, (action, _) in KNOWN[env_id].items()}
-        labels = [(action, label) for key, (action, label) in KNOWN[env_id].items() if key != keys.NONE]
+    known = known_keys(env_id, space)
+    if known is not None:
+        actions = {key: action for key, (action, _) in known.items()}
+        labels = [(action, label) for key, (action, label) in known.items() if key != keys.NONE]
     elif own and isinstance(space, gym.spaces.Box) and space.low.size > len(keys.AXIS_KEYS):
         actions = {}
     else:

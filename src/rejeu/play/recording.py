@@ -13,8 +13,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
-from rejeu.envs.registry import make_env
+from rejeu.envs.validation import id_of
 from rejeu.errors import MissingExtra
 from rejeu.reporting.text import counted
 from rejeu.reporting.video import HOLD_SECONDS, VideoFile, ffmpeg
@@ -25,13 +26,13 @@ VIDEO_NAME = "video.mp4"
 class Recording:
     """A folder with a Minari dataset and a video of the same episodes. Mutable.
 
-    The folder is a Minari path. The dataset is complete after every episode. It contains the environment's spec, if the spec
-    can be written as JSON. An aborted episode ends in a truncation; an episode without steps is left out. The video has one
-    frame after each reset and one for each step. The last frame of an episode is shown for half a second.
+    The folder is a Minari path. The dataset is complete after every episode. It contains the environment's spec, if an
+    environment can be made from it. An aborted episode ends in a truncation; an episode without steps is left out. The
+    video has one frame after each reset and one for each step. The last frame of an episode is shown for half a second.
 
     Args:
         folder: new or empty; created with the first episode.
-        env_id: id of the environment, from which the dataset is named.
+        env: the environment that is played, from whose id the dataset is named.
         fps: frames per second of the video.
 
     Raises:
@@ -39,7 +40,7 @@ class Recording:
         FileExistsError: if the folder is not empty.
     """
 
-    def __init__(self, folder: str | Path, env_id: str, fps: float) -> None:
+    def __init__(self, folder: str | Path, env: gym.Env, fps: float) -> None:
         try:
             import h5py  # noqa: F401 - Minari's files
             import minari
@@ -51,11 +52,13 @@ class Recording:
         self.folder = Path(folder).absolute()
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{folder} exists and is not an empty folder; choose another one")
-        self.dataset_id = re.sub(r"[^\w/-]", "-", env_id) + "/human-v0"
+        self.dataset_id = re.sub(r"[^\w/-]", "-", id_of(env)) + "/human-v0"
         self.episodes = 0
         """Number of recorded episodes."""
-        # Made without a render mode, which would become part of the spec in the dataset.
-        self._env = make_env(env_id)
+        self._description = gym.Env[Any, Any]()
+        """The spec and the spaces, which are all that Minari reads of an environment."""
+        self._description.spec = spec_of(env)
+        self._description.observation_space, self._description.action_space = env.observation_space, env.action_space
         self._dataset: Any = None
         self._video = VideoFile(self.folder / VIDEO_NAME, fps)
         self._buffer: Any = None
@@ -101,8 +104,6 @@ class Recording:
         except BaseException:
             self._video.discard()
             raise
-        finally:
-            self._env.close()
         if self._video.n_frames:
             self._video.close()
 
@@ -121,7 +122,7 @@ class Recording:
             self._video.write(self._frame)
 
     def _create(self, buffer: Any) -> Any:
-        described = self._env if has_json_spec(self._env) else None
+        described = None if self._description.spec is None else self._description
         with minari_path(self.folder), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # for example about the missing author
             return self._minari.create_dataset_from_buffers(
@@ -129,8 +130,8 @@ class Recording:
                 [buffer],
                 env=described,
                 eval_env=described,
-                observation_space=self._env.observation_space,
-                action_space=self._env.action_space,
+                observation_space=self._description.observation_space,
+                action_space=self._description.action_space,
                 algorithm_name="human",
                 description="Played by hand with rejeu play",
                 data_format="hdf5",
@@ -138,15 +139,21 @@ class Recording:
             )
 
 
-def has_json_spec(env: gym.Env) -> bool:
-    """Returns whether the environment's spec can be written as JSON: not if it was registered with a class."""
-    if env.spec is None:
-        return False
+def spec_of(env: gym.Env) -> EnvSpec | None:
+    """Returns the spec of an environment without its render mode, None if no environment can be made from it.
+
+    That is so for environments without an id, for those registered with a class, and with wrappers that do not record their
+    arguments.
+    """
+    if env.spec is None or any(wrapper.kwargs is None for wrapper in env.spec.additional_wrappers):
+        return None
+    spec = copy.deepcopy(env.spec)
+    spec.kwargs.pop("render_mode", None)
     try:
-        env.spec.to_json()
+        spec.to_json()
     except (ValueError, TypeError):
-        return False
-    return True
+        return None
+    return spec
 
 
 @contextmanager
