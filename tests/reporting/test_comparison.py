@@ -294,6 +294,22 @@ def test_plot(runs, tmp_path):
     assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_legend_of_many_settings_is_inside_the_picture(tmp_path):
+    pytest.importorskip("matplotlib")
+    for i in range(10):
+        settings = {"learning_rate": 10.0**-i, "policy_kwargs": {"net_arch": [2**i] * 12, "activation_fn": "relu"}}
+        write_run(tmp_path / str(i), seed=i, hyperparameters=settings)
+    figure = compare(tmp_path, samples=10).plot()
+    figure.draw_without_rendering()
+    legend = figure.axes[0].get_legend()
+    assert len(legend.get_texts()) == 10
+    assert all(
+        legend.get_window_extent().contains(*corner) for corner in legend.get_title().get_window_extent().corners()
+    )
+    assert all(figure.bbox.contains(*corner) for corner in legend.get_window_extent().corners())
+    assert figure.axes[0].get_window_extent().height > 200 * figure.dpi / 72  # points
+
+
 HOSTILE = "<script>alert(1)</script>|=cmd()$x_{$"
 
 

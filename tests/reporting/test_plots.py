@@ -58,12 +58,11 @@ def test_a_long_title_and_the_legend_keep_apart_and_inside_the_picture(success):
     title = "gymnasium_robotics/AdroitHandRelocateSparse-v1 of some_package.some_module, RecurrentPPO"
     figure = learning_curve(history(success=success), evaluations=[evaluated(100_000, success)], title=title)
     figure.draw_without_rendering()
-    title_box, legend_box = (
-        artist.get_window_extent() for artist in (figure.axes[0]._left_title, figure.axes[0].get_legend())
-    )
-    assert title_box.y0 > legend_box.y1
+    legend = figure.axes[0].get_legend()
+    title_box, legend_box = legend.get_title().get_window_extent(), legend.get_window_extent()
+    assert title_box.y0 > max(text.get_window_extent().y1 for text in legend.get_texts())
     assert title_box.x1 < figure.bbox.x1
-    assert title_box.y1 <= figure.bbox.y1
+    assert legend_box.y1 <= figure.bbox.y1
     assert legend_box.x1 < figure.bbox.x1
 
 

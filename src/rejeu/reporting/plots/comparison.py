@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,9 +30,11 @@ def plot(comparison: Any, path: str | Path | None = None) -> Picture:
         MissingExtra: if matplotlib is not installed.
     """
     envs = list(dict.fromkeys(group.env_id for group in comparison.groups))[:MAX_PANELS]
-    figure = style.make_figure("drawing a comparison", height=0.6 + 3.9 * len(envs))
-    panels = figure.subplots(len(envs), squeeze=False)[:, 0]
     labels = list(dict.fromkeys(group.label for group in comparison.groups))
+    names = [[name_of(group) for group in comparison.groups if group.env_id == env] for env in envs]
+    heights = [3.7 + 0.2 * math.ceil(len(one) / style.legend_columns(one)) for one in names]
+    figure = style.make_figure("drawing a comparison", height=0.6 + sum(heights))
+    panels = figure.subplots(len(envs), squeeze=False, height_ratios=heights)[:, 0]
     for panel, env in zip(panels, envs, strict=True):
         for group in comparison.groups:
             if group.env_id != env:
@@ -39,8 +42,7 @@ def plot(comparison: Any, path: str | Path | None = None) -> Picture:
             place = labels.index(group.label)
             color, dash = COLORS[place % len(COLORS)], "-" if place < len(COLORS) else "--"
             value, low, high = group.curve
-            name = literal(f"{group.label} ({len(group.runs)})")
-            panel.plot(group.x, value, dash, label=name, **{**style.LINE, "color": color})
+            panel.plot(group.x, value, dash, label=name_of(group), **{**style.LINE, "color": color})
             known = np.isfinite(low) & np.isfinite(high)
             panel.fill_between(group.x[known], low[known], high[known], color=color, alpha=0.15, linewidth=0)
         panel.xaxis.set_major_formatter(style.thousands)
@@ -50,6 +52,11 @@ def plot(comparison: Any, path: str | Path | None = None) -> Picture:
         style.format_axes(panel)
         style.add_title_and_legend(panel, literal(env))
     return style.save(figure, path)
+
+
+def name_of(group: Any) -> str:
+    """Returns the name of a group in the legend: its label and the number of its runs."""
+    return literal(f"{group.label} ({len(group.runs)})")
 
 
 def literal(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ DOT_COLOR, LINE_COLOR, ACCENT_COLOR, GOOD_COLOR, BAD_COLOR = "#63a4e0", "#1d4f91
 LINE: dict[str, Any] = {"color": LINE_COLOR, "linewidth": 1.8, "solid_capstyle": "round", "solid_joinstyle": "round"}
 TITLE_WIDTH = 72
 """Characters in a line of the title."""
+LEGEND_WIDTH, LEGEND_COLUMNS = 110, 4
+"""Characters in a line of the legend, and its maximum number of columns."""
 
 
 def make_figure(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
@@ -56,13 +59,31 @@ def format_axes(panel: Axes) -> None:
 
 def add_title_and_legend(panel: Axes, title: str) -> None:
     """Writes the legend above a panel and the title above the legend."""
-    has_legend = bool(panel.get_legend_handles_labels()[0])
-    if title:
-        text = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
-        panel.set_title(text, loc="left", color=INK, fontsize=12, fontweight="bold", pad=25 if has_legend else 9)
-    if has_legend:
-        style = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2, "columnspacing": 1.4}
-        panel.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=4, borderaxespad=0.2, **style)
+    handles, labels = panel.get_legend_handles_labels()
+    title = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
+    if not labels:
+        panel.set_title(title, loc="left", color=INK, fontsize=12, fontweight="bold", pad=9)
+        return
+    labels = [textwrap.fill(label, LEGEND_WIDTH) for label in labels]
+    style: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2}
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
+    heading: dict[str, Any] = {
+        "title": title,
+        "alignment": "left",
+        "title_fontproperties": {"size": 12, "weight": "bold"},
+    }
+    legend = panel.legend(handles, labels, ncols=legend_columns(labels), columnspacing=1.4, **style, **place, **heading)
+    legend.get_title().set_color(INK)
+
+
+def legend_columns(labels: Sequence[str]) -> int:
+    """Returns the number of columns in which the labels of a legend fit above a panel.
+
+    >>> legend_columns(["episodes", "mean of 50 episodes"]), legend_columns(["batch_size=64, learning_rate=0.001 (5)"])
+    (4, 2)
+    """
+    longest = max((len(line) for label in labels for line in label.splitlines()), default=0)
+    return min(max(LEGEND_WIDTH // (longest + 6), 1), LEGEND_COLUMNS)
 
 
 def thousands(value: float, _: float | None = None) -> str:
