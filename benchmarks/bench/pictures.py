@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from benchmarks.bench import plan
 from benchmarks.bench.summary import Limit, Spread
 
-COLOURS = {"rejeu": "#0b6e99", "rejeu, EnvPool": "#15b097", "sb3": "#e07b39", "sbx": "#9b59b6", "limit": "#444444"}
+COLORS = {"rejeu": "#0b6e99", "rejeu, EnvPool": "#15b097", "sb3": "#e07b39", "sbx": "#9b59b6", "limit": "#444444"}
 NAMES = {"rejeu": "rejeu", "sb3": "Stable-Baselines3", "sbx": "SBX"}
 STYLE = {
     "font.size": 10,
@@ -55,7 +55,7 @@ def draw_steps(
                     low.append(1e3 * (found.median - found.low))
                     high.append(1e3 * (found.high - found.median))
             if places:
-                axes.bar(places, heights, width, color=COLOURS[library], label=NAMES[library])
+                axes.bar(places, heights, width, color=COLORS[library], label=NAMES[library])
                 axes.errorbar(places, heights, [low, high], fmt="none", ecolor="black", elinewidth=0.8, capsize=2)
                 for place, height, above in zip(places, heights, high, strict=True):
                     above_it = {"xytext": (0, 2), "textcoords": "offset points", "ha": "center", "fontsize": 7}
@@ -73,7 +73,7 @@ def draw_steps(
         logarithmic(axes.yaxis)
         axes.grid(axis="x", visible=False)
         axes.set_xticks(range(len(seconds)), [name.replace(", ", "\n") for name in seconds])
-        axes.set_ylabel("milliseconds of a step (log), less is better")
+        axes.set_ylabel("milliseconds per step (log), less is better")
         axes.set_title(title, loc="left")
         axes.legend(loc="upper left", ncols=4, fontsize=8)
         axes.margins(y=0.15)
@@ -99,17 +99,17 @@ def draw_rollouts(
         figure, panels = plt.subplots(1, len(rates), figsize=(9, 4), layout="constrained", squeeze=False)
         for axes, (algorithm, lines) in zip(panels[0], rates.items(), strict=True):
             for line, by in lines.items():
-                draw_line(axes, by, COLOURS[line], NAMES.get(line, line))
+                draw_line(axes, by, COLORS[line], NAMES.get(line, line))
             for line, at in limits.get(algorithm, {}).items():
-                axes.plot(list(at), list(at.values()), "--", color=COLOURS[line], linewidth=1, alpha=0.8)
-            axes.plot([], [], "--", color=COLOURS["limit"], linewidth=1, label="limit, of the same colour")
+                axes.plot(list(at), list(at.values()), "--", color=COLORS[line], linewidth=1, alpha=0.8)
+            axes.plot([], [], "--", color=COLORS["limit"], linewidth=1, label="limit, of the same color")
             axes.set_xscale("log", base=2)
             axes.set_yscale("log")
             axes.set_xticks(plan.N_ENVS, [str(n) for n in plan.N_ENVS])
             logarithmic(axes.yaxis)
             axes.set_xlabel("environments")
             axes.set_title(algorithm, loc="left")
-        panels[0][0].set_ylabel("environment steps a second (log), more is better")
+        panels[0][0].set_ylabel("environment steps per second (log), more is better")
         panels[0][0].legend(fontsize=8, frameon=True, framealpha=0.9, edgecolor="none")
         figure.suptitle(title, x=0.01, ha="left")
         save(figure, path)
@@ -117,7 +117,7 @@ def draw_rollouts(
 
 def draw_replay(seconds: Mapping[str, Mapping[int, Spread]], path: Path, title: str) -> None:
     """Plots microseconds per batch against the buffer size. Lines of Stable-Baselines3 start with ``sb3``."""
-    colours = {"rejeu, hindsight": "#0b6e99", "sb3, hindsight": "#e07b39", "rejeu, priority": "#15b097"}
+    colors = {"rejeu, hindsight": "#0b6e99", "sb3, hindsight": "#e07b39", "rejeu, priority": "#15b097"}
     labels = {
         "rejeu, hindsight": "rejeu, hindsight",
         "sb3, hindsight": "Stable-Baselines3, hindsight",
@@ -127,12 +127,12 @@ def draw_replay(seconds: Mapping[str, Mapping[int, Spread]], path: Path, title: 
         figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
         for line, by in seconds.items():
             scaled = {size: Spread(*(1e6 * value for value in found)) for size, found in by.items()}
-            draw_line(axes, scaled, colours[line], labels[line])
+            draw_line(axes, scaled, colors[line], labels[line])
         axes.set_xscale("log")
         axes.set_yscale("log")
         logarithmic(axes.yaxis)
         axes.set_xlabel("transitions in the buffer (log)")
-        axes.set_ylabel("microseconds a batch of 256 (log), less is better")
+        axes.set_ylabel("microseconds per batch of 256 (log), less is better")
         axes.set_title(title, loc="left")
         axes.legend(fontsize=8)
         save(figure, path)
@@ -145,12 +145,12 @@ def logarithmic(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(number))
 
 
-def draw_line(axes: Any, by: Mapping[int, Spread], colour: str, label: str) -> None:
+def draw_line(axes: Any, by: Mapping[int, Spread], color: str, label: str) -> None:
     """Plots medians as a line and ranges as a band."""
     places: Sequence[int] = list(by)
-    axes.plot(places, [found.median for found in by.values()], "o-", color=colour, label=label, markersize=4)
+    axes.plot(places, [found.median for found in by.values()], "o-", color=color, label=label, markersize=4)
     low, high = ([getattr(found, end) for found in by.values()] for end in ("low", "high"))
-    axes.fill_between(places, low, high, color=colour, alpha=0.15, linewidth=0)
+    axes.fill_between(places, low, high, color=color, alpha=0.15, linewidth=0)
 
 
 def save(figure: Any, path: Path) -> None:

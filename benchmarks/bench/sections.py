@@ -210,7 +210,7 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
     if not tables:
         return ""
     picture = page.parent / "images" / PICTURES["rollouts"]
-    pictures.draw_rollouts(drawn, limits, picture, f"{plan.LANDER}: steps a second")
+    pictures.draw_rollouts(drawn, limits, picture, f"{plan.LANDER}: steps per second")
     return f"""## On-policy: PPO and A2C by number of environments
 
 Environment steps per second on {plan.LANDER}, 64-64 networks, updates included. PPO: rollouts of {plan.ROLLOUT:,} steps
