@@ -66,6 +66,18 @@ def test_a_long_title_and_the_legend_keep_apart_and_inside_the_picture(success):
     assert legend_box.x1 < figure.bbox.x1
 
 
+def test_the_intervals_of_evaluations_are_drawn_whole():
+    low, high = learning_curve(history(), evaluations=[evaluated(100_000)]).axes[0].get_ylim()
+    assert low < -450 - 12.7 * 50 < -450 + 12.7 * 50 < high  # Student's t of two episodes
+
+
+def test_the_axes_of_a_run_without_an_episode_or_with_equal_returns_have_readable_numbers():
+    assert learning_curve(history(0)).axes[0].get_xlim()[1] > 0.5
+    flat = History([Episode(10 * i, 0, -200.0, 10, float("nan"), i) for i in range(9)])
+    low, high = learning_curve(flat).axes[0].get_ylim()
+    assert high - low > 10
+
+
 def test_points_at_the_right_edge_are_drawn_whole():
     figure = learning_curve(history(), evaluations=[evaluated(200_000)])
     figure.draw_without_rendering()

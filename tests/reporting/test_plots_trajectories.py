@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,14 @@ def test_one_coordinate_is_drawn_against_steps(shape):
     np.testing.assert_array_equal(y, points.ravel())
     walls = {line.get_ydata()[0] for line in panel.lines if len(line.get_xdata()) == 2}
     assert walls == {-20, 20}
+
+
+def test_long_names_of_coordinates_stay_next_to_their_panels():
+    names = ["cart position, m", "cart velocity, m/s", "pole angle, rad", "pole angular velocity, rad/s"]
+    figure = plots.trajectory(random_course(4), names=names)
+    figure.draw_without_rendering()
+    boxes = [panel.yaxis.label.get_window_extent() for panel in figure.axes[1:]]
+    assert all(above.y0 >= below.y1 for above, below in pairwise(boxes))
 
 
 def test_two_coordinates_are_drawn_as_a_plane_with_the_box():

@@ -68,6 +68,7 @@ def noise(
         style.format_axes(panel)
     panels[-1].set_xlabel("step")
     panels[-1].set_xlim(0, n_steps)
+    panels[-1].locator_params(axis="x", integer=True)
     panels[-1].xaxis.set_major_formatter(style.thousands)
     if title:
         figure.suptitle(title, x=0.02, ha="left", color=style.INK, fontsize=12, fontweight="bold")
@@ -112,6 +113,8 @@ def repulsive_boundary(
     ):
         panel.plot(action, values, **style.LINE)
         panel.set_ylabel(name)
+        panel.xaxis.set_major_formatter(style.thousands)
+        panel.yaxis.set_major_formatter(style.thousands)
         style.format_axes(panel)
         for bound in (low, high):
             panel.axvline(bound, color=style.INK, linewidth=1.2)
@@ -162,6 +165,7 @@ def saturation(
         panel.annotate(text, (0.0, 1.02), xycoords="axes fraction", color=style.INK, fontsize=8.5)
     panels[-1].set_xlabel("step")
     panels[-1].set_xlim(0, n_steps)
+    panels[-1].locator_params(axis="x", integer=True)
     panels[-1].xaxis.set_major_formatter(style.thousands)
     if title:
         figure.suptitle(title, x=0.02, ha="left", color=style.INK, fontsize=12, fontweight="bold")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -77,8 +78,9 @@ def learning_curve(
     _episodes(panels[0], x, returns)
     _records(panels[0], x, returns, history.record_rows)
     _line(panels[0], x, history.moving_average("return", window), window)
-    _points(panels[0], at, means, [evaluation.return_interval for _, evaluation in evaluations])
-    _fit(panels[0], returns, [*means, history.best_return])
+    intervals = [evaluation.return_interval for _, evaluation in evaluations]
+    _points(panels[0], at, means, intervals)
+    _fit(panels[0], returns, [*means, *chain.from_iterable(intervals), history.best_return])
     panels[0].set_ylabel("return")
     panels[0].yaxis.set_major_formatter(style.thousands)
     if has_success:
@@ -92,7 +94,7 @@ def learning_curve(
         style.format_axes(panel)
     panels[-1].set_xlabel(AXIS_LABELS[against])
     panels[-1].xaxis.set_major_formatter(style.thousands)
-    panels[-1].set_xlim(0, max([*x[-1:], *at[-1:], 1e-9]) * (1 + RIGHT_MARGIN))
+    panels[-1].set_xlim(0, (max([*x[-1:], *at[-1:]], default=0.0) or 1.0) * (1 + RIGHT_MARGIN))
     style.add_title_and_legend(panels[0], title)
     _enlarge_dots(panels[0])
     return style.save(figure, path)
@@ -156,5 +158,5 @@ def _fit(panel: Axes, returns: np.ndarray, further: list[float]) -> None:
     shown = np.concatenate([np.quantile(returns, [0.005, 0.995]) if len(returns) else [], further])
     shown = shown[np.isfinite(shown)]
     if len(shown):
-        margin = 0.05 * (np.ptp(shown) or 1.0)
+        margin = 0.05 * (np.ptp(shown) or max(abs(shown[0]), 1.0))
         panel.set_ylim(shown.min() - margin, shown.max() + margin)

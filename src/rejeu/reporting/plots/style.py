@@ -17,13 +17,15 @@ if TYPE_CHECKING:
 INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
 DOT_COLOR, LINE_COLOR, ACCENT_COLOR, GOOD_COLOR, BAD_COLOR = "#63a4e0", "#1d4f91", "#dd6b20", "#26966a", "#cd3e34"
 LINE: dict[str, Any] = {"color": LINE_COLOR, "linewidth": 1.8, "solid_capstyle": "round", "solid_joinstyle": "round"}
-TITLE_WIDTH = 72
-"""Characters in a line of the title."""
-LEGEND_WIDTH, LEGEND_COLUMNS = 110, 4
-"""Characters in a line of the legend, and its maximum number of columns."""
+WIDTH = 8.0
+"""Default width of a figure in inches."""
+TITLE_CHARACTERS, LEGEND_CHARACTERS = 7.5, 13.5
+"""Characters in an inch of the title and of the legend."""
+LEGEND_COLUMNS = 4
+"""Maximum number of columns of a legend."""
 
 
-def make_figure(what: str, width: float = 8.0, height: float = 4.2) -> Picture:
+def make_figure(what: str, width: float = WIDTH, height: float = 4.2) -> Picture:
     """Returns an empty figure with a size in inches.
 
     Raises:
@@ -60,11 +62,12 @@ def format_axes(panel: Axes) -> None:
 def add_title_and_legend(panel: Axes, title: str) -> None:
     """Writes the legend above a panel and the title above the legend."""
     handles, labels = panel.get_legend_handles_labels()
-    title = "\n".join(textwrap.wrap(title, TITLE_WIDTH))
+    width = panel.figure.bbox.width / panel.figure.dpi
+    title = textwrap.fill(title, round(TITLE_CHARACTERS * width))
     if not labels:
         panel.set_title(title, loc="left", color=INK, fontsize=12, fontweight="bold", pad=9)
         return
-    labels = [textwrap.fill(label, LEGEND_WIDTH) for label in labels]
+    labels = [textwrap.fill(label, round(LEGEND_CHARACTERS * width)) for label in labels]
     style: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2}
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
     heading: dict[str, Any] = {
@@ -72,18 +75,20 @@ def add_title_and_legend(panel: Axes, title: str) -> None:
         "alignment": "left",
         "title_fontproperties": {"size": 12, "weight": "bold"},
     }
-    legend = panel.legend(handles, labels, ncols=legend_columns(labels), columnspacing=1.4, **style, **place, **heading)
+    legend = panel.legend(
+        handles, labels, ncols=legend_columns(labels, width), columnspacing=1.4, **style, **place, **heading
+    )
     legend.get_title().set_color(INK)
 
 
-def legend_columns(labels: Sequence[str]) -> int:
-    """Returns the number of columns in which the labels of a legend fit above a panel.
+def legend_columns(labels: Sequence[str], width: float = WIDTH) -> int:
+    """Returns the number of columns in which the labels of a legend fit into a width in inches.
 
     >>> legend_columns(["episodes", "mean of 50 episodes"]), legend_columns(["batch_size=64, learning_rate=0.001 (5)"])
     (4, 2)
     """
     longest = max((len(line) for label in labels for line in label.splitlines()), default=0)
-    return min(max(LEGEND_WIDTH // (longest + 6), 1), LEGEND_COLUMNS)
+    return min(max(int(LEGEND_CHARACTERS * width / (longest + 6)), 1), LEGEND_COLUMNS)
 
 
 def thousands(value: float, _: float | None = None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 MAX_COORDINATES = 10
 """Maximum number of coordinates that are drawn against time next to the plane."""
+NAME_CHARACTERS = 64
+"""Characters of names that fit above each other, next to the panels of all coordinates."""
 MARGIN = 0.08
 """Margin beyond the bounds, as a share of their distance."""
 
@@ -76,7 +79,8 @@ def trajectory(
         shown = min(dimension, MAX_COORDINATES)
         panels = right.subplots(shown, 1, sharex=True)
         for i, panel in enumerate(panels):
-            _coordinate(panel, points[:, i], lows[i], highs[i], names[i])
+            name = textwrap.fill(names[i], NAME_CHARACTERS // shown, break_long_words=False)
+            _coordinate(panel, points[:, i], lows[i], highs[i], name)
         panels[-1].set_xlabel("step" if shown == dimension else f"step (the first {shown} of {dimension} coordinates)")
     return style.save(figure, path)
 
@@ -110,6 +114,7 @@ def _coordinate(panel: Axes, values: np.ndarray, low: float, high: float, name: 
     steps = np.arange(len(values))
     panel.plot(steps, values, color=style.LINE_COLOR, linewidth=1.0)
     _ends(panel, steps, values)
+    panel.locator_params(axis="x", integer=True)
     panel.xaxis.set_major_formatter(style.thousands)
     panel.set_ylim(*_limits(values, low, high))
     panel.set_ylabel(name)
