@@ -76,6 +76,19 @@ def test_the_progress_bar_sends_few_messages_in_a_second(notebook):
     assert len(notebook.outputs) < 60
 
 
+def test_a_command_in_a_cell_prints_lines_though_the_notebook_forces_colors(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(progress_bar, "LINE_SECONDS", 0.0)
+    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[], ep_success_buffer=[], seconds=SECONDS)
+    bar = ProgressBar(2, None)
+    for step in (1, 2):
+        bar(agent, Progress(step, [], None))
+    bar.close()
+    text = capsys.readouterr().out
+    assert [line[:4] for line in text.splitlines()] == [" 50%", "100%"]
+    assert "\x1b" not in text
+
+
 def test_verbose_training_keeps_one_table_up_to_date(notebook, tmp_path, capsys):
     agent = rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs={"net_arch": [8]}, seed=0, verbose=1)
     rows = CsvFile(tmp_path / "metrics.csv")
@@ -121,6 +134,12 @@ def test_an_evaluation_shows_its_numbers():
     assert "<tr><th>success</th><td>50.0%</td>" in shown["text/html"]
 
 
+def test_an_evaluation_of_one_episode_has_no_interval():
+    shown = formatted(Evaluation(np.array([2.0]), np.array([10]), np.array([NAN])))
+    assert shown["text/plain"] == "<Evaluation: return 2.00 ± 0.00, length 10.0, 1 episode>"
+    assert "<tr><th>return</th><td>2.00</td><td></td><td>0.00</td></tr>" in shown["text/html"]
+
+
 def test_an_evaluation_without_successes_has_no_row_for_them():
     shown = formatted(Evaluation(np.ones(3), np.ones(3), np.full(3, NAN)))
     assert "success" not in shown["text/html"] + shown["text/plain"]
@@ -142,6 +161,17 @@ def test_vector_environments_show_what_they_step():
     inside = DummyVecEnv([lambda: gym.make("CartPole-v1")] * 2)
     assert repr(inside).startswith("<DummyVecEnv: 2 environments, observations Box(")
     assert repr(VecNormalize(inside)).endswith("actions Discrete(2)>")
+
+
+def test_what_is_stored_is_counted(tmp_path):
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", buffer_size=500, policy_kwargs={"net_arch": [8]}, seed=0).learn(60)
+    assert repr(agent.replay_buffer) == "<ReplayBuffer: 60 of 500 steps>"
+    memory = rejeu.ReplayMemory(2_000, agent.observation_space, agent.action_space)
+    assert repr(memory) == "<ReplayMemory: 0 of 2,000 transitions>"
+    agent.remember_best(2.5, by="evaluation")
+    assert repr(agent.best) == "<Best: evaluation 2.5 at step 60>"
+    loaded = rejeu.load(agent.save(tmp_path / "cart"))
+    assert repr(loaded).startswith("<rejeu.DQN on no environment, trained on CartPole-v1, 60 steps")
 
 
 def test_agents_and_histories_are_tables():

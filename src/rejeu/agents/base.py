@@ -72,6 +72,9 @@ class Best(NamedTuple):
     state: PackedState
     """The complete state of the algorithm at that time, packed."""
 
+    def __repr__(self) -> str:
+        return f"<Best: {self.by} {self.score} at step {self.step:,}>"
+
 
 class Resumed(NamedTuple):
     """Where a run was resumed."""
@@ -311,6 +314,13 @@ class BaseAgent(ABC):
         return self.run.env
 
     @property
+    def _place(self) -> str:
+        """The id of its environments; of a loaded agent, that of the environments it was trained on, if it is known."""
+        if self.run.env is not None:
+            return self.run.env.env_id
+        return "no environment" if self.trained_on is None else f"no environment, trained on {self.trained_on[0]}"
+
+    @property
     def n_envs(self) -> int:
         """Number of environments."""
         return self.run.env.n_envs if self.run.env is not None else 1
@@ -353,14 +363,12 @@ class BaseAgent(ABC):
                 raise ValueError(f"{what} has the {kind} space {other}, and this agent was made for {own}")
 
     def __repr__(self) -> str:
-        where = self.run.env.env_id if self.run.env is not None else "no environment"
-        return f"<rejeu.{self.name} on {where}, {self.run.step} steps, {self.run.n_updates} updates>"
+        return f"<rejeu.{self.name} on {self._place}, {self.run.step} steps, {self.run.n_updates} updates>"
 
     def _repr_html_(self) -> str:
         """Returns a table for notebooks."""
-        where = self.run.env.env_id if self.run.env is not None else "no environment"
         counts = f"{counted(self.run.step, 'step')}, {counted(self.run.n_updates, 'update')}"
-        rows = [(self.name, where), ("seed", str(self.seed)), ("trained", counts)]
+        rows = [(self.name, self._place), ("seed", str(self.seed)), ("trained", counts)]
         if len(self.history):
             rows.append(("episodes", repr(self.history).removeprefix("<History: ").removesuffix(">")))
         return html_table(rows)

@@ -69,6 +69,9 @@ class ReplayMemory:
         """Number of stored transitions, at most ``capacity``."""
         return min(self._n_pushed, self.capacity)
 
+    def __repr__(self) -> str:
+        return f"<ReplayMemory: {len(self):,} of {self.capacity:,} transitions>"
+
     def push(self, obs: Any, action: Any, reward: float, next_obs: Any, terminated: bool) -> None:
         """Adds one transition, and overwrites the oldest if the memory is full.
 

@@ -50,6 +50,9 @@ class BaseReplayBuffer(ABC):
         """Returns the number of transitions kept."""
         return len(self.ring)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.size():,} of {self.ring.rows * self.ring.n_envs:,} steps>"
+
     def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
         """Starts episodes; see :meth:`Ring.begin`."""
         self.ring.begin(obs, envs)

@@ -12,7 +12,7 @@ from rejeu.callbacks.base import TrainedAgent, TrainingCallback
 from rejeu.callbacks.due import step_before
 from rejeu.loops.run import Progress
 from rejeu.loops.timing import time_shares
-from rejeu.reporting.notebook import Display
+from rejeu.reporting import notebook
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,12 +65,11 @@ class ProgressBar(TrainingCallback):
             taken: steps of a resumed run that were taken before.
             spent: wall time that it had taken before, in seconds.
         """
-        from rich.console import Console
         from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
 
         self.n_steps, self.seconds = n_steps, seconds
-        self._console = Console() if console is None else console
-        self._display = Display() if self._console.is_jupyter else None
+        self._console = notebook.console() if console is None else console
+        self._display = notebook.Display() if self._console.is_jupyter else None
         self._animated = self._console.is_terminal and not self._console.is_dumb_terminal
         self._period = (
             NOTEBOOK_SECONDS if self._display is not None else REFRESH_SECONDS if self._animated else LINE_SECONDS

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from rejeu.reporting import notebook
+
 WIDE = 10_000
 """Columns of what is no terminal, such as a pipe: nothing is folded, so that ``grep`` finds whole names."""
 
@@ -11,7 +13,6 @@ WIDE = 10_000
 def show(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> None:
     """Prints a table. A narrow terminal folds the first ``n_text`` columns, which are text; numbers are never folded."""
     from rich import box
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -21,7 +22,7 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> Non
         table.add_column(name, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text)
     for row in rows:
         table.add_row(*map(escape, row))
-    console = Console(highlight=False)
+    console = notebook.console(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=WIDE)
+        console = notebook.console(highlight=False, width=WIDE)
     console.print(table)

@@ -20,6 +20,7 @@ from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.presets import Preset
+from rejeu.reporting import notebook
 from rejeu.reporting.report.sections import duration
 from rejeu.reporting.tabular import number
 from rejeu.reporting.text import counted
@@ -139,10 +140,9 @@ def complete(
 @contextmanager
 def display(study: Study) -> Iterator[Watch]:
     """Returns a function that prints a line for each trial that has ended and, on a terminal, a table of those that run."""
-    from rich.console import Console
     from rich.live import Live
 
-    lines, console = tuning.lines(echo, study), Console()
+    lines, console = tuning.lines(echo, study), notebook.console()
     if not console.is_terminal:
         yield lines
         return

@@ -99,8 +99,9 @@ class Evaluation:
 
     def __str__(self) -> str:
         low, high = self.return_interval
+        interval = "" if math.isnan(low) else f" (95 % CI of the mean {low:.2f} to {high:.2f})"
         text = (
-            f"return {self.mean_return:.2f} ± {self.std_return:.2f} (95 % CI of the mean {low:.2f} to {high:.2f}), "
+            f"return {self.mean_return:.2f} ± {self.std_return:.2f}{interval}, "
             f"length {self.mean_length:.1f}, {counted(len(self.returns), 'episode')}"
         )
         if not math.isnan(self.success_rate):
@@ -114,11 +115,12 @@ class Evaluation:
     def _repr_html_(self) -> str:
         """Returns a table for notebooks."""
         (low, high), rows = self.return_interval, []
+        interval = "" if math.isnan(low) else f"{low:,.2f} to {high:,.2f}"
         if not math.isnan(self.success_rate):
             least, most = self.success_interval
             rows.append(("success", f"{self.success_rate:.1%}", f"{least:.1%} to {most:.1%}", ""))
         rows += [
-            ("return", f"{self.mean_return:,.2f}", f"{low:,.2f} to {high:,.2f}", f"{self.std_return:,.2f}"),
+            ("return", f"{self.mean_return:,.2f}", interval, f"{self.std_return:,.2f}"),
             ("length", f"{self.mean_length:,.1f}", "", f"{np.std(self.lengths):,.1f}"),
         ]
         return html_table(

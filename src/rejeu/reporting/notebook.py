@@ -1,8 +1,24 @@
-"""Notebook output that is updated while a cell runs and is saved with the notebook."""
+"""Output in notebooks: what is updated while a cell runs, and what the commands of a cell print."""
 
 from __future__ import annotations
 
-from typing import Any
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def console(**settings: Any) -> Console:
+    """Returns a console of Rich for standard output that is a terminal only if standard output is one.
+
+    Notebooks set ``FORCE_COLOR`` for the commands of their cells. Rich would then animate bars and tables there, and every
+    frame would be saved with the notebook.
+    """
+    from rich.console import Console
+
+    is_terminal = getattr(sys.stdout, "isatty", bool)()
+    return Console(force_terminal=None if is_terminal else False, **settings)
 
 
 class Display:

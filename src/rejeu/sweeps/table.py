@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
+from rejeu.reporting import notebook
 from rejeu.reporting.text import counted
 from rejeu.sweeps.coordinator import Coordinator, Outcome, count
 from rejeu.sweeps.folder import Glance, SweepFolder
@@ -28,10 +29,9 @@ Watch = Callable[[Coordinator], None]
 @contextmanager
 def shown(folder: SweepFolder, progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]]:
     """Context in which progress is shown; returns a function to call often, and one to call with each event."""
-    from rich.console import Console
     from rich.live import Live
 
-    console = Console()
+    console = notebook.console()
     if not progress:
         yield (lambda coordinator: None), (lambda text: None)
     elif not console.is_terminal:
