@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from rejeu import devices, spaces, validation, xla
-from rejeu.algorithms import config as configs
+from rejeu.algorithms import config as configs, contract
 from rejeu.callbacks.base import RunFolder, Stateful
 from rejeu.core import Algorithm
 from rejeu.envs.make import Backend, VectorEnv
@@ -163,6 +163,7 @@ class BaseAgent(ABC):
         device: str = "auto",
     ) -> None:
         """Sets the attributes that do not depend on the environment."""
+        contract.check_config(config)
         self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
         self.log = log if tensorboard_log is None else tuple(dict.fromkeys((*log, "tensorboard")))
         self.tensorboard_log = tensorboard_log
@@ -226,7 +227,8 @@ class BaseAgent(ABC):
 
     def algorithm_of(self, config: Any) -> Algorithm:
         """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
-        algorithm = self.algorithm.make(config, self.observation_space, self.action_space)
+        made = self.algorithm.make(config, self.observation_space, self.action_space)
+        algorithm = contract.checked(made, self.action_space)
         if config.normalize is None:
             return algorithm
         explorer = exploration.make(algorithm, self.make_noise())

@@ -93,6 +93,8 @@ class OffPolicyConfig:
     as ``encoder``, ``torso`` and ``head``."""
 
     name: ClassVar[str] = ""
+    is_checked: ClassVar[bool] = False
+    """Whether :meth:`__post_init__` has run; set on each instance."""
     hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
     """Default widths of the networks."""
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
@@ -122,6 +124,7 @@ class OffPolicyConfig:
                 f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "
                 f"try buffer_size={max(10 * self.batch_size, 10_000)} or batch_size={self.buffer_size}"
             )
+        assign(self, is_checked=True)
 
     @property
     def hindsight(self) -> HindsightConfig | None:

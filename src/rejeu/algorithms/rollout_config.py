@@ -46,6 +46,8 @@ class RolloutConfig:
     modules of your own as ``encoder``, ``torso`` and ``head``."""
 
     name: ClassVar[str] = ""
+    is_checked: ClassVar[bool] = False
+    """Whether :meth:`__post_init__` has run; set on each instance."""
     policy_kwargs_class: ClassVar[type[PolicyConfig]] = PolicyConfig
     """The class of ``policy_kwargs``."""
     hidden_layers: ClassVar[Widths] = Widths((64, 64), (64, 64))
@@ -65,6 +67,7 @@ class RolloutConfig:
         assign(self, normalize=normalization.parse(self.normalize))
         coerce(self, "nonfinite", choice, among=("stop", "skip"))
         coerce(self, "policy_kwargs", nested, kind=self.policy_kwargs_class)
+        assign(self, is_checked=True)
 
     def steps_per_gradient(self, n_envs: int) -> int:
         """Returns the number of steps of ``n_envs`` environments per gradient step."""

@@ -11,10 +11,10 @@ import numpy as np
 from jax import Array
 
 from rejeu import xla
+from rejeu.algorithms.contract import check_state
 from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Transition, copy
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
-from rejeu.io.checkpoint import names
 from rejeu.loops import nonfinite
 from rejeu.loops.packing import PackedState, Packing, Readings
 from rejeu.prng import nth
@@ -85,7 +85,6 @@ class Learner:
 
         def step(before: PyTree, batch: Any) -> tuple[PyTree, Metrics]:
             after, metrics = self.algorithm.update(before, batch, clock)
-            check_state(after, self.shapes, "update")
             metrics = {name: jnp.asarray(value) for name, value in metrics.items()}
             return nonfinite.undo(before, after, metrics) if self.skips else (after, metrics)
 
@@ -165,19 +164,3 @@ def td_error_of(metrics: Metrics, batches: Transition | Rollout) -> Array | None
 def is_finite(state: PackedState) -> bool:
     """Returns whether all numbers of a packed state are finite; waits for the device."""
     return all(np.isfinite(array).all() for array in map(np.asarray, state) if array.dtype.kind == "f")
-
-
-def check_state(state: PyTree, expected: PyTree, function: str) -> None:
-    """Raises ``TypeError`` if a leaf of a state differs in shape or dtype from that of ``expected``; runs while tracing.
-
-    ``function`` is that of the algorithm which returned the state.
-    """
-    given, wanted = (dict(zip(names(tree), jax.tree.leaves(tree), strict=True)) for tree in (state, expected))
-    for name in [*wanted, *given]:
-        found, leaf = given.get(name), wanted.get(name)
-        ours, theirs = (
-            "no such leaf" if x is None else f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else repr(x)
-            for x in (leaf, found)
-        )
-        if ours != theirs:
-            raise TypeError(f"{function} returned a state with {name or 'state'}: {theirs}, expected an array {ours}")
