@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from rejeu import presets
 from rejeu.errors import CheckpointError
 from rejeu.tuning import Integers, LogUniform, plan as plans
 
@@ -23,6 +24,13 @@ def test_without_a_preset_the_algorithm_is_named_and_its_defaults_are_compared_w
         plans.make("Acrobot-v1")
     plan = plans.make("Acrobot-v1", "ppo")
     assert (plan.algorithm, plan.default, plan.steps) == ("PPO", {}, 100_000)
+
+
+def test_an_environment_in_jax_is_tuned_on_its_own_backend(tmp_path):
+    plan = plans.make("jax/CartPole-v1", "PPO")
+    assert plan.backend == "jax"
+    path = presets.write(plan.preset({}, "a test"), tmp_path / "preset.json")
+    assert presets.read(path).backend == "jax"
 
 
 def test_what_is_set_is_not_searched():

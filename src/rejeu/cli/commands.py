@@ -64,7 +64,7 @@ class Train(EnvironmentOptions):
     envs: Count = None
     """Environments stepped at once; by default the preset's, else 1."""
     backend: Name = None
-    """auto, envpool, gymnasium, gymnasium-async or ray; by default the preset's, else auto."""
+    """auto, envpool, gymnasium, gymnasium-async, jax or ray; by default the preset's, else auto."""
     restart_workers: Annotated[int, arg(metavar="N")] = 0
     """With --backend gymnasium-async or ray: how many workers that crashed, hung or were lost are restarted."""
     wait_for: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
@@ -182,7 +182,7 @@ class Tune(EnvironmentOptions):
     envs: Count = None
     """Environments stepped at once; by default the preset's, else 1."""
     backend: Name = None
-    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto."""
+    """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
     preset: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """What trials start from and the winner is compared with; by default rejeu's preset, else the algorithm's defaults."""
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
@@ -235,7 +235,7 @@ class Pbt(EnvironmentOptions):
     envs: Count = None
     """Environments that each member steps at once; by default the preset's, else 1."""
     backend: Name = None
-    """auto, envpool, gymnasium or gymnasium-async; by default the preset's, else auto."""
+    """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
     preset: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Hyperparameters that do not change; by default those of rejeu's preset, else the algorithm's defaults."""
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
@@ -271,7 +271,7 @@ class Evaluate(RunOptions):
     minutes: Minutes = None
     """Wall time after which no further episode begins; running episodes are finished."""
     backend: Annotated[str, arg(metavar="NAME")] = "auto"
-    """auto, envpool, gymnasium or gymnasium-async; gymnasium is the environment's own package."""
+    """auto, envpool, gymnasium, gymnasium-async or jax; gymnasium is the environment's own package."""
     device: Device = "auto"
     """As for rejeu train."""
     seed: Count = None

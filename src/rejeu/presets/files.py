@@ -30,7 +30,7 @@ class Content:
     total_steps: Positive
     evaluate_every: Positive
     evaluate_episodes: Annotated[int, Meta(ge=1, le=10_000)]
-    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async)$")] = "auto"
+    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async|jax)$")] = "auto"
     source: Annotated[str, Meta(max_length=1000)] = ""
 
 

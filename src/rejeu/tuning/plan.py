@@ -58,7 +58,7 @@ class Plan:
     steps: Positive
     """Environment steps of a trial."""
     n_envs: EnvCount
-    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async)$")]
+    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async|jax)$")]
     evaluate_every: Positive
     evaluate_episodes: Annotated[int, Meta(ge=1, le=10_000)]
     trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)]
