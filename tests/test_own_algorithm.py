@@ -17,11 +17,13 @@ import pytest
 
 import rejeu
 from rejeu import presets
-from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.agents import modules_of
+from rejeu.algorithms.config import OffPolicyConfig, to_json
 from rejeu.callbacks import Checkpoint
 from rejeu.core import TD_ERROR, Transition
 from rejeu.errors import CheckpointError
 from rejeu.loops.learner import Learner
+from rejeu.reporting.runs import Run
 from tests.environments import Reach
 
 ROOT = Path(__file__).parents[1]
@@ -169,6 +171,30 @@ def test_an_agent_without_a_named_configuration_is_refused(algorithm):
         Nameless.algorithm = algorithm
     with pytest.raises(ValueError, match=r"Nameless needs a class attribute algorithm .* name: ClassVar"):
         rejeu.register(Nameless)
+
+
+def test_other_processes_are_told_what_to_import(awac):
+    assert modules_of("SAC", ()) == modules_of("sac", ()) == ()
+    assert modules_of("AWAC", ()) == ("awac",)  # its entry point
+    assert modules_of("AWAC", ["my_awac.py"]) == ("my_awac.py",)
+    with pytest.raises(ValueError, match=r"Own is registered in this program only, .*--import my_algorithm\.py"):
+        modules_of("Own", ())
+
+
+def test_a_report_shows_what_differs_and_the_command_that_repeats_the_run(awac):
+    saved = to_json(awac.Config(beta=3.0, gamma=0.9))
+    run = Run(
+        path=Path("run"),
+        name="run",
+        algorithm="AWAC",
+        env_id="Pendulum-v1",
+        seed=1,
+        config={"imports": ["my awac.py"], "env_argument": "Pendulum-v1"},
+        hyperparameters=saved,
+    )
+    assert run.changed == {"gamma": (0.9, 0.99), "beta": (3.0, 1.0)}
+    words = "--algo AWAC --seed 1 --import 'my awac.py' --set gamma=0.9 beta=3.0"
+    assert run.command == f"rejeu train Pendulum-v1 {words}"
 
 
 def with_update(awac, change):

@@ -10,6 +10,7 @@ import numpy as np
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
+from rejeu.tuning import LogUniform
 
 env: gym.Env = gym.make("Pendulum-v1")
 agent = rejeu.SAC("MlpPolicy", env, learning_rate=1e-3, seed=0)
@@ -22,6 +23,12 @@ rejeu.register(rejeu.SAC)
 vector = rejeu.make_vec("Pendulum-v1", 2)
 batch = rejeu.Transition(0, 0, 0.0, 0, 1.0)
 print(batch.reward, vector.n_envs)
+agents = rejeu.train_seeds(rejeu.PQN, "MlpPolicy", "jax/CartPole-v1", 1_000, seeds=2, device="cpu")
+print(agents[0].q_values(np.zeros(4)).shape)
+sweep = rejeu.sweep({"environments": ["CartPole-v1"], "seeds": 2}, "runs/sweep", workers=2)
+print(sweep.counts(), rejeu.compare(sweep.path).table(), rejeu.write_report(sweep.runs).name)
+study = rejeu.tune("Pendulum-v1", "SAC", trials=2, search={"learning_rate": LogUniform(1e-4, 1e-2)})
+print(study.best, None if study.preset is None else study.preset.hyperparameters)
 rejeu.SACC
 agent.lern(3)
 """

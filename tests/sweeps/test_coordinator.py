@@ -72,6 +72,14 @@ def make_jobs(n=4, **more):
     return tuple(Job(name=f"job-{i}", env="CartPole-v1", seed=i, **more) for i in range(n))
 
 
+def test_an_algorithm_that_no_other_process_knows_is_refused(tmp_path):
+    folder = open_folder(tmp_path / "sweep", Sweep(jobs=make_jobs(2, algorithm="Own"), threads=1), None, Code())
+    with pytest.raises(ValueError, match=r"Own is registered in this program only.*imports=\['my_algorithm.py'\]"):
+        Coordinator(folder, Launcher(), Interrupt(), Code())
+    code = Code(imports=("own.py",))
+    assert Coordinator(folder, Launcher(), Interrupt(), code).code == code
+
+
 def make_folder(tmp_path, n=4):
     return open_folder(tmp_path / "sweep", Sweep(jobs=make_jobs(n), threads=1), None, Code())
 

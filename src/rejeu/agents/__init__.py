@@ -4,7 +4,7 @@ from rejeu.agents.agent import Agent
 from rejeu.agents.base import whole_seed
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
 from rejeu.agents.on_policy import A2C, PPO, PQN, MaskablePPO, OnPolicyAgent, RecurrentPPO
-from rejeu.agents.registry import AGENTS, agent_of_file, find_agent, load, register
+from rejeu.agents.registry import AGENTS, agent_of_file, find_agent, load, modules_of, register
 from rejeu.callbacks.base import Callback
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "agent_of_file",
     "find_agent",
     "load",
+    "modules_of",
     "register",
     "whole_seed",
 ]

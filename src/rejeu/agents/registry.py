@@ -13,6 +13,7 @@ from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ
 from rejeu.agents.on_policy import A2C, PPO, PQN, MaskablePPO, RecurrentPPO
+from rejeu.algorithms import config as configs
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.presets import Preset
@@ -57,6 +58,8 @@ def register(agent: A, presets: Iterable[Preset] = ()) -> A:
         if preset.algorithm != name:
             raise ValueError(f"the preset of {preset.env_id} is for {preset.algorithm!r}, not {name!r}")
     AGENTS[name] = agent
+    if name not in BUILT_IN:
+        configs.registered[name] = config
     all_presets.register(name, given)
     return agent
 
@@ -100,6 +103,23 @@ def entry_point(name: str) -> metadata.EntryPoint | None:
     """Returns the entry point of an algorithm that an installed package offers, without importing it."""
     offered = metadata.entry_points(group=ENTRY_POINTS)
     return next((one for one in offered if one.name.lower() == name.lower()), None)
+
+
+def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
+    """Returns the modules that another process must import to know an algorithm: ``imports``, else that of its entry point.
+
+    Raises:
+        ValueError: if only this process knows it, such as one of a notebook.
+    """
+    given = tuple(imports)
+    if given or algorithm.lower() in {name.lower() for name in BUILT_IN}:
+        return given
+    if (found := entry_point(algorithm)) is not None:
+        return (found.module,)
+    raise ValueError(
+        f"{algorithm} is registered in this program only, and each run is a process of its own; write the algorithm into a "
+        "file, and name that: imports=['my_algorithm.py'], or --import my_algorithm.py"
+    )
 
 
 def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:

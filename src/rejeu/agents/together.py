@@ -36,8 +36,6 @@ from rejeu.reporting.logging import Sink
 from rejeu.validation import whole
 
 A = TypeVar("A", bound=Agent)
-STATIC = ("buffer_size", "learning_starts", "batch_size", "n_steps", "n_epochs")
-"""Whole numbers on which the shapes or the course of a program depend, which runs of one program therefore share."""
 IN_REPLAY = ("gamma",)
 """Numbers that the replay buffer on the device is compiled with."""
 
@@ -295,7 +293,8 @@ def check_differing(agent: Agent, names: Iterable[str]) -> None:
     for name in names:
         if name not in kinds:
             raise ValueError(f"{name} is no hyperparameter of {agent.name} and is equal for all runs; give one value")
-        if name in STATIC or "float" not in kinds[name] or (name in IN_REPLAY and hasattr(agent.config, "buffer_size")):
+        in_replay = name in IN_REPLAY and isinstance(agent.config, OffPolicyConfig)
+        if "float" not in kinds[name] or in_replay:
             raise ValueError(
                 f"{name} cannot differ between the runs of one program, which is compiled for its value; give one number, or "
                 "train one program for each"

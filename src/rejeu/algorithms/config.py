@@ -31,6 +31,8 @@ REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
 """The replay buffers by name, and the configuration of each."""
 OWN = "own"
 """Key of the name by which a file mentions an object of the user's own."""
+registered: dict[str, Any] = {}
+"""The configurations of algorithms that are not rejeu's, by name; :func:`rejeu.register` adds to it."""
 OWN_MODULES = ("encoder", "torso", "head")
 """Settings of ``policy_kwargs`` that are modules of the user's own."""
 

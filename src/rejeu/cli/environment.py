@@ -43,6 +43,8 @@ class Environment:
     """As typed, innermost first."""
     wrappers: tuple[Callable[[Any], Any], ...]
     """The same, imported."""
+    modules: tuple[str, ...] = ()
+    """What ``--import`` named, as typed."""
 
     def make(self, **more: Any) -> gym.Env:
         """Returns a new one; ``more`` are further keyword arguments, such as ``render_mode``."""
@@ -83,13 +85,16 @@ class Environment:
         return register(self.env_id)
 
     def options(self) -> str:
-        """Returns what ``rejeu evaluate RUN`` and the like need to make it again; empty if the id is enough.
+        """Returns what ``rejeu evaluate RUN`` and the like need to make it again, and to import; empty if the id is enough.
 
         >>> Environment("Walk-v0", "my_env:Walk-v0", {"g": 9.8}, (), ()).options()
         ' --env my_env:Walk-v0 --env-kwargs g=9.8'
+        >>> Environment("Walk-v0", "Walk-v0", {}, (), (), modules=("my_algorithm.py",)).options()
+        ' --import my_algorithm.py'
         """
         recorded = not imports(self.typed) and not self.wrapper_names and are_plain(dict(self.kwargs))
-        return "" if recorded else options(self.typed, self.kwargs, self.wrapper_names)
+        made = "" if recorded else options(self.typed, self.kwargs, self.wrapper_names)
+        return made + "".join(f" --import {shlex.quote(name)}" for name in self.modules)
 
     def __str__(self) -> str:
         parts = [f"{key}={value!r}" for key, value in self.kwargs.items()]
@@ -129,7 +134,7 @@ def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
     """
     kwargs = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
     wrappers = tuple(find_wrapper(name) for name in given.wrapper)
-    return Environment(find_id(env), env, kwargs, given.wrapper, wrappers)
+    return Environment(find_id(env), env, kwargs, given.wrapper, wrappers, given.imports)
 
 
 def from_run(
@@ -171,4 +176,4 @@ def from_run(
             f"for; if you trust it, name it again:{again if len(again) < 500 and again.isprintable() else ' --env ENV'}"
         )
     wrappers = tuple(find_wrapper(name) for name in given.wrapper)
-    return Environment(env_id, env_id, {**kept, **own}, given.wrapper, wrappers)
+    return Environment(env_id, env_id, {**kept, **own}, given.wrapper, wrappers, given.imports)

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rejeu.agents import modules_of
 from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Pbt, Resume
 from rejeu.cli.environment import Environment
@@ -38,7 +39,7 @@ def pbt(arguments: Pbt) -> tuple[int, dict[str, Any]]:
     )
     name = re.sub(r"[^\w.-]+", "-", f"pbt-{made.env_id}-{population.plan.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}")
     members = trained.create(arguments.out or Path("runs") / name, population)
-    return train(members, made, arguments.imports, arguments.workers)
+    return train(members, made, arguments.workers)
 
 
 def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
@@ -54,12 +55,10 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     made = environment.from_run(plan.env_id, plan.env_argument, plan.env_kwargs, plan.wrappers, members.path, arguments)
     if made.env_id != plan.env_id:
         raise ValueError(f"{arguments.run} is a population of {plan.env_id}, not of {made.env_id}")
-    return train(members, made, arguments.imports, arguments.workers)
+    return train(members, made, arguments.workers)
 
 
-def train(
-    members: Members, made: Environment, imports: tuple[str, ...], workers: int | None
-) -> tuple[int, dict[str, Any]]:
+def train(members: Members, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
     """Trains a population to its end; returns the exit status and the result."""
     population, plan = members.population, members.population.plan
     at_once = min(workers or default_workers(), population.members)
@@ -69,14 +68,13 @@ def train(
     for i, (name, dimension) in enumerate(plan.search_space.items()):
         echo(f"{'changing' if i == 0 else '':<14}{name}: {dimension}")
     echo(f"folder        {members.path}")
-    options = env_options(made.kwargs, made.wrapper_names, imports)
+    options = env_options(made.kwargs, made.wrapper_names, modules_of(plan.algorithm, made.modules))
     command = Command(made.typed, options, variables(threads_of(at_once)))
     with members.lock(), Interrupt() as stop:
         complete = trained.train(members, command, at_once, stop, echo)
     result = as_dict(members, complete, stop.signal)
     if stop.signal is not None:
-        again = "".join(f" --import {name}" for name in imports)
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {members.path}{made.options()}{again} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {members.path}{made.options()} continues")
         return 128 + stop.signal, result
     echo(f"\nbest member   {result['best']['member']}: {plan.measure} {result['best']['score']:,.4g}")
     echo(f"model         {members.path / 'best.safetensors'}")

@@ -143,6 +143,8 @@ class RunConfig:
     """Keyword arguments of the environment."""
     wrappers: tuple[str, ...] = ()
     """Names of its wrappers, innermost first; used in messages only."""
+    imports: tuple[str, ...] = ()
+    """What ``--import`` named; used in messages only. Missing in older folders."""
     log: tuple[LogName, ...] = ()
     """Logs beside ``metrics.csv``."""
     wait_for: Positive | None = None

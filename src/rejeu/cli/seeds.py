@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shlex
 import time
 from itertools import chain
 from pathlib import Path
@@ -63,7 +64,7 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
     ]
     result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {path}{again(jobs[0])} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {path}{again(jobs[0], code)} continues")
         return 128 + stop.signal, result
     return (2 if any(one.state == "failed" for one in outcomes) else 0), result
 
@@ -107,6 +108,7 @@ def choose_folder(arguments: Train) -> Path:
     return arguments.out or Path("runs") / re.sub(r"[^\w.-]+", "-", name)
 
 
-def again(job: Job) -> str:
-    """Returns the options that ``rejeu resume`` needs to import the environment again."""
-    return "".join(f" {word}" for word in ["--env", job.env, *job.environment_words()]) if job.names_code else ""
+def again(job: Job, code: Code) -> str:
+    """Returns the options that ``rejeu resume`` needs to import the same again."""
+    words = ["--env", job.env, *job.environment_words()] if job.names_code else []
+    return "".join(f" {shlex.quote(word)}" for word in [*words, *code.words()])

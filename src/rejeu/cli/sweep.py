@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,8 @@ def complete(
         "comparison": None if comparison is None else comparison.table(),
     }
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {folder.path} continues")
+        again = "".join(f" {shlex.quote(word)}" for word in code.words())
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {folder.path}{again} continues")
         return 128 + stop.signal, content
     return (2 if result.failed else 0), content
 

@@ -74,7 +74,10 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
     ]
     result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {path} continues, each seed in a process of its own")
+        again = seeds.again(jobs[0], code)
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {path}{again} continues, each seed in a process of its own"
+        )
         return 128 + stop.signal, result
     return max(statuses), result
 

@@ -188,6 +188,7 @@ def make_config(
         env_argument=made.typed,
         env_kwargs=dict(made.kwargs),
         wrappers=made.wrapper_names,
+        imports=made.modules,
         algorithm=algorithm,
         preset=preset is not None,
         hyperparameters=configs.to_json(config),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 
 from rejeu import presets, tuning
-from rejeu.agents import AGENTS, agent_of_file, find_agent
+from rejeu.agents import AGENTS, agent_of_file, find_agent, modules_of
 from rejeu.algorithms.search import Dimension
 from rejeu.cli import environment, jsonout, settings
 from rejeu.cli.commands import Pbt, Resume, Tune
@@ -44,7 +44,7 @@ def tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
     made = environment.from_arguments(arguments.env, arguments)
     made.vector(1, arguments.backend or "auto", arguments.seed).close()
     study = tuning.open_study(make_plan(arguments, made), arguments.out)
-    return complete(study, made, arguments.imports, arguments.workers)
+    return complete(study, made, arguments.workers)
 
 
 def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
@@ -64,7 +64,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     )
     if made.env_id != plan.env_id:
         raise ValueError(f"{arguments.run} is a study of {plan.env_id}, not of {made.env_id}")
-    return complete(study, made, arguments.imports, arguments.workers)
+    return complete(study, made, arguments.workers)
 
 
 def make_plan(arguments: Tune, made: Environment) -> Plan:
@@ -119,18 +119,15 @@ def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, 
     return dict(space.parse(one, declared) for one in assignments)
 
 
-def complete(
-    study: Study, made: Environment, imports: tuple[str, ...], workers: int | None
-) -> tuple[int, dict[str, Any]]:
+def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
-    options = env_options(made.kwargs, made.wrapper_names, imports)
+    options = env_options(made.kwargs, made.wrapper_names, modules_of(study.plan.algorithm, made.modules))
     with Interrupt() as stop, display(study) as watch:
         result = tuning.run(study, made.typed, options, workers, stop, watch, echo)
     echo()
     if stop.signal is not None:
-        again = "".join(f" --import {name}" for name in imports)
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {study.folder.path}{made.options()}{again} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {study.folder.path}{made.options()} continues")
     echo(str(result))
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()

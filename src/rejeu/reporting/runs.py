@@ -126,7 +126,7 @@ class Run:
     def changed(self) -> dict[str, tuple[Any, Any]]:
         """Value and default of each hyperparameter that differs from the algorithm's default, by dotted name.
 
-        Empty if the algorithm is none of rejeu's.
+        Empty if the algorithm is neither rejeu's nor registered.
         """
         defaults = default_hyperparameters(self.algorithm)
         if not defaults:
@@ -147,6 +147,12 @@ class Run:
         named = [["--wrapper", text(one)] for one in (wrappers if isinstance(wrappers, list) else ())]
         return [*(["--env-kwargs", *pairs] if pairs else []), *chain.from_iterable(named)]
 
+    @property
+    def import_words(self) -> list[str]:
+        """The options of a command line that import what the run imported."""
+        imports = self.config.get("imports")
+        return [*chain.from_iterable(("--import", text(one)) for one in (imports if isinstance(imports, list) else ()))]
+
     @cached_property
     def command(self) -> str:
         """The command that repeats the run, made from its configuration; empty if that is not known."""
@@ -161,12 +167,17 @@ class Run:
         options |= {name: config.get(name) for name in others}
         for name, value in options.items():
             words += [] if value is None else [f"--{name.replace('_', '-')}", text(value)]
-        words += self.env_words
+        words += [*self.env_words, *self.import_words]
         preset = presets.find(self.env_id, self.algorithm)
         usual = default_hyperparameters(self.algorithm, preset.hyperparameters if preset else {})
         taken = dict(flat(usual))  # by rejeu train if nothing is set
         values = dict(flat(self.hyperparameters))
-        names = [name for name in values if name in self.changed or values[name] != taken.get(name, values[name])]
+        same = {
+            name
+            for name in values
+            if usual and name not in self.changed and taken.get(name, values[name]) == values[name]
+        }
+        names = [name for name in values if name not in same]
         if names:
             words += ["--set", *(f"{name}={assigned(values[name])}" for name in names)]
         return shlex.join(shown(word, MAX_WORD) for word in words)
@@ -389,7 +400,7 @@ def is_file(path: Path) -> bool:
 
 
 def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """Returns ``given`` and the defaults of one of rejeu's algorithms as JSON values; empty for another."""
+    """Returns ``given`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
     from rejeu.algorithms import (
         a2c,
         config,
@@ -407,7 +418,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
     )
 
     modules: tuple[Any, ...] = (a2c, crossq, ddpg, dqn, maskable_ppo, ppo, pqn, qrdqn, recurrent_ppo, sac, td3, tqc)
-    kinds = {module.Config.name: module.Config for module in modules}
+    kinds = {module.Config.name: module.Config for module in modules} | config.registered
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -11,6 +12,7 @@ from typing import Protocol
 
 from filelock import FileLock
 
+from rejeu.agents import modules_of
 from rejeu.interrupt import Interrupt
 from rejeu.supervised import TAKEN
 from rejeu.sweeps.folder import State, SweepFolder
@@ -95,8 +97,14 @@ class Coordinator:
             code: what runs import.
             retry: whether jobs that have failed are tried again, once.
             say: called with a line for each event.
+
+        Raises:
+            ValueError: if the processes of the runs could not find an algorithm.
         """
-        self.folder, self.launcher, self.stop, self.code, self.say = folder, launcher, stop, code, say
+        algorithms = {job.algorithm: None for job in folder.jobs if job.algorithm is not None}
+        modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, code.imports)}
+        self.folder, self.launcher, self.stop, self.say = folder, launcher, stop, say
+        self.code = dataclasses.replace(code, imports=tuple(modules) or code.imports)
         self.running: list[Attempt] = []
         self.retried = {job.name for job in folder.jobs if folder.exit_status(job)} if retry else set[str]()
         """Names of failed jobs that are still to be tried again."""

@@ -6,12 +6,13 @@ See :mod:`rejeu.tuning.study` for the files, :mod:`rejeu.algorithms.search` for 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rejeu import envs, presets
+from rejeu.agents import modules_of
 from rejeu.algorithms.search import Choice, Integers, LogUniform, NearOne, SearchSpace, Uniform
 from rejeu.errors import MissingExtra
 from rejeu.interrupt import Interrupt
@@ -98,6 +99,7 @@ def tune(
     seed: int = 0,
     pruner: Pruner = "median",
     measure: Measure = "return",
+    imports: Sequence[str] = (),
 ) -> Result:
     """Searches hyperparameters, and compares the best ones with the default on fresh seeds.
 
@@ -126,6 +128,7 @@ def tune(
         seed: determines what is sampled and the seeds of all trainings.
         pruner: ``"median"``, ``"halving"`` (successive halving) or ``"none"``.
         measure: what is maximized: the mean ``"return"`` of the last evaluation, or its ``"success"`` rate.
+        imports: modules and Python files that each training imports first, such as one that registers the algorithm.
 
     Ctrl-C and SIGTERM stop the trainings with a checkpoint; ``signal`` of the result is then set.
 
@@ -154,11 +157,12 @@ def tune(
         pruner=pruner,
         measure=measure,
     )
+    options = env_options(plan.env_kwargs, (), modules_of(plan.algorithm, imports))
     study = open_study(plan, None if folder is None else Path(folder))
     echo: Echo = print if verbose else lambda text: None
     watch = lines(echo, study) if verbose else lambda outcomes: None
     with Interrupt() as stop:
-        result = run(study, plan.env_argument, env_options(plan.env_kwargs), workers, stop, watch, echo)
+        result = run(study, plan.env_argument, options, workers, stop, watch, echo)
     echo(str(result))
     return result
 

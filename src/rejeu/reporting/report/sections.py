@@ -326,11 +326,12 @@ def replay_command(run: Run) -> str:
 
 
 def env_options(run: Run) -> str:
-    """Returns what commands about the run need to make its environment again; empty if its id is enough."""
+    """Returns what commands about the run need to make its environment again, and to import; empty if its id is enough."""
     words = run.env_words
-    if not words and run.env_argument == run.env_id:
-        return ""
-    return " " + shlex.join(shown(word, MAX_WORD) for word in ["--env", run.env_argument, *words])
+    if words or run.env_argument != run.env_id:
+        words = ["--env", run.env_argument, *words]
+    words += run.import_words
+    return " " + shlex.join(shown(word, MAX_WORD) for word in words) if words else ""
 
 
 def quoted(path: Path) -> str:
