@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from gymnasium import spaces
 
@@ -170,9 +171,19 @@ def supported(algorithm: str) -> str:
         ("HER, prioritized replay, n-step returns", "yes" if is_off_policy else "no (on-policy)"),
         ("action masks", "yes" if agent.takes_masks else "no"),
         ("memory (LSTM, GRU)", "yes" if "cell" in validation.field_names(type(config.policy_kwargs)) else "no"),
-        ("normalization, schedules, own networks", "yes"),
+        ("normalization, schedules", "yes"),
+        ("custom modules as encoder, torso or head", "yes" if takes_modules(agent.algorithm.Config) else "no"),
     ]
     return table(("", "supported"), rows)
+
+
+def takes_modules(config_class: Any) -> bool:
+    """Returns whether the networks of an algorithm may contain modules of the user's own."""
+    try:
+        config_class(policy_kwargs={"torso": eqx.nn.Identity})
+    except ValueError:
+        return False
+    return True
 
 
 def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_space: spaces.Space) -> bool:
