@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: requests while training, the end of the command everywhere else."""
+"""Ctrl-C, SIGTERM and SIGHUP: requests while training, the end of the command everywhere else."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_handlers_are_put_back():
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-@pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_swallowed(number, status):
     script = f"""if True:
         import gc, importlib.util, os, signal
@@ -58,6 +58,58 @@ def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_swallowed(nu
     """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "rejeu: stopped\n")
+
+
+def test_a_closed_terminal_stops_training_as_sigterm_does():
+    with Interrupt() as stop:
+        raise_signal(signal.SIGHUP)
+    assert stop.signal == signal.SIGHUP
+
+
+def test_output_to_a_closed_terminal_is_no_error():
+    script = """if True:
+        import os, pty, signal, sys
+        from rejeu.interrupt import Interrupt
+        pid, terminal = pty.fork()
+        if pid:
+            os.read(terminal, 5)
+            os.close(terminal)
+            sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+        with Interrupt() as stop:
+            print("ready", flush=True)
+            while not stop.requested:
+                signal.pause()
+            print("stopped", flush=True)
+        os._exit(stop.signal)
+    """
+    assert subprocess.run([sys.executable, "-c", script]).returncode == signal.SIGHUP
+
+
+def test_under_nohup_a_closed_terminal_is_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupt() as stop, interrupt.leaving():
+            raise_signal(signal.SIGHUP)
+        assert stop.signal is None
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_while_a_file_is_written_leaves_the_old_file_and_no_other(tmp_path):
+    (tmp_path / "page.html").write_text("old")
+    script = f"""if True:
+        import os, pathlib, signal
+        from rejeu import interrupt
+        from rejeu.io import atomic
+        with interrupt.leaving("stopped"), atomic.replacing(pathlib.Path({str(tmp_path / "page.html")!r})) as file:
+            file.write(b"half of the new")
+            os.kill(os.getpid(), signal.SIGTERM)
+    """
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (143, "rejeu: stopped\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+    assert (tmp_path / "page.html").read_text() == "old"
 
 
 @pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143)])

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: requests to stop training after the current step, and the end of the command ``rejeu``.
+"""Ctrl-C, SIGTERM and SIGHUP: requests to stop training after the current step, and the end of the command ``rejeu``.
 
 A signal handler here only raises an exception if a second signal arrives. Python runs handlers between any two
 instructions of the main thread, also inside callbacks of C libraries (JAX's garbage collection), which print and
@@ -7,6 +7,7 @@ discard exceptions. A handler therefore either records the signal, which other c
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -18,13 +19,18 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, NoReturn
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+HANGUP: int | None = getattr(signal, "SIGHUP", None)
+"""The signal of a closed terminal; None on Windows."""
 NAMES: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+NAMES |= {} if HANGUP is None else {HANGUP: "SIGHUP"}
 Handler = Callable[[int, FrameType | None], Any]
+
+unfinished: set[Path] = set()
+"""Temporary files, which :func:`leave` removes."""
 
 
 class Stopped(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM, raised where no operation is incomplete."""
+    """Ctrl-C, SIGTERM or SIGHUP, raised where no operation is incomplete."""
 
     def __init__(self, number: int) -> None:
         super().__init__(NAMES[number])
@@ -32,7 +38,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Interrupt:
-    """Context in which the first Ctrl-C or SIGTERM sets ``requested``. A second signal takes effect immediately.
+    """Context in which the first Ctrl-C, SIGTERM or SIGHUP sets ``requested``. A second signal takes effect immediately.
 
     A nested context passes signals on to the outer one, so both are set. Outside of the main thread, where Python does
     not allow signal handlers, it does nothing.
@@ -53,6 +59,8 @@ class Interrupt:
         return self
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if number == HANGUP:
+            detach()
         first = not self.requested
         if first:
             self.signal = number
@@ -75,11 +83,25 @@ class Interrupt:
         restore(self._previous)
 
 
+def detach() -> None:
+    """Redirects outputs to a terminal that was closed to nowhere, because writing to it raises an error."""
+    for handle in (1, 2):
+        try:
+            os.get_terminal_size(handle)
+        except OSError as error:
+            if error.errno == errno.EIO:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), handle)
+
+
 def install(handler: Handler) -> dict[int, Any]:
-    """Installs a handler for both signals and returns the previous handlers; none outside of the main thread."""
+    """Installs a handler for all signals and returns the previous handlers; none outside of the main thread.
+
+    SIGHUP remains ignored if it is, as under ``nohup``.
+    """
     if threading.current_thread() is not threading.main_thread():
         return {}
-    return {number: signal.signal(number, handler) for number in SIGNALS}
+    numbers = [n for n in NAMES if n != HANGUP or signal.getsignal(n) != signal.SIG_IGN]
+    return {number: signal.signal(number, handler) for number in numbers}
 
 
 def restore(previous: dict[int, Any]) -> None:
@@ -90,7 +112,7 @@ def restore(previous: dict[int, Any]) -> None:
 
 @contextmanager
 def leaving(text: str = "interrupted") -> Iterator[None]:
-    """Context in which Ctrl-C and SIGTERM end the process immediately and print ``text``; see :func:`leave`."""
+    """Context in which these signals end the process immediately and print ``text``; see :func:`leave`."""
     previous = install(lambda number, frame: leave(number, text))
     try:
         yield
@@ -99,11 +121,15 @@ def leaving(text: str = "interrupted") -> Iterator[None]:
 
 
 def leave(number: int, text: str = "interrupted") -> NoReturn:
-    """Ends the process with one line on standard error and the exit status that shells use: 130 or 143.
+    """Ends the process with one line on standard error and the exit status that shells use: 130, 143 or 129.
 
     The stack is not unwound, so no code can catch the exit. Call it only where no operation is incomplete. Files are
-    written to a temporary path and renamed, and worker processes exit when their pipe closes.
+    written to a temporary path and renamed; that of an unfinished file is removed. Worker processes exit when their pipe
+    closes.
     """
+    for path in tuple(unfinished):
+        with suppress(OSError):
+            path.unlink()
     show_cursor = b"\x1b[?25h" if os.isatty(2) else b""  # progress bars hide it
     with suppress(OSError):  # the reader may have closed the pipe
         os.write(2, show_cursor + f"rejeu: {text}\n".encode(errors="replace"))
@@ -120,6 +146,6 @@ def is_command() -> bool:
 
 
 def guard_imports() -> None:
-    """Lets Ctrl-C and SIGTERM end the command ``rejeu`` with one line while it imports. Otherwise does nothing."""
+    """Lets these signals end the command ``rejeu`` with one line while it imports. Otherwise does nothing."""
     if is_command():
         install(lambda number, frame: leave(number))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import re
 import threading
 import warnings
@@ -15,7 +16,7 @@ import pytest
 import rejeu
 from rejeu.callbacks import Evaluate
 from rejeu.reporting import trackers
-from rejeu.reporting.logging import JsonLines, check_logs
+from rejeu.reporting.logging import CsvFile, JsonLines, check_logs
 from tests.helpers import small_sac
 
 BALL = "rejeu/Ball-v0"
@@ -37,6 +38,38 @@ def test_json_lines_that_are_continued_keep_the_complete_rows_up_to_a_step(tmp_p
     path.write_bytes(b'{"step": 1}\n[' + b"[" * 100_000 + b'\n7\n{"step": "x"}\n{"step": 2}\n{"step": 3}\n{"step": 2')
     JsonLines(path, up_to=2).write(3, {"a": 1.0})
     assert lines(path) == [{"step": 1}, {"step": 2}, {"step": 3, "a": 1.0}]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"stfp,a\r\n1,2\r\n", b"step,a\r\n1," + b"2" * 200_000 + b"\r\n", b'step,a\r\n1,"2\r\n' + b"3,4\r\n" * 40_000],
+    ids=["no step", "a long cell", "a quote that does not end"],
+)
+def test_a_table_that_cannot_be_continued_is_kept_under_another_name(tmp_path, content):
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(content)
+    with pytest.warns(UserWarning, match=r"metrics.csv is damaged and is now metrics.csv.damaged; a new table begins"):
+        CsvFile(path, up_to=10).write(11, {"a": 1.0})
+    assert (tmp_path / "metrics.csv.damaged").read_bytes() == content
+    assert path.read_text().splitlines() == ["step,a", "11,1.0"]
+
+
+def test_damaged_rows_of_a_table_are_left_out_when_it_is_continued(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_bytes("step,a\r\n1,2\r\n²,3\r\n".encode() + b"2,\xff\r\n" + b"9" * 5000 + b",4\r\n3\r\n4,5,6\r\n5,7\r\n")
+    CsvFile(path, up_to=10)
+    assert path.read_text(encoding="utf-8").splitlines() == ["step,a", "1,2", "2,\ufffd", "5,7"]
+
+
+@pytest.mark.parametrize("log", [CsvFile, JsonLines])
+def test_a_log_larger_than_any_is_not_read(tmp_path, log, monkeypatch):
+    monkeypatch.setattr("rejeu.reporting.logging.MAX_LOG_BYTES", 2**20)
+    path = tmp_path / "metrics"
+    path.touch()
+    os.truncate(path, 2**40)
+    with pytest.raises(OSError, match="metrics has more than 0 GiB; move it to another folder, and a new one begins"):
+        log(path, up_to=10)
+    assert path.stat().st_size == 2**40
 
 
 def test_an_unknown_log_is_an_error_that_lists_the_known_ones():

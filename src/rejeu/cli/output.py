@@ -17,6 +17,7 @@ from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.cli.environment import Environment
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.interrupt import NAMES
+from rejeu.io import atomic
 from rejeu.reporting.logging import Sink
 from rejeu.reporting.text import counted
 
@@ -150,8 +151,8 @@ def noted_in(path: Path) -> Iterator[None]:
     show = warnings.showwarning
 
     def note(text: object) -> None:
-        with suppress(OSError), path.open("a", encoding="utf-8") as file:
-            print(*str(text).split(), file=file)
+        with suppress(OSError), atomic.open_log(path) as file:
+            file.write((" ".join(str(text).split()) + "\n").encode())
 
     def show_and_note(message: Warning | str, *arguments: Any, **options: Any) -> None:
         show(message, *arguments, **options)

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from rejeu import interrupt
+
 STALE = 3600.0
 """Age in seconds from which a temporary file is taken for one that a killed process left behind."""
 
@@ -47,6 +49,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             raise OSError(errno.EISDIR, "there is a folder, or something else that is not a file, of that name")
         make_folder(path.parent)
         remove_stale(path)
+        interrupt.unfinished.add(temporary)
         try:
             with temporary.open("xb") as file:
                 yield file
@@ -57,6 +60,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
+        finally:
+            interrupt.unfinished.discard(temporary)
     except OSError as error:
         raise _explained(error, path) from error
     _sync_folder(path.parent)
@@ -83,9 +88,11 @@ def append(path: Path, content: bytes) -> None:
     """Appends bytes to a file, all of them or none; they are not synced to disk.
 
     Raises:
-        OSError: if that is impossible, as for :func:`replacing`; the file is then as long as before.
+        OSError: if that is impossible, as for :func:`replacing`, or the path is a symbolic link; the file is then as long as
+            before.
     """
     try:
+        check_no_link(path)
         with path.open("r+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             try:
@@ -97,6 +104,22 @@ def append(path: Path, content: bytes) -> None:
                 raise
     except OSError as error:
         raise _explained(error, path) from error
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Opens a file to which lines are added, a new one if there is none.
+
+    Raises:
+        OSError: if that is impossible, or the path is a symbolic link.
+    """
+    check_no_link(path)
+    return path.open("ab")
+
+
+def check_no_link(path: Path) -> None:
+    """Raises ``OSError`` if a path is a symbolic link, through which a folder from elsewhere could change any file."""
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, f"{shortened(path)} is a symbolic link; remove it")
 
 
 def remove_stale(path: Path, age: float = STALE) -> None:

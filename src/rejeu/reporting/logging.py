@@ -7,9 +7,11 @@ import io
 import json
 import math
 import os
+import re
 import secrets
 import socket
 import time
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,10 +24,13 @@ from rejeu.io import atomic
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.reporting import trackers
 from rejeu.reporting.notebook import Display
+from rejeu.reporting.tables import read_bytes
 from rejeu.reporting.trackers import Background, MLflow, Tracker, Trackio, WandB
 
 LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
 """What the argument ``log`` takes."""
+MAX_LOG_BYTES = 2**30
+"""Upper limit on the size of a log that is continued."""
 
 
 class Sink(Protocol):
@@ -102,20 +107,21 @@ class CsvFile:
 
     Args:
         path: path of the file.
-        up_to: step up to which the rows of an existing file are kept; None starts an empty file.
+        up_to: step up to which the rows of an existing file are kept; None starts an empty file. A file that is no table with
+            a column ``step`` is renamed, with a warning.
+
+    Raises:
+        OSError: if an existing file cannot be read, is a symbolic link, or is larger than ``MAX_LOG_BYTES``.
     """
 
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
         self.path = Path(path)
         self._columns: list[str] = []
-        kept: list[dict[str, str]] = []
-        if up_to is not None and self.path.exists():
-            rows = [row for row in self._read() if (row.get("step") or "").isdigit()]
-            kept = [row for row in rows if int(row["step"]) <= up_to and None not in row and None not in row.values()]
+        kept = [] if up_to is None or not self.path.exists() else self._rows_up_to(up_to)
         if kept:
             self._columns = [*kept[0]]
         content = self._header() + self._lines(kept)
-        if not self.path.exists() or self.path.read_bytes() != content:
+        if up_to is None or not self.path.exists() or read_log(self.path) != content:
             self._replace(content)
 
     def __str__(self) -> str:
@@ -143,8 +149,23 @@ class CsvFile:
         """Does nothing, because rows are not buffered."""
 
     def _read(self) -> list[dict[str, str]]:
-        with self.path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(line for line in file if "\0" not in line))
+        text = read_log(self.path).decode("utf-8", "replace")
+        return list(csv.DictReader(line for line in io.StringIO(text, newline="") if "\0" not in line))
+
+    def _rows_up_to(self, step: int) -> list[dict[str, str]]:
+        """Returns the complete rows up to a step; none, with a warning, if the file is no table with steps."""
+        try:
+            rows = self._read()
+            is_damaged = bool(rows) and "step" not in rows[0]
+        except csv.Error:  # such as a cell of 200,000 characters
+            rows, is_damaged = [], True
+        if is_damaged:
+            aside = self.path.with_name(f"{self.path.name}.damaged")
+            self.path.replace(aside)
+            warnings.warn(f"{self.path} is damaged and is now {aside.name}; a new table begins", stacklevel=4)
+            return []
+        complete = (row for row in rows if None not in row and None not in row.values())
+        return [row for row in complete if re.fullmatch("[0-9]{1,18}", row["step"]) and int(row["step"]) <= step]
 
     def _header(self) -> bytes:
         return self._lines([{name: name for name in self._columns}]) if self._columns else b""
@@ -171,9 +192,9 @@ class JsonLines:
         self.path = Path(path)
         kept: list[bytes] = []
         if up_to is not None and self.path.exists():
-            kept = [line for line in self.path.read_bytes().splitlines(keepends=True) if _has_step(line, up_to)]
+            kept = [line for line in read_log(self.path).splitlines(keepends=True) if _has_step(line, up_to)]
         content = b"".join(kept)
-        if not self.path.exists() or self.path.read_bytes() != content:
+        if up_to is None or not self.path.exists() or read_log(self.path) != content:
             with atomic.replacing(self.path) as file:
                 file.write(content)
 
@@ -191,6 +212,20 @@ class JsonLines:
 
     def close(self) -> None:
         """Does nothing, because rows are not buffered."""
+
+
+def read_log(path: Path) -> bytes:
+    """Returns the content of a log.
+
+    Raises:
+        OSError: if it cannot be read, is no regular file, or is larger than ``MAX_LOG_BYTES``.
+    """
+    content = read_bytes(path, MAX_LOG_BYTES + 1)
+    if len(content) > MAX_LOG_BYTES:
+        raise OSError(
+            f"{path} has more than {MAX_LOG_BYTES >> 30} GiB; move it to another folder, and a new one begins"
+        )
+    return content
 
 
 def _has_step(line: bytes, up_to: int) -> bool:

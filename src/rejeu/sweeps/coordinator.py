@@ -25,7 +25,7 @@ RESCAN = 2.0
 """Seconds between two attempts to take jobs that another process holds."""
 MAX_LOST = 5
 """How often in a row a run may be lost without a new checkpoint before it counts as failed."""
-STOPPED = (130, 143)
+STOPPED = (129, 130, 143)
 """Exit statuses of a run that a signal stopped; its checkpoint is saved."""
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from rejeu import cluster
+from rejeu.io import atomic
 from rejeu.sweeps.process import Process
 
 POLL = 0.2
@@ -119,7 +120,7 @@ class Desk:
             self._path(name, path).unlink(missing_ok=True)
 
     def append_log(self, name: str, content: bytes) -> None:
-        with (self._folder / f"{name}.log").open("ab") as file:
+        with atomic.open_log(self._folder / f"{name}.log") as file:
             file.write(content)
 
     def _path(self, name: str, path: str) -> Path:

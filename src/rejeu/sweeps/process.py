@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rejeu import supervised
+from rejeu.io import atomic
 
 LOST = -1
 """Exit status of a process that vanished."""
@@ -33,7 +34,7 @@ class Process:
         Raises:
             OSError: if the log cannot be written.
         """
-        with log.open("ab") as file:
+        with atomic.open_log(log) as file:
             self._process = subprocess.Popen(
                 program(words),
                 stdin=subprocess.PIPE,

@@ -13,6 +13,7 @@ from typing import Any
 
 from rejeu import cluster, xla
 from rejeu.errors import ClusterError
+from rejeu.io import atomic
 from rejeu.sweeps.folder import HIDDEN, SweepFolder
 from rejeu.sweeps.node import PACKAGES, Desk, Spec, look, train_task
 from rejeu.sweeps.process import LOST
@@ -61,8 +62,8 @@ class RayRun:
 
     def _note(self, error: Exception) -> None:
         """Writes an error of the cluster to the log."""
-        with suppress(OSError), self._log.open("a", encoding="utf-8") as file:
-            print(f"{type(error).__name__}: {cluster.one_line(error)}", file=file)
+        with suppress(OSError), atomic.open_log(self._log) as file:
+            file.write(f"{type(error).__name__}: {cluster.one_line(error)}\n".encode())
 
 
 class RayLauncher:

@@ -45,7 +45,7 @@ POLL = 0.2
 """Seconds between two looks at the processes."""
 MAX_LOST = 3
 """How often the process of a member may be killed in a round before the member counts as failed."""
-STOPPED = (130, 143)
+STOPPED = (129, 130, 143)
 """Exit statuses of a process that was asked to stop."""
 
 Echo = Callable[[str], object]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rejeu.errors import MissingExtra
+from rejeu.io import atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,10 +42,12 @@ def make_figure(what: str, width: float = WIDTH, height: float = 4.2) -> Picture
 
 
 def save(figure: Picture, path: str | Path | None) -> Picture:
-    """Writes the figure to ``path``, if there is one, and returns the figure."""
+    """Writes the figure to ``path``, if there is one, in the format of its suffix, and returns the figure."""
     if path is not None:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
+        path = Path(path)
+        path = path if path.suffix else path.with_name(f"{path.name}.png")
+        with atomic.replacing(path) as file:
+            figure.savefig(file, format=path.suffix[1:])
     return figure
 
 
