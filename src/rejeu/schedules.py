@@ -18,6 +18,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from rejeu.validation import is_finite
+
 
 @dataclass(frozen=True)
 class Linear:
@@ -102,7 +104,7 @@ def _parse(name: str, value: Any) -> float | Schedule:
     if isinstance(value, bool):
         raise TypeError(f"{name}={value!r} must be a number or a schedule")
     if isinstance(value, int | float):
-        if not math.isfinite(value):
+        if not is_finite(value):
             raise ValueError(f"{name}={value} must be finite")
         return float(value)
     try:

@@ -22,9 +22,7 @@ def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     Raises:
         ValueError: if it is not a whole number from ``least`` to ``most``.
     """
-    good = (
-        isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value == int(value)
-    )
+    good = isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value) and value == int(value)
     if not good or not least <= value <= most:
         raise ValueError(
             f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * (most < 2**63 - 1)
@@ -38,12 +36,20 @@ def number(key: str, value: Any, least: float = -math.inf, above: float = -math.
     Raises:
         ValueError: if it is not.
     """
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    good = isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
     if not (good and least <= value <= most and value > above):
         bounds = [f"above {above}"] * (above > -math.inf) + [f"at least {least}"] * (least > -math.inf)
         bounds += [f"at most {most}"] * (most < math.inf)
         raise ValueError(f"{key}={value!r} must be a finite number" + (", " + " and ".join(bounds) if bounds else ""))
     return float(value)
+
+
+def is_finite(value: float) -> bool:
+    """Returns whether a number is finite as a float; an integer of 400 digits is not."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def flag(key: str, value: Any) -> bool:

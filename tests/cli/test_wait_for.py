@@ -42,6 +42,10 @@ def test_other_files_are_no_order_of_arrival(tmp_path):
     np.save(path, np.array([{}], object))
     with pytest.raises(CheckpointError, match=r"is not the arrivals\.npy of a run: .*pickle"):
         run_folder.read_arrivals(path)
-    path.write_bytes(b"")
-    with pytest.raises(CheckpointError, match="is not the arrivals"):
-        run_folder.read_arrivals(path)
+    np.save(path, np.zeros((3, 2), np.uint16))
+    whole = path.read_bytes()
+    huge = whole.replace(b"(3, 2), }", b"(9999999999999, 2), }")
+    for content in (b"", b"PK\3\4" + whole, whole[:-1], huge[:128]):
+        path.write_bytes(content)
+        with pytest.raises(CheckpointError, match="is not the arrivals"):
+            run_folder.read_arrivals(path)

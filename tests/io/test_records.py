@@ -15,10 +15,13 @@ from rejeu.io.records import Count, EnvCount, Malformed, Seed, convert, parse_js
     [
         ("NaN", "NaN is not valid JSON"),
         ("[1e999]", "1e999 is out of range"),
-        ("9" * 5000, "not valid JSON"),
+        ("9" * 5000, "999... has more than 300 digits"),
+        ("[-1" + "0" * 300 + "]", "has more than 300 digits"),
         ('{"a": 1, "b": 2, "a": 1}', "the name a occurs twice"),
         ("[" * 100_000, "nested too deeply"),
         ("[" * 100_000 + "]" * 100_000, "nested too deeply"),
+        ("[" * 101 + "]" * 101, "nested too deeply"),
+        ('{"a": ' * 101 + "1" + "}" * 101, "nested too deeply"),
         ("{", "not valid JSON"),
         (b"\xff", "not valid UTF-8"),
     ],
@@ -26,6 +29,11 @@ from rejeu.io.records import Count, EnvCount, Malformed, Seed, convert, parse_js
 def test_json_that_is_not_strict_is_refused(text, words):
     with pytest.raises(Malformed, match=words):
         parse_json(text)
+
+
+def test_long_integers_and_nesting_within_the_limits_are_read():
+    assert parse_json("[" * 100 + "]" * 100)
+    assert float(parse_json("9" * 300)) == 1e300
 
 
 class Inner(msgspec.Struct):

@@ -20,6 +20,7 @@ from rejeu.callbacks.base import Callback, Stateful, TrainingCallback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.errors import CheckpointError
 from rejeu.interrupt import Interrupt
+from rejeu.io.records import shown
 from rejeu.loops import finite
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress
@@ -224,7 +225,7 @@ def listening(agent: BaseAgent, callbacks: Sequence[Callback]) -> Iterator[None]
                 restore_callback(callback, saved)
         agent.saved_callbacks = None
         if saved:
-            names = ", ".join(name for name, _ in saved)
+            names = shown(", ".join(name for name, _ in saved))
             warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=6)
         yield
     except BaseException as raised:

@@ -17,6 +17,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from rejeu.validation import is_finite
+
 
 @dataclass(frozen=True)
 class Range:
@@ -113,7 +115,7 @@ SearchSpace = Mapping[str, Dimension]
 
 def is_number(value: Any) -> bool:
     """Returns whether a value is a finite number, and not True or False."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
 def plain(value: Any) -> Any:

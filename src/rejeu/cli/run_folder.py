@@ -14,13 +14,14 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
+from rejeu.agents.model_files import WRONG
 from rejeu.cli import environment
 from rejeu.cli.commands import RunOptions, Which
 from rejeu.cli.environment import Environment
 from rejeu.cli.settings import MAX_EPISODES
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic, checkpoint
-from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json
+from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, parse_json, shown
 from rejeu.reporting.logging import LOGS
 from rejeu.reporting.runs import newest_inside
 
@@ -206,7 +207,7 @@ def read_config(folder: RunFolder) -> RunConfig:
             content.setdefault("video_every", content.pop("film_every"))
         return convert(content, RunConfig)
     except (Malformed, CheckpointError) as error:
-        raise CheckpointError(f"{folder.config} is damaged: {error}") from None
+        raise CheckpointError(f"{folder.config} is damaged: {shown(error, 1000)}") from None
 
 
 def write_arrivals(folder: RunFolder, arrivals: np.ndarray) -> None:
@@ -223,8 +224,9 @@ def read_arrivals(path: Path) -> np.ndarray:
         CheckpointError: if it is not a NumPy array without pickles.
     """
     try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        with path.open("rb") as file:  # np.load also opens zip files, which cannot be a record
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except (*WRONG, EOFError) as error:
         raise CheckpointError(
             f"{path} is not the arrivals.npy of a run: {' '.join(str(error).split())[:100]}"
         ) from None

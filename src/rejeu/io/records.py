@@ -21,6 +21,10 @@ Positive = Annotated[int, Meta(ge=1, le=2**62)]
 """An integer from 1."""
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 """The seed of a NumPy generator."""
+MAX_DEPTH = 100
+"""Upper limit on the levels of a JSON document; much deeper ones exceed Python's recursion limit."""
+MAX_DIGITS = 300
+"""Upper limit on the characters of an integer in a JSON document, so that each can be converted to a float."""
 MAX_ENVS = 4096
 """Upper limit on the environments that a file may ask for."""
 EnvCount = Annotated[int, Meta(ge=1, le=MAX_ENVS)]
@@ -34,7 +38,7 @@ class Malformed(ValueError):
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the value of a JSON document; unlike ``json.loads``, refuses repeated names, NaN and infinities.
+    """Returns the value of a JSON document; unlike ``json.loads``, refuses repeated names, NaN, infinities and longer numbers.
 
     Raises:
         Malformed: if the document is not valid.
@@ -45,9 +49,16 @@ def parse_json(text: str | bytes) -> Any:
     rejeu.io.records.Malformed: NaN is not valid JSON
     """
     try:
-        return json.loads(
-            text, parse_constant=_refuse_constant, parse_float=_finite, object_pairs_hook=_without_duplicates
+        value = json.loads(
+            text,
+            parse_constant=_refuse_constant,
+            parse_float=_finite,
+            parse_int=_short,
+            object_pairs_hook=_without_duplicates,
         )
+        if is_deep(value, MAX_DEPTH):
+            raise RecursionError
+        return value
     except Malformed:
         raise
     except UnicodeDecodeError:
@@ -76,6 +87,21 @@ def convert(value: Any, kind: type[T]) -> T:
         raise CheckpointError(f"{_received(value, place)}{problem[:1].lower()}{problem[1:]}") from None
 
 
+def is_deep(value: Any, most: int) -> bool:
+    """Returns whether a JSON value has more than ``most`` levels."""
+    level = [value]
+    for _ in range(most):
+        level = [
+            child
+            for one in level
+            if isinstance(one, dict | list)
+            for child in (one.values() if isinstance(one, dict) else one)
+        ]
+        if not level:
+            break
+    return bool(level)
+
+
 def shown(value: Any, length: int = 100) -> str:
     """Returns a value from a file as an error message may contain it: on one line, and shortened."""
     text = str(value)
@@ -95,6 +121,12 @@ def _received(value: Any, place: str) -> str:
 
 def _refuse_constant(name: str) -> None:
     raise Malformed(f"{name} is not valid JSON")
+
+
+def _short(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise Malformed(f"{text[:20]}... has more than {MAX_DIGITS} digits")
+    return int(text)
 
 
 def _finite(text: str) -> float:

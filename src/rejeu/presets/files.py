@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import EnvCount, Malformed, Positive, convert, parse_json
+from rejeu.io.records import EnvCount, Malformed, Positive, convert, parse_json, shown
 from rejeu.presets.preset import Preset
 
 MAX_BYTES = 2**20
@@ -66,6 +66,7 @@ def read(path: str | Path) -> Preset:
             data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
-        return Preset(**vars(convert(parse_json(data), Content)))
+        content = convert(parse_json(data), Content)
+        return Preset(**{one.name: getattr(content, one.name) for one in dataclasses.fields(Content)})
     except (Malformed, CheckpointError) as error:
-        raise CheckpointError(f"{path} is no preset: {error}") from None
+        raise CheckpointError(f"{path} is no preset: {shown(error, 1000)}") from None

@@ -24,7 +24,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rejeu import presets
-from rejeu.io.records import Malformed, parse_json, shown
+from rejeu.io.records import Malformed, is_deep, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
 
 RENAMED = {
@@ -38,6 +38,8 @@ REPLAYS = "replays.csv"
 """Episodes of the trained agent from known seeds, which ``rejeu report --replay`` writes."""
 WARNINGS = "warnings.txt"
 """Warnings of the training, and the error that ended it, one a line."""
+MAX_DEPTH = 20
+"""Upper limit on the levels of a ``config.json``."""
 MAX_CONFIG_BYTES = 2**20
 MAX_WARNINGS = 100
 MAX_WARNINGS_BYTES = 2**16
@@ -284,26 +286,13 @@ def read_config(path: Path) -> tuple[dict[str, Any], list[str]]:
         content = parse_json(data)
         if not isinstance(content, dict):
             raise Malformed("it is not a JSON object")
-        if is_deep(content):
+        if is_deep(content, MAX_DEPTH):
             raise Malformed("it is nested too deeply")
         return content, []
     except FileNotFoundError:
         return {}, [f"there is no {CONFIG}, so the configuration is not known"]
     except (OSError, Malformed) as error:
         return {}, [f"{CONFIG} is damaged: {shown(error)}"]
-
-
-def is_deep(value: Any, most: int = 20) -> bool:
-    """Returns whether a JSON value has more than ``most`` levels."""
-    level = [value]
-    for _ in range(most):
-        level = [
-            child
-            for one in level
-            if isinstance(one, dict | list)
-            for child in (one.values() if isinstance(one, dict) else one)
-        ]
-    return bool(level)
 
 
 def ordered(table: Table) -> Table:

@@ -31,7 +31,7 @@ from msgspec import Meta
 from rejeu.agents.run_files import run_files, step_of
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import Malformed, convert, parse_json
+from rejeu.io.records import Malformed, convert, parse_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
 from rejeu.sweeps.jobs import MAX_JOBS, Code, Job
@@ -266,7 +266,7 @@ def read_folder(path: Path, code: Code = NO_CODE) -> SweepFolder:
         if len({job.name.lower() for job in sweep.jobs}) < len(sweep.jobs):
             raise Malformed("two jobs have the same name")
     except (Malformed, CheckpointError) as error:
-        raise CheckpointError(f"{path / SWEEP} is damaged: {error}") from None
+        raise CheckpointError(f"{path / SWEEP} is damaged: {shown(error, 1000)}") from None
     for job in sweep.jobs:
         job.check_code(code, path / SWEEP)
     if not os.access(path, os.W_OK):

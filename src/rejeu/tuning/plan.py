@@ -18,7 +18,7 @@ from rejeu.algorithms import config as configs
 from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import EnvCount, Malformed, Positive, Seed, convert, parse_json
+from rejeu.io.records import EnvCount, Malformed, Positive, Seed, convert, parse_json, shown
 from rejeu.presets import Preset
 from rejeu.tuning import space as spaces
 
@@ -276,7 +276,7 @@ def read(path: Path) -> Plan:
         check(plan, path)
         return plan
     except (ValueError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from None
+        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
 
 
 def check(plan: Plan, path: Path) -> None:

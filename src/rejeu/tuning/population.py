@@ -21,7 +21,7 @@ from msgspec import Meta
 from rejeu.algorithms.search import FIXED_AT_START, Choice, Dimension, NearOne, SearchSpace, Uniform
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import Count, Malformed, convert, parse_json
+from rejeu.io.records import Count, Malformed, convert, parse_json, shown
 from rejeu.tuning import plan as plans, space as spaces
 from rejeu.tuning.plan import Plan
 
@@ -186,7 +186,7 @@ def read(path: Path) -> Population:
         plans.check(found.plan, path)
         return found
     except (ValueError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from None
+        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
 
 
 def read_decisions(path: Path, population: Population) -> list[Decision]:
@@ -208,7 +208,7 @@ def read_decisions(path: Path, population: Population) -> list[Decision]:
                 raise Malformed(f"there is no member {one.parent}")
         return found
     except (ValueError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from None
+        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
 
 
 def parse(path: Path) -> Any:
