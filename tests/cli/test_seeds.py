@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import sys
 
 import pytest
@@ -72,6 +73,13 @@ def test_options_are_passed_on():
         *("--checkpoint-minutes", "0.5", "--log", "json", "--set", "gamma=0.9", 'train_freq=[1, "episode"]'),
         *("--seed", "1", "--out", "OUT"),
     ]
+
+
+def test_the_address_of_a_cluster_is_in_no_file(monkeypatch):
+    monkeypatch.setenv("RAY_ADDRESS", "")
+    arguments = Train("CartPole-v1", seeds=2, seed=1, backend="ray", ray="10.0.0.1:6379")
+    assert {job.options.ray for job in seeds.make_jobs(arguments)} == {"auto"}
+    assert os.environ["RAY_ADDRESS"] == "10.0.0.1:6379"
 
 
 def test_every_option_of_train_is_one_of_a_job():

@@ -236,6 +236,8 @@ def test_the_threads_of_a_sweep_are_fixed_when_it_begins(tmp_path):
         ("hyperparameters", {"a --import os": 1}, ""),
         ("options", {"backend": "--import"}, "backend"),
         ("options", {"log": ["--import"]}, "log"),
+        ("options", {"minutes": 10**400}, "has more than 300 digits"),
+        ("options", {"ray": "evil.org:6379"}, "no file may name what is connected to; set RAY_ADDRESS"),
         ("env", "evil:Env-v0", "name it again: --env evil:Env-v0"),
         ("wrappers", ["evil:Wrapper"], "--wrapper evil:Wrapper"),
         ("env_kwargs", {"path": "/etc/passwd"}, "imported or made with more than numbers"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import shlex
 import time
@@ -81,7 +82,10 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
     first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Options)}
     paths = {key: None if given[key] is None else str(given[key]) for key in ("preset", "arrivals")}
-    options = Options(**{**given, **paths, "log": tuple(chain.from_iterable(arguments.log))})
+    if arguments.ray not in (None, "auto"):
+        os.environ["RAY_ADDRESS"] = arguments.ray  # no file may name an address
+    ray = None if arguments.ray is None else "auto"
+    options = Options(**{**given, **paths, "ray": ray, "log": tuple(chain.from_iterable(arguments.log))})
     words = [*chain.from_iterable(arguments.assignments)]
     settings.apply(words, {})
     return tuple(

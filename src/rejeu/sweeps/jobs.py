@@ -47,7 +47,7 @@ class Options:
     """Path of the record of an earlier run."""
     device: str = "auto"
     ray: str | None = None
-    """Address of a Ray cluster for environments with ``backend="ray"``."""
+    """``"auto"``: environments with ``backend="ray"`` are on the Ray cluster of this machine, or of ``RAY_ADDRESS``."""
     env_cpus: float | None = None
     success_threshold: float | None = None
     video_every: int | None = None
@@ -68,10 +68,14 @@ class Options:
         coerce(self, "success_threshold", number, optional=True)
         coerce(self, "checkpoint_minutes", number, least=0)
         coerce(self, ("no_report", "no_video"), flag)
-        for key in ("preset", "arrivals", "ray"):
+        for key in ("preset", "arrivals"):
             value = getattr(self, key)
             if value is not None and (not isinstance(value, str) or not value or value.startswith("-")):
-                raise ValueError(f"{key}={value!r} must be {'an address' if key == 'ray' else 'the path of a file'}")
+                raise ValueError(f"{key}={value!r} must be the path of a file")
+        if self.ray not in (None, "auto"):
+            raise ValueError(
+                f"ray={self.ray!r} must be 'auto': no file may name what is connected to; set RAY_ADDRESS=HOST:PORT"
+            )
         coerce(self, "backend", choice, optional=True, among=BACKENDS)
         coerce(self, "device", choice, among=devices.NAMES)
         if not isinstance(self.log, str | list | tuple) or not all(isinstance(one, str) for one in self.log):
