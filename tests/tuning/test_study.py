@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import sys
 from pathlib import Path
 
@@ -246,6 +247,29 @@ def test_a_damaged_journal_is_one_line_and_is_not_changed(tmp_path, place):
     with pytest.raises(CheckpointError, match=r"journal\.log is damaged: .*; restore it from a copy"):
         run(studies.join(StudyFolder(tmp_path / "study")))
     assert journal.read_bytes() == content
+
+
+def test_a_journal_nested_too_deeply_is_one_line(tmp_path):
+    tuning.open_study(make_plan(), tmp_path / "study")
+    with (tmp_path / "study" / "journal.log").open("ab") as file:
+        file.write(b"[" * 100_000 + b"]" * 100_000 + b"\n")
+    with pytest.raises(CheckpointError, match=r"journal\.log is damaged"):
+        studies.join(StudyFolder(tmp_path / "study"))
+
+
+def test_a_journal_that_is_a_link_or_a_hole_is_refused(tmp_path):
+    tuning.open_study(make_plan(), tmp_path / "study")
+    journal = tmp_path / "study" / "journal.log"
+    journal.unlink()
+    journal.symlink_to(tmp_path / "mine")
+    with pytest.raises(CheckpointError, match="is no file of up to 1024 MiB"):
+        studies.join(StudyFolder(tmp_path / "study"))
+    assert not (tmp_path / "mine").exists()
+    journal.unlink()
+    journal.touch()
+    os.truncate(journal, 2**42)
+    with pytest.raises(CheckpointError, match="is no file of up to 1024 MiB"):
+        studies.join(StudyFolder(tmp_path / "study"))
 
 
 def test_the_value_of_a_trial_must_be_finite(tmp_path):

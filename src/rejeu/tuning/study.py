@@ -16,6 +16,8 @@ study continues as it would have without the interruption.
 from __future__ import annotations
 
 import math
+import os
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -25,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from filelock import FileLock, Timeout
 
 from rejeu import presets
+from rejeu.agents.model_files import WRONG
 from rejeu.errors import CheckpointError, MissingExtra
 from rejeu.io import atomic
 from rejeu.presets import Preset
@@ -38,6 +41,8 @@ NAME = "rejeu"
 """Name of the study in its journal."""
 INDEX, REPEATS, REASON = "index", "repeats", "reason"
 """User attributes of trials: the index, the number of the interrupted trial that is repeated, why a trial failed."""
+MAX_JOURNAL_BYTES = 2**30
+"""Upper limit on the size of a journal; a trial takes some kilobytes."""
 STARTUP_TRIALS = 5
 """Trials before the first one is pruned."""
 LOCK = "trial.lock"
@@ -283,9 +288,18 @@ def connect(folder: StudyFolder, plan: Plan) -> optuna.Study:
 
 
 def complete_last_line(journal: Path, lock: Any) -> None:
-    """Cuts the part of a line at the end of a journal that a killed process left behind; Optuna cannot read on after it."""
-    if not journal.is_file():
+    """Cuts the part of a line at the end of a journal that a killed process left behind; Optuna cannot read on after it.
+
+    Raises:
+        CheckpointError: if it is no regular file, such as a symbolic link, or too large.
+    """
+    if not os.path.lexists(journal):
         return
+    found = journal.lstat()
+    if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_JOURNAL_BYTES:
+        raise CheckpointError(
+            f"{journal} is no file of up to {MAX_JOURNAL_BYTES >> 20} MiB; it is from another program"
+        )
     lock.acquire()
     try:
         content = journal.read_bytes()
@@ -305,7 +319,7 @@ def readable(journal: Path) -> Iterator[None]:
         yield
     except CheckpointError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, AssertionError, OptunaError) as error:
+    except (*WRONG, AssertionError, OptunaError) as error:
         raise CheckpointError(
             f"{journal} is damaged: {type(error).__name__}: {' '.join(str(error).split())[:200]}; restore it from a copy, or "
             "begin a study in another folder"
