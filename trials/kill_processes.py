@@ -4,9 +4,10 @@
     python trials/kill_processes.py --kills 4
 
 Every resumption is a new process, as with ``rejeu resume``. The runs cover large networks, many environments, EnvPool,
-worker processes, prioritized replay, n-step returns, hindsight, normalization and parameter noise. The uninterrupted
-run saves no checkpoints. All weights, the buffers, the history except its times, the state of the random generator and
-the best weights are compared bit for bit.
+worker processes, training on the device, prioritized replay, n-step returns, hindsight, normalization, action masks and
+parameter noise. The uninterrupted run saves no checkpoints. All weights, the buffers, the history except its times, the
+state of the random generator and the best weights are compared bit for bit. A run that ends before its last kill is
+compared, and the next kills are of a new one.
 """
 
 from __future__ import annotations
@@ -83,6 +84,17 @@ CASES: dict[str, Case] = {
     "SAC in worker processes": Case(
         "SAC", "Pendulum-v1", 2, "gymnasium-async", 4000, 400, lambda: {**SMALL, **REPLAY}
     ),
+    "MaskablePPO": Case(
+        "MaskablePPO", "MaskedCartPole-v0", 4, "gymnasium", 20_000, 1000,
+        lambda: {**SMALL, "n_steps": 64, "batch_size": 64},
+    ),
+    "PQN on the device": Case("PQN", "jax/CartPole-v1", 16, "jax", 300_000, 10_000, lambda: dict(SMALL)),
+    "SAC on the device, hindsight": Case(
+        "SAC", "jax/Parking-v0", 8, "jax", 16_000, 800, lambda: hindsight(**SMALL, **REPLAY)
+    ),
+    "DQN on the device, priorities, 3-step": Case(
+        "DQN", "jax/CartPole-v1", 4, "jax", 40_000, 2000, lambda: {**SMALL, **REPLAY, "priorities": {}, "n_steps": 3}
+    ),
     "RecurrentPPO": Case(
         "RecurrentPPO", "rejeu/CartPoleNoVelocity-v0", 4, "gymnasium", 20_000, 1000,
         lambda: {**SMALL, "n_steps": 64, "batch_size": 64},
@@ -90,9 +102,30 @@ CASES: dict[str, Case] = {
 }  # fmt: skip
 
 
+def masked_cart_pole() -> Any:
+    """Returns CartPole without the pushes that lead out of the middle."""
+    import gymnasium as gym
+
+    class Masked(gym.Wrapper):
+        def action_masks(self) -> list[bool]:
+            position = self.unwrapped.state[0]
+            return [position > -0.5, position < 0.5]
+
+        def get_wrapper_state(self) -> dict[str, Any]:
+            return {}
+
+        def set_wrapper_state(self, state: dict[str, Any]) -> None:
+            pass
+
+    return Masked(gym.make("CartPole-v1"))
+
+
 def vector(case: Case) -> Any:
+    import gymnasium as gym
+
     import rejeu
 
+    gym.register("MaskedCartPole-v0", masked_cart_pole)
     return rejeu.make_vector(case.env_id, case.n_envs, case.backend, seed=3)
 
 
@@ -121,7 +154,7 @@ def live(name: str, folder: str, kept: bool) -> None:
         if agent.num_timesteps < case.steps:
             agent.learn(callback=callbacks)
     else:
-        policy = "MultiInputPolicy" if case.env_id == "parking-v0" else "MlpPolicy"
+        policy = "MultiInputPolicy" if "parking" in case.env_id.lower() else "MlpPolicy"
         agent = agent_class(policy, env, seed=5, **case.settings())
         say(resumed=0, exact=True, replay=0.0, trained=0.0)
         agent.learn(case.steps, callback=callbacks)
@@ -191,40 +224,66 @@ def finished(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     return last
 
 
+class Killed(NamedTuple):
+    """A run that was killed, and resumed until it ended."""
+
+    kills: int
+    lives: list[dict[str, Any]]
+    """The first message of each process."""
+    end: dict[str, Any]
+    """The last message."""
+
+
+def killed(name: str, folder: Path, most: int, pause: float, rng: random.Random) -> Killed:
+    """Kills a run until there were ``most`` kills or it ended, and lets it end.
+
+    Args:
+        name: of the case.
+        folder: of the checkpoints.
+        most: kills at most.
+        pause: most seconds of training before a kill.
+        rng: draws the moments.
+    """
+    lives = []
+    for kills in range(most + 1):
+        process = start(name, folder, kept=True)
+        lives.append(said(process))
+        if kills == most:
+            break
+        second = said(process)
+        if "digest" in second:
+            return Killed(kills, lives, second)
+        time.sleep(rng.uniform(0.0, pause))  # a random moment during training
+        if process.poll() is not None:
+            break
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    return Killed(kills, lives, finished(process))
+
+
 def try_case(name: str, kills: int, rng: random.Random) -> dict[str, Any]:
     case = CASES[name]
     with tempfile.TemporaryDirectory() as root:
         whole = finished(start(name, Path(root) / "none", kept=False))
-        folder = Path(root) / "run"
-        lives = []
+        runs: list[Killed] = []
         began = time.monotonic()
-        done, end = 0, None
-        while end is None:
-            process = start(name, folder, kept=True)
-            first = said(process)
-            lives.append(first)
-            if done == kills:
-                end = finished(process)
-                break
-            second = said(process)
-            time.sleep(rng.uniform(0.0, 1.4 * whole["trained"] / kills))  # a random moment during training
-            if process.poll() is not None or "digest" in second:
-                end = second if "digest" in second else finished(process)  # the run ended before its last kill
-                break
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-            done += 1
+        while (done := sum(run.kills for run in runs)) < kills:
+            folder = Path(root) / f"run-{len(runs)}"
+            runs.append(killed(name, folder, kills - done, 1.4 * whole["trained"] / kills, rng))
+        lives = [life for run in runs for life in run.lives]
         resumed = [life for life in lives if life["resumed"]]
-        different = [key for key in whole["digest"] if whole["digest"][key] != end["digest"].get(key)]
+        keys = sorted({key for run in runs for key in (*whole["digest"], *run.end["digest"])})
+        different = [key for key in keys if any(whole["digest"].get(key) != run.end["digest"].get(key) for run in runs)]
         return {
             "case": name,
             **{key: getattr(case, key) for key in ("algorithm", "env_id", "n_envs", "backend", "steps", "every")},
             "kills": done,
+            "runs": len(runs),
             "resumed_after_step_0": len(resumed),
             "all_exact": all(life["exact"] for life in lives),
             "arrays": len(whole["digest"]),
             "arrays_that_differ": different,
-            "equal": not different and whole["digest"].keys() == end["digest"].keys(),
+            "equal": not different,
             "seconds_of_training_without_kills": round(whole["trained"], 1),
             "seconds_of_replaying": [round(life["replay"], 2) for life in resumed],
             "seconds_trained_when_resumed": [round(life["trained"], 1) for life in resumed],
@@ -237,24 +296,27 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", choices=CASES, help="cases to try, instead of all")
+    parser.add_argument("--out", type=Path, default=RESULT)
     parser.add_argument("--live", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.live:
         name, folder, kept = arguments.live
         live(name, folder, kept == "kept")
         return
-    known = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    from provenance import commit
+
+    known = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.exists() else {}
     for name in arguments.only or CASES:
         result = try_case(name, arguments.kills, random.Random(f"{arguments.seed} {name}"))
         only = f' --only "{name}"'
-        known[name] = {"command": f"python trials/kill_processes.py --kills {arguments.kills}{only}", "commit": commit}
+        known[name] = {
+            "command": f"python trials/kill_processes.py --kills {arguments.kills}{only}",
+            "commit": commit(),
+        }
         known[name] |= {"date": time.strftime("%Y-%m-%d"), **result}
         print(json.dumps(known[name]), flush=True)
-        RESULT.parent.mkdir(parents=True, exist_ok=True)
-        RESULT.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

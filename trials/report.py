@@ -26,6 +26,8 @@ COMMANDS = {
     "fuzz": "python trials/fuzz.py --seconds 300 (600 for run and rows)",
 }
 """Commands of older results, which do not contain them."""
+PARTS = {"sweep_kills": ("sweep_kills", "sweep_kills_ray")}
+"""Sections that show several files of results."""
 NOT_TESTED = """- **Other systems.** All trials were run on Linux with local disks: not on macOS or Windows, on
 network file
   systems or on a GPU.
@@ -36,9 +38,17 @@ while it is in a
 - **Deliberate changes.** Checksums are not signatures. Someone who changes a file and its checksums can make an
 agent act badly.
   Tested is that loading executes no code and needs bounded time and memory.
+- **Searches.** Processes of `rejeu tune` and `rejeu pbt` are killed in the test suite, not at hundreds of random
+moments.
+- **Several machines.** The nodes of the Ray cluster were processes of one machine.
 - **Runs of days.** The longest trial took an hour.
 - **Faults of environments.** Environments that leak memory or end the main process (`os._exit`) were not tested.
 - **Other machines.** Equal results were compared on one machine, with the same versions and number of threads."""
+
+
+def files(section: str) -> list[str]:
+    """Returns the names of the results that a section shows and that exist."""
+    return [name for name in PARTS.get(section, (section,)) if (RESULTS / f"{name}.json").exists()]
 
 
 def read(name: str) -> Any:
@@ -55,7 +65,7 @@ def origins(name: str) -> list[tuple[str, str, str]]:
     dates: dict[tuple[str, str], list[str]] = {}
     for part in parts:
         commit = f"`{part['commit']}`" if "commit" in part else f"recorded in `{part.get('recorded', recorded)}`"
-        command = re.sub(r" --only .*", "", part.get("command", COMMANDS.get(name, ""))).replace("SB3_PYTHON", "PATH")
+        command = re.sub(r' --only ".*', "", part.get("command", COMMANDS.get(name, ""))).replace("SB3_PYTHON", "PATH")
         dates.setdefault((commit, f"`{command}`"), []).append(part.get("date", day))
     return [(commit, " and ".join(sorted({*days})), command) for (commit, command), days in dates.items()]
 
@@ -153,6 +163,38 @@ training time without kills and the longest time to replay EnvPool's actions.
 {table(head, rows)}
 
 {origin("kill_processes")}
+"""
+
+
+def sweeps() -> str:
+    rows = []
+    for found in map(read, files("sweep_kills")):
+        for where, title in (("local", "processes"), ("ray", "Ray, two nodes")):
+            if one := found.get(where):
+                kinds = {key.removeprefix("kills_of_a_"): n for key, n in one.items() if key.startswith("kills_of_a_")}
+                rows.append(
+                    (
+                        title,
+                        f"{one['kills']} ({', '.join(f'{n} of a {kind}' for kind, n in kinds.items())})",
+                        f"{one['sweeps'] - one['sweeps_that_failed']} of {one['sweeps']}",
+                        f"{one['runs'] - len(one['models_that_differ'])} of {one['runs']}",
+                        f"{one['most_seconds_of_training_lost']:.1f} of {found['checkpoint_interval_seconds']:.0f} s",
+                        f"{one['most_seconds_until_no_process_was_left']:.1f} s",
+                    )
+                )
+    head = (
+        "sweep", "SIGKILLs", "sweeps completed", "models equal", "most training lost, of the interval",
+        "until no process was left",
+    )  # fmt: skip
+    return f"""## SIGKILL of runs, workers, nodes and sweeps
+
+Sweeps of eight runs, two at a time, are disturbed by `SIGKILL` at random moments: of runs, of the process `rejeu
+sweep`, of Ray workers, and of all processes of a Ray node. The final models are compared bit for bit with those of an
+undisturbed sweep. The loss is the training time since the newest checkpoint of a run that was killed.
+
+{table(head, rows)}
+
+{" ".join(map(origin, files("sweep_kills")))}
 """
 
 
@@ -375,6 +417,19 @@ the resumed run must also train and save checkpoints that can be read.
 """
 
 
+def transitions() -> str:
+    found = read("transitions")
+    return f"""## Replayed transitions
+
+Every transition that a replay buffer returns is compared with a model in plain Python that keeps whole episodes, with
+one and several environments, n-step returns, priorities, hindsight and stacked frames: {
+        found["transitions"]:,} transitions in {len(found["cases"])} cases, of which {
+        found["relabeled"]:,} were relabeled and {found["terminal"]:,} were terminal. Differences: {found["differ"]}.
+
+{origin("transitions")}
+"""
+
+
 def environments() -> str:
     found = read("environments")
     parts = ("in this process", "in worker processes")
@@ -464,20 +519,22 @@ def fill(text: str, **settings: str) -> str:
 SECTIONS: dict[str, Callable[[], str]] = {
     "kill": kills,
     "kill_processes": processes,
+    "sweep_kills": sweeps,
     "power_loss": power,
     "signals": signals,
     "resume": resumed,
     "hostile": hostile,
     "fuzz": fuzzed,
     "environments": environments,
+    "transitions": transitions,
     "soak": soaked,
 }
 """The trials in the order of the page, by the names of their results."""
 
 
 def main() -> None:
-    found = [name for name in SECTIONS if (RESULTS / f"{name}.json").exists()]
-    rows = [(f"`{name}`", *one) for name in found for one in origins(name)]
+    found = [name for name in SECTIONS if files(name)]
+    rows = [(f"`{file}`", *one) for name in found for file in files(name) for one in origins(file)]
     sections = "\n".join(SECTIONS[name]() for name in found)
     page = f"""# Reliability
 

@@ -153,10 +153,11 @@ def main() -> None:
             found.append(one)
             print(len(found), json.dumps(one), flush=True)
     counted = [one for one in found if one["phase"] != PHASES[0]]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    from provenance import commit
+
     result = {
         "command": shlex.join(["python", "trials/signals.py", "--signals", str(arguments.signals)]),
-        "commit": commit.stdout.strip(),
+        "commit": commit(),
         "date": date.today().isoformat(),
         "seconds_of_a_run": round(lengths[-1], 1),
         "signals": len(found),

@@ -297,7 +297,11 @@ def test_the_number_of_threads_is_saved_and_a_resumed_run_says_if_it_has_another
     cut_run(tmp_path)
     header, _ = checkpoint.read(run_files(tmp_path)[0], "run")
     assert header["threads"] == xla.threads()
+    asked = []
+    monkeypatch.setattr(xla, "start_device", asked.append)
+    monkeypatch.setattr(xla, "cores", lambda: 64)
     assert rejeu.SAC.resume(tmp_path).resumed.exact
+    assert asked == [header["threads"]]  # and not what suits an agent with one environment
     monkeypatch.setattr(xla, "threads", lambda: header["threads"] + 1)
     with pytest.warns(UserWarning, match=rf"computes with {header['threads'] + 1} threads here and had"):
         assert not rejeu.SAC.resume(tmp_path).resumed.exact
