@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import gymnasium as gym
 import jax
@@ -23,6 +24,7 @@ CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
 SMALL = {"learning_rate": 1e-2, "policy_kwargs": {"net_arch": [5, 4]}}
 
 
+@functools.cache
 def make(**settings):
     algorithm = crossq.make(crossq.Config(**{**SMALL, **settings}), OBS_SPACE, ACTION_SPACE)
     return jax.jit(algorithm.update), jax.jit(algorithm.init)(jax.random.PRNGKey(1))

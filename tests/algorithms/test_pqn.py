@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import gymnasium as gym
 import jax
@@ -30,6 +32,7 @@ IMAGE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
 RATE = 3e-2
 
 
+@functools.cache
 def make(**settings):
     config = pqn.Config(**{"policy_kwargs": {"net_arch": [5, 4]}, "learning_rate": RATE, **settings})
     algorithm = pqn.make(config, OBS_SPACE, ACTIONS)

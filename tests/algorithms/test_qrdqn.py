@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,7 @@ ACTION_SPACE = gym.spaces.Discrete(N_ACTIONS)
 N_QUANTILES = 3
 
 
+@functools.cache
 def make(**settings):
     settings = {"n_quantiles": N_QUANTILES, "policy_kwargs": {"net_arch": [5, 4]}, **settings}
     algorithm = qrdqn.make(qrdqn.Config(**settings), OBS_SPACE, ACTION_SPACE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import equinox as eqx
@@ -24,6 +25,7 @@ ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
 
 
+@functools.cache
 def make(**settings):
     config = sac.Config(**{"policy_kwargs": {"net_arch": [5, 4]}, **settings})
     algorithm = sac.make(config, OBS_SPACE, ACTION_SPACE)

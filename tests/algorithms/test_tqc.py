@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import gymnasium as gym
 import jax
@@ -22,6 +23,7 @@ ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
 
 
+@functools.cache
 def make(**settings):
     settings = {"n_quantiles": N_QUANTILES, "policy_kwargs": {"net_arch": [5, 4]}, **settings}
     algorithm = tqc.make(tqc.Config(**settings), OBS_SPACE, ACTION_SPACE)
