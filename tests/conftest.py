@@ -78,6 +78,15 @@ def forget_registered() -> Iterator[None]:
             registry.update(entries)
 
 
+@pytest.fixture(scope="module")
+def learners_are_shared() -> Iterator[None]:
+    """All agents of the tests of a module share compiled functions (see ``sharing``)."""
+    from tests.sharing import shared_learners
+
+    with shared_learners():
+        yield
+
+
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shortens the training and the evaluations of an example."""

@@ -31,7 +31,8 @@ _build = Agent.build
 def shared_learners() -> Iterator[None]:
     """Agents that are created or loaded within the block share the learner of equal agents, also across blocks.
 
-    Not for tests that patch functions of an algorithm: a learner that was compiled earlier does not use the patch.
+    Not for tests that patch functions of an algorithm other than ``make``: a learner that was compiled earlier does not use
+    the patch.
     """
     with mock.patch.object(Agent, "build", _build_or_share):
         yield
@@ -54,4 +55,9 @@ def _key(agent: Agent, observation_space: gym.Space, action_space: gym.Space) ->
         if config.normalize is None:
             names.append("gamma")  # otherwise gamma occurs only in the discounts of a batch
         config = dataclasses.replace(config, **{name: getattr(defaults, name) for name in names})
-    return type(agent), config, json.dumps([spaces.describe(observation_space), spaces.describe(action_space)])
+    return (
+        type(agent),
+        agent.algorithm.make,
+        config,
+        json.dumps([spaces.describe(observation_space), spaces.describe(action_space)]),
+    )

@@ -33,6 +33,10 @@ FILES = {
     "video.mp4",
 }
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=8", "buffer_size=5000", "learning_starts=50"]
+FEWER_FILES = ["--no-report", "--no-video"]
+"""Without what takes longer than such a training."""
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 
 class Words(gym.Env):
@@ -120,7 +124,8 @@ def test_tables_hold_every_episode_and_evaluation(run):
 
 
 def test_the_same_seed_gives_the_same_run(run, tmp_path):
-    assert train(tmp_path / "again", "--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium") == 0
+    argv = ["--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium", *FEWER_FILES]
+    assert train(tmp_path / "again", *argv) == 0
     first, second = (rejeu.load(path / "agent.safetensors").get_parameters() for path in (run, tmp_path / "again"))
     assert all(np.array_equal(first[name], second[name]) for name in first)
 
@@ -134,7 +139,7 @@ def test_the_best_model_is_that_of_the_best_evaluation(run):
 
 
 def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
-    assert train(tmp_path / "run", "--seed", "1", steps=60) == 0
+    assert train(tmp_path / "run", "--seed", "1", *FEWER_FILES, steps=60) == 0
     text = capsys.readouterr().out
     assert "environment   Pendulum-v1, 1 at once\nbackend       envpool\n" in text
     assert "SAC, preset, seed 1" in text
@@ -146,7 +151,7 @@ def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
 @exhaustive
 def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "envpool", None)
-    assert train(tmp_path / "run", "--seed", "1", steps=60) == 0
+    assert train(tmp_path / "run", "--seed", "1", *FEWER_FILES, steps=60) == 0
     said = (
         "backend       gymnasium; EnvPool would be faster (about 770 MB with its assets): pip install 'rejeu[envpool]'"
     )
@@ -163,12 +168,12 @@ def test_train_stops_after_the_minutes_given(tmp_path):
 
 
 def test_goal_environments_are_trained_with_hindsight(tmp_path):
-    assert train(tmp_path / "run", "--envs", "2", env="parking-v0", steps=120) == 0
+    assert train(tmp_path / "run", "--envs", "2", "--no-video", env="parking-v0", steps=120) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["policy"] == "MultiInputPolicy"
     assert config["hyperparameters"]["replay_buffer_class"] == "HerReplayBuffer"
     assert (config["n_envs"], config["backend"]) == (2, "envpool")
-    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES - {"video.mp4"}
 
 
 def test_without_a_name_the_run_folder_is_new_each_time(tmp_path, monkeypatch):
@@ -283,7 +288,7 @@ def test_set_leaves_the_preset_as_it_was():
 
 @exhaustive
 def test_set_may_be_given_more_than_once(tmp_path):
-    assert train(tmp_path / "run", "--set", "gamma=0.5", steps=60) == 0
+    assert train(tmp_path / "run", *FEWER_FILES, "--set", "gamma=0.5", steps=60) == 0
     hyperparameters = json.loads((tmp_path / "run" / "config.json").read_text())["hyperparameters"]
     assert (hyperparameters["gamma"], hyperparameters["batch_size"]) == (0.5, 8)
 
@@ -389,7 +394,7 @@ def table(path):
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
 def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path):
-    arguments = ["--steps", "900", "--seed", "3", "--evaluate-every", "300", "--evaluate-episodes", "2"]
+    arguments = ["--steps", "900", "--seed", "3", "--evaluate-every", "300", "--evaluate-episodes", "2", *FEWER_FILES]
     argv = ["train", "rejeu/Ball-v0", *arguments, "--set", *TINY, "--checkpoint-minutes", "0.002"]
     assert main([*argv, "--out", str(tmp_path / "whole")]) == 0
     script = """if True:
@@ -413,6 +418,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path):
         "rejeu",
         "resume",
         str(tmp_path / "cut"),
+        *FEWER_FILES,
     ]  # this process may have another thread count
     resumed = subprocess.run(resume, capture_output=True, text=True, check=True)
     assert re.search(r"resumed at step [\d,]+, exactly as it was saved", resumed.stdout), resumed.stdout
@@ -427,26 +433,26 @@ def test_a_complete_run_can_be_trained_further(run, tmp_path, capsys):
     text = error_of(capsys, "resume", str(tmp_path / "run"))
     assert "the run is complete" in text
     before = rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps
-    assert main(["resume", str(tmp_path / "run"), "--steps", "50"]) == 0
+    assert main(["resume", str(tmp_path / "run"), "--steps", "50", *FEWER_FILES]) == 0
     assert rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps == before + 50
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
 def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
     """Pausing changes nothing about the run: it ends where the one that was never paused ended."""
-    argv = ["--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium"]
+    argv = ["--seed", "3", "--evaluate-every", "400", "--backend", "gymnasium", *FEWER_FILES]
     out = tmp_path / "run"
     with pytest.MonkeyPatch.context() as patch:
         kill = lambda self, agent, turn: os.kill(os.getpid(), signal.SIGINT) if turn.step == 100 else None  # noqa: E731
         patch.setattr(rejeu.callbacks.Evaluate, "__call__", kill)
         arguments = ["train", "Pendulum-v1", "--steps", "850", "--out", str(out), "--evaluate-episodes", "2", *argv]
         assert main([*arguments, "--set", *TINY]) == 130
-    assert main(["resume", str(out), "--steps", "1e2"]) == 0
+    assert main(["resume", str(out), "--steps", "1e2", *FEWER_FILES]) == 0
     text = capsys.readouterr().out
     assert f"paused; everything is saved; rejeu resume {out} continues" in text
     paused = rejeu.load(out / "agent.safetensors").num_timesteps
     assert paused == 200
-    assert main(["resume", str(out)]) == 0
+    assert main(["resume", str(out), *FEWER_FILES]) == 0
     one, two = (rejeu.load(path / "agent.safetensors") for path in (run, out))
     assert one.num_timesteps == two.num_timesteps == 850
     weights = [agent.get_parameters() for agent in (one, two)]
@@ -460,8 +466,8 @@ def test_the_best_model_is_kept_when_a_complete_run_is_trained_further(tmp_path,
     evaluation = rejeu.Evaluation
     fake = lambda *_, **__: evaluation(np.array([next(better)]), np.array([5]), np.array([np.nan]))  # noqa: E731
     monkeypatch.setattr(rejeu.SAC, "evaluate", fake)
-    assert train(tmp_path / "run", "--evaluate-every", "1000", steps=60) == 0
-    assert main(["resume", str(tmp_path / "run"), "--steps", "20"]) == 0
+    assert train(tmp_path / "run", "--evaluate-every", "1000", *FEWER_FILES, steps=60) == 0
+    assert main(["resume", str(tmp_path / "run"), "--steps", "20", *FEWER_FILES]) == 0
     assert [row["best"] for row in rows(tmp_path / "run" / "evaluations.csv")] == ["1", "0"]
     assert rejeu.load(tmp_path / "run" / "best.safetensors").num_timesteps == 60
 
@@ -493,7 +499,7 @@ def test_resume_says_that_it_skipped_a_damaged_checkpoint(run, tmp_path, capsys)
     content = bytearray(newest.read_bytes())
     content[-9] ^= 1
     newest.write_bytes(content)
-    assert main(["resume", str(tmp_path / "run"), "--steps", "10"]) == 0
+    assert main(["resume", str(tmp_path / "run"), "--steps", "10", *FEWER_FILES]) == 0
     said = capsys.readouterr()
     assert "resumed at step 0" in said.out
     warning = (

@@ -15,7 +15,9 @@ import pytest
 import rejeu
 from rejeu.cli import main, parsing
 from rejeu.cli.commands import COMMANDS
-from tests.cli.test_cli import TINY, error_of
+from tests.cli.test_cli import FEWER_FILES, TINY, error_of
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 SOURCE = """
 import gymnasium as gym, numpy as np
@@ -62,7 +64,7 @@ def here(tmp_path, monkeypatch):
 
 def train(*named, out="run"):
     argv = ["train", *named, "--algo", "SAC", "--steps", "60", "--seed", "0", "--out", out, "--evaluate-episodes", "1"]
-    assert main([*argv, "--set", *TINY]) == 0
+    assert main([*argv, *FEWER_FILES, "--set", *TINY]) == 0
 
 
 def forget():
@@ -82,7 +84,7 @@ def test_the_command_that_train_prints_works_for_an_environment_of_ones_own(name
     forget()
     assert main(["record", "run", "--env", named, "--episodes", "1"]) == 0
     forget()
-    assert main(["resume", "run", "--env", named, "--steps", "20"]) == 0
+    assert main(["resume", "run", "--env", named, "--steps", "20", *FEWER_FILES]) == 0
     assert rejeu.load("run/agent").num_timesteps == 80
 
 

@@ -20,6 +20,9 @@ from rejeu.interrupt import Stopped
 ROOT = Path(__file__).parents[2]
 BALL = "rejeu/Ball-v0"
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=8", "buffer_size=5000", "learning_starts=50"]
+FEWER_FILES = ["--no-report", "--no-video"]
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 
 class NoInfo(gym.Env):
@@ -57,7 +60,7 @@ def documented_keys(command):
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "ball"
     argv = ["train", BALL, "--steps", "200", "--seed", "3", "--out", str(out), "--evaluate-episodes", "2"]
-    assert main([*argv, "--log", "json", "--set", *TINY]) == 0
+    assert main([*argv, *FEWER_FILES, "--log", "json", "--set", *TINY]) == 0
     return out
 
 
@@ -74,7 +77,7 @@ def test_train_prints_its_summary(capsys, tmp_path):
 
 
 def test_resume_prints_its_summary_and_continues_the_logs(run, capsys):
-    result, messages = document(capsys, "resume", str(run), "--steps", "50")
+    result, messages = document(capsys, "resume", str(run), "--steps", "50", *FEWER_FILES)
     assert result.keys() == documented_keys("resume")
     assert result["steps"] == 250
     assert "checkpoint    resumed at step 200" in messages
