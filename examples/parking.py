@@ -1,7 +1,7 @@
 """Trains SAC with hindsight experience replay to park a car, in 16 environments at once.
 
 Observations of parking-v0 contain the goal: the pose in which the car must stop. Requires ``pip install
-'rejeu[parking]'`` or EnvPool, which rejeu uses if it is installed.
+"rejeu[parking]"`` or EnvPool, which rejeu uses if it is installed.
 """
 
 import rejeu

@@ -13,7 +13,7 @@ from rejeu.errors import ClusterError, MissingExtra
 
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtra, match=r"backend='ray' needs ray, .* pip install 'rejeu\[ray\]'"):
+    with pytest.raises(MissingExtra, match=r"backend='ray' needs ray, .* pip install \"rejeu\[ray\]\""):
         cluster.connect()
 
 

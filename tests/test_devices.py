@@ -15,7 +15,7 @@ needs_no_gpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="of mac
 
 @needs_no_gpu
 def test_a_missing_device_is_one_line_with_what_there_is_and_how_to_get_it():
-    with pytest.raises(ValueError, match=r"device='gpu'.* only 1 CPU device.*pip install 'jax\[cuda") as raised:
+    with pytest.raises(ValueError, match=r"device='gpu'.* only 1 CPU device.*pip install .jax\[cuda") as raised:
         rejeu.DQN("MlpPolicy", "CartPole-v1", device="cuda", **SMALL)
     assert "\n" not in str(raised.value)
 

@@ -15,7 +15,7 @@ NAMES = ("auto", "cpu", "gpu")
 """``auto`` is JAX's default device: the first GPU if there is one that JAX supports, else the CPU."""
 SYNONYMS = {"cuda": "gpu", "cuda:0": "gpu"}
 """Names of Stable-Baselines3."""
-INSTALL = "pip install 'jax[cuda13]'"
+INSTALL = 'pip install "jax[cuda13]"'
 """The command that brings JAX for NVIDIA GPUs; ``cuda12`` is for older drivers."""
 
 

@@ -10,7 +10,7 @@ class MissingExtra(ImportError):
     """An optional package is not installed. The message contains the command that installs it."""
 
     def __init__(self, purpose: str, package: str, extra: str) -> None:
-        super().__init__(f"{purpose} needs {package}, which is not installed; run: pip install 'rejeu[{extra}]'")
+        super().__init__(f'{purpose} needs {package}, which is not installed; run: pip install "rejeu[{extra}]"')
 
 
 class CheckpointError(ValueError):

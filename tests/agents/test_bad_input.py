@@ -170,5 +170,5 @@ def test_a_missing_extra_is_named_with_its_command(monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "highway_env" else real(name, *a))
     monkeypatch.delitem(gym.registry, "parking-v0", raising=False)
-    with pytest.raises(MissingExtra, match=r"parking-v0 needs highway-env, .*run: pip install 'rejeu\[parking\]'"):
+    with pytest.raises(MissingExtra, match=r'parking-v0 needs highway-env, .*run: pip install "rejeu\[parking\]"'):
         rejeu.make_vector("parking-v0", backend="gymnasium")

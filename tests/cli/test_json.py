@@ -139,7 +139,7 @@ def test_a_log_whose_package_is_missing_is_an_error_before_training(kind, capsys
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, kind, None)
     assert main(["train", BALL, "--log", kind]) == 2
-    assert capsys.readouterr().err.endswith(f"is not installed; run: pip install 'rejeu[{kind}]'\n")
+    assert capsys.readouterr().err.endswith(f'is not installed; run: pip install "rejeu[{kind}]"\n')
     assert not [*tmp_path.iterdir()]
 
 

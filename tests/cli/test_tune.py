@@ -111,7 +111,7 @@ def test_folders_of_other_studies_are_one_line(pretend, tmp_path, capsys):
 def test_a_missing_package_is_one_line(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert tune(out=tmp_path / "study") == 2
-    assert "rejeu tune needs optuna, which is not installed; run: pip install 'rejeu[tune]'" in capsys.readouterr().err
+    assert 'rejeu tune needs optuna, which is not installed; run: pip install "rejeu[tune]"' in capsys.readouterr().err
     assert not (tmp_path / "study").exists()
 
 

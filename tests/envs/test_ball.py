@@ -251,7 +251,7 @@ def test_drawing_without_a_render_mode_says_how_to_get_one():
 
 def test_drawing_without_pygame_names_the_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pygame", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'rejeu\["):
+    with pytest.raises(MissingExtra, match=r'pip install "rejeu\['):
         placed(0.0, 0.0, render_mode="rgb_array").render()
 
 

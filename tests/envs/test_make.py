@@ -354,7 +354,7 @@ def test_auto_uses_gymnasium_without_envpool(without_envpool):
 
 
 def test_the_envpool_backend_without_envpool_says_how_to_install_it_and_its_size(without_envpool):
-    said = r"EnvPool \(about 770 MB with its assets\), which is not installed; run: pip install 'rejeu\[envpool\]'"
+    said = r'EnvPool \(about 770 MB with its assets\), which is not installed; run: pip install "rejeu\[envpool\]"'
     with pytest.raises(rejeu.MissingExtra, match=said):
         make_vector("Pendulum-v1", backend="envpool")
     with pytest.raises(ValueError, match="no environment is called 'Pong-v5'"):
@@ -411,7 +411,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(monkeypatc
 
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "gymnasium_robotics" else real(name))
-    with pytest.raises(MissingExtra, match=r"FetchReach-v99 needs gymnasium-robotics.*pip install 'rejeu\[robotics\]'"):
+    with pytest.raises(MissingExtra, match=r'FetchReach-v99 needs gymnasium-robotics.*pip install "rejeu\[robotics\]"'):
         make_env("FetchReach-v99")
 
 
@@ -420,7 +420,7 @@ def test_a_dependency_that_gymnasium_misses_is_named_likewise(monkeypatch):
         raise gym.error.DependencyNotInstalled("Box2D is not installed, run `pip install swig`")
 
     monkeypatch.setattr(gym, "make", make)
-    with pytest.raises(MissingExtra, match=r"pip install 'rejeu\[box2d\]'"):
+    with pytest.raises(MissingExtra, match=r'pip install "rejeu\[box2d\]"'):
         make_env("LunarLander-v3")
 
 

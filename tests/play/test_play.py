@@ -531,7 +531,7 @@ def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, argv, message):
 
 def test_a_window_without_pygame_names_the_extra(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert "playing needs pygame-ce, which is not installed; run: pip install 'rejeu[play]'" in error_of(
+    assert 'playing needs pygame-ce, which is not installed; run: pip install "rejeu[play]"' in error_of(
         capsys, "play", LEVER
     )
 

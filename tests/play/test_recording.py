@@ -133,4 +133,4 @@ def test_a_recording_overwrites_nothing(capsys, tmp_path):
 def test_a_recording_without_minari_names_the_extra(capsys, tmp_path, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     text = error_of(capsys, "play", LEVER, "--record", str(tmp_path / "played"))
-    assert "pip install 'rejeu[play]'" in text
+    assert 'pip install "rejeu[play]"' in text

@@ -191,5 +191,5 @@ def test_without_its_package_a_log_names_the_command_that_installs_it(monkeypatc
     for kind in ("wandb", "mlflow", "trackio"):
         monkeypatch.setitem(sys.modules, kind, None)
         agent = small_sac(BALL, log=kind)
-        with pytest.raises(rejeu.errors.MissingExtra, match=rf"pip install 'rejeu\[{kind}\]'"):
+        with pytest.raises(rejeu.errors.MissingExtra, match=rf'pip install "rejeu\[{kind}\]"'):
             agent.learn(10)

@@ -323,7 +323,7 @@ def hide(monkeypatch, package):
 
 def test_missing_ffmpeg_names_the_extra(lamp, tmp_path, monkeypatch):
     hide(monkeypatch, "imageio_ffmpeg")
-    with pytest.raises(MissingExtra, match=r"pip install 'rejeu\[video\]'"):
+    with pytest.raises(MissingExtra, match=r'pip install "rejeu\[video\]"'):
         record_video(Still(), tmp_path / "v.mp4", lamp)
 
 

@@ -96,6 +96,6 @@ def test_a_missing_package_is_a_note(study, monkeypatch):
     opened = studies.join(StudyFolder(study.folder.path))
     result = tuning.run(opened, "Pendulum-v1", (), 1, tuning.Interrupt(), print, print)
     assert result.notes == (
-        "no study.html: a report needs plotly, which is not installed; run: pip install 'rejeu[report]'",
+        'no study.html: a report needs plotly, which is not installed; run: pip install "rejeu[report]"',
     )
     assert presets.read(study.folder.preset).env_id == "Pendulum-v1"

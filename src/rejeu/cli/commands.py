@@ -85,7 +85,7 @@ class Train(EnvironmentOptions):
     jobs: Count = None
     """With --seeds: how many are trained at once; by default half as many as there are cores."""
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
-    """Hyperparameters, dotted where nested: policy_kwargs.net_arch=[64,64] train_freq=[1,"episode"]."""
+    """Hyperparameters, dotted where nested: "policy_kwargs.net_arch=[64,64]" "train_freq=[1,'episode']"."""
     out: Folder = None
     """Run folder, new or empty; by default one under runs, named after the run and the time."""
     success_threshold: Return = None
@@ -188,7 +188,7 @@ class Tune(EnvironmentOptions):
     assignments: Annotated[Assignments, UseAppendAction, arg(name="set", metavar="NAME=VALUE ...")] = ()
     """Hyperparameters to set instead of searching them, as for rejeu train."""
     search: Annotated[Assignments, UseAppendAction, arg(metavar="NAME=LOW..HIGH ...")] = ()
-    """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 batch_size=[64,128] tau=log:0.001..0.1"""
+    """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 "batch_size=[64,128]" tau=log:0.001..0.1"""
     only: Annotated[Assignments, UseAppendAction, arg(metavar="NAME ...")] = ()
     """Search these hyperparameters and no others."""
     trial_seeds: Annotated[int, arg(metavar="K")] = 1
@@ -312,7 +312,7 @@ class Play(EnvironmentOptions):
     env: EnvironmentId
     """Id of an environment with Discrete or Box actions, as for rejeu train; or Car, Mountain or Lunar."""
     keys: Annotated[Assignments, UseAppendAction, arg(metavar="KEYS=ACTION ...")] = ()
-    """Other keys: a=0 d=2 none=1 for Discrete actions, w=[1,0] a+w=[1,-1] for Box actions; none is nothing held."""
+    """Other keys: a=0 d=2 none=1 for Discrete actions, "w=[1,0]" "a+w=[1,-1]" for Box actions; none is nothing held."""
     seed: Count = None
     """Of the first episode; each further one has the next seed. By default a random one."""
     fps: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None

@@ -19,7 +19,7 @@ def run(arguments: Course) -> int:
             change = "" if is_new else " exists and was not changed; delete or rename it to get a new copy"
             print(f"{path}{change}", flush=True)
         if not any(path.suffix == ".ipynb" for path in [*written, *kept]):
-            print("only text notebooks (.py) were written; for .ipynb too, run: pip install 'rejeu[course]'")
+            print('only text notebooks (.py) were written; for .ipynb too, run: pip install "rejeu[course]"')
         if arguments.json:
             jsonout.emit({"written": written, "kept": kept}, output)
     return 0

@@ -146,7 +146,7 @@ def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -
     """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
     if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
         return env.backend
-    return f"{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install 'rejeu[envpool]'"
+    return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
 
 
 def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:

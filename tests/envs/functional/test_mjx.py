@@ -18,7 +18,7 @@ HAS_MJX = importlib.util.find_spec("mujoco") is not None and importlib.util.find
 
 @pytest.mark.skipif(HAS_MJX, reason="MJX is installed")
 def test_a_missing_package_is_named():
-    with pytest.raises(MissingExtra, match=r"pip install 'rejeu\[mjx\]'"):
+    with pytest.raises(MissingExtra, match=r'pip install "rejeu\[mjx\]"'):
         mjx.InvertedPendulum()
 
 

@@ -13,7 +13,7 @@ from tests.reporting.report.folders import write, write_hostile
 from tests.reporting.test_comparison import write_run
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright; pip install 'rejeu[browser]'")
+playwright = pytest.importorskip("playwright.sync_api", reason='needs playwright; pip install "rejeu[browser]"')
 pytestmark = [
     pytest.mark.exhaustive,  # a browser takes seconds to start and to draw
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium; on Debian: apt-get install chromium"),

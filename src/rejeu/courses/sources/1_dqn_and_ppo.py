@@ -11,7 +11,7 @@
 # - A cell that trains needs the functions above it. If one is missing, it says so and stops.
 # - Questions are marked with **Question**. The answers are in the solution, in the folder `solutions`.
 #
-# You need: `pip install 'rejeu[course]'`. All trainings together take about three minutes on two CPU cores.
+# You need: `pip install "rejeu[course]"`. All trainings together take about three minutes on two CPU cores.
 
 # %% [markdown] lang="fr"
 # # Cours 1 : DQN et PPO, pièce par pièce
@@ -27,7 +27,7 @@
 # - Une cellule d'entraînement a besoin des fonctions qui la précèdent. S'il en manque une, elle le dit et s'arrête.
 # - Les questions sont signalées par **Question**. Les réponses sont dans le corrigé, dans le dossier `solutions`.
 #
-# Il vous faut : `pip install 'rejeu[course]'`. Tous les entraînements réunis prennent environ trois minutes sur deux
+# Il vous faut : `pip install "rejeu[course]"`. Tous les entraînements réunis prennent environ trois minutes sur deux
 # cœurs.
 
 # %%

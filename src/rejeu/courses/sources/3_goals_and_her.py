@@ -449,11 +449,11 @@ plt.show()
 env.close()
 
 # %% [markdown] lang="en"
-# SAC and DDPG with HER, in 16 environments at once. With `pip install 'rejeu[envpool]'` they are stepped in C++;
+# SAC and DDPG with HER, in 16 environments at once. With `pip install "rejeu[envpool]"` they are stepped in C++;
 # without it the simulation in Python takes several minutes more. SAC explores by its random policy. DDPG needs noise.
 
 # %% [markdown] lang="fr"
-# SAC et DDPG avec HER, dans 16 environnements à la fois. Avec `pip install 'rejeu[envpool]'`, ils sont calculés en
+# SAC et DDPG avec HER, dans 16 environnements à la fois. Avec `pip install "rejeu[envpool]"`, ils sont calculés en
 # C++ ; sans cela, la simulation en Python demande plusieurs minutes de plus. SAC explore par sa politique aléatoire.
 # DDPG a besoin de bruit.
 

@@ -1,6 +1,6 @@
 """Environments on MuJoCo's engine in JAX (MJX), and an example: an inverted pendulum.
 
-They need the packages ``mujoco`` and ``mujoco-mjx``, in equal versions: ``pip install 'rejeu[mjx]'``. MJX is made for
+They need the packages ``mujoco`` and ``mujoco-mjx``, in equal versions: ``pip install "rejeu[mjx]"``. MJX is made for
 thousands of environments on a GPU.
 """
 
