@@ -23,6 +23,7 @@ from rejeu import cli, validation
 from rejeu.algorithms import ppo, sac
 from rejeu.cli import settings
 from rejeu.sweeps import process
+from rejeu.sweeps.plan import read_plan
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -160,6 +161,13 @@ def test_the_commands_of_a_page_are_understood(page, arguments, monkeypatch, cap
     command.import_source = lambda name: None
     assert cli.main(arguments) == 0, capsys.readouterr().err
     assert len(given) == 1
+
+
+def test_the_plan_of_the_page_on_scaling_is_read(tmp_path):
+    page = ROOT / "docs" / "scaling.md"
+    (tmp_path / "plan.toml").write_text("".join(block.text for block in blocks(page) if block.language == "toml"))
+    plan, _ = read_plan(tmp_path / "plan.toml")
+    assert (len(plan.jobs), plan.resources.cpus) == (40, 2)
 
 
 def test_blocks_are_found_in_the_pages():

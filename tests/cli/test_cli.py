@@ -313,6 +313,8 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "ALE/Pong-v5"], "pip install ale-py; EnvPool has Pong-v5: backend='envpool' (--backend envpool)"),
         (["check", "Pong-v5"], "Gymnasium has no Pong-v5, so it cannot be drawn or stepped by Gymnasium; EnvPool has"),
         (["trian", "Pendulum-v1"], "no command is called 'trian'; did you mean train?"),
+        (["trian", "--help"], "no command is called 'trian'; did you mean train?"),
+        ([], "expected a command, such as rejeu train parking-v0"),
         (["train"], "rejeu train needs ENV"),
         (["train", "Pendulum-v1", "CartPole-v1"], "does not expect 'CartPole-v1'"),
         (["train", "Pendulum-v1", "--step", "5"], "no option --step; did you mean --steps?"),

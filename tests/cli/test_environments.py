@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
 import shutil
@@ -15,6 +16,9 @@ import pytest
 import rejeu
 from rejeu.cli import main, parsing
 from rejeu.cli.commands import COMMANDS
+from rejeu.cli.environment import Environment
+from rejeu.reporting.text import quoted
+from rejeu.sweeps.jobs import Code, Job, again
 from tests.cli.test_cli import FEWER_FILES, TINY, error_of
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -73,19 +77,45 @@ def forget():
     sys.modules.pop("drift_env", None)
 
 
-@pytest.mark.parametrize("named", ["drift_env:Drift-v0", "drift_env.py"])
-def test_the_command_that_train_prints_works_for_an_environment_of_ones_own(named, here, capsys):
-    train(named)
+@pytest.mark.parametrize(("named", "out"), [("drift_env:Drift-v0", "run"), ("drift_env.py", "été 1/run")])
+def test_the_command_that_train_prints_works_for_an_environment_of_ones_own(named, out, here, capsys):
+    train(named, out=out)
     hint = capsys.readouterr().out.strip().splitlines()[-1]
-    assert hint == f"try it        rejeu evaluate run --env {named} --backend gymnasium"
+    assert hint == f"try it        rejeu evaluate {quoted(out)} --env {named} --backend gymnasium"
     forget()
     assert main([*shlex.split(hint.partition("rejeu ")[2]), "--episodes", "1"]) == 0
     assert "return 10.00" in capsys.readouterr().out
     forget()
-    assert main(["record", "run", "--env", named, "--episodes", "1"]) == 0
+    assert main(["record", out, "--env", named, "--episodes", "1"]) == 0
     forget()
-    assert main(["resume", "run", "--env", named, "--steps", "20", *FEWER_FILES]) == 0
-    assert rejeu.load("run/agent").num_timesteps == 80
+    assert main(["resume", out, "--env", named, "--steps", "20", *FEWER_FILES]) == 0
+    assert rejeu.load(f"{out}/agent").num_timesteps == 80
+
+
+def test_commands_to_type_name_what_was_imported():
+    made = Environment("CartPole-v1", "CartPole-v1", {}, (), (), modules=("awac.py",))
+    assert made.options() == " --import awac.py"
+    job = Job(name="seed_0", env="my_env.py", seed=0, env_kwargs={"g": 9.8}, wrappers=("my_env:Double",))
+    code = Code(env="my_env.py", wrappers=job.wrappers, imports=("awac.py",))
+    assert again([job], code) == " --env my_env.py --env-kwargs g=9.8 --wrapper my_env:Double --import awac.py"
+
+
+def test_a_file_in_a_folder_with_py_in_its_name(here):
+    folder = here / "my.pyproject"
+    folder.mkdir()
+    (here / "drift_env.py").rename(folder / "drift_env.py")
+    assert main(["check", "my.pyproject/drift_env.py"]) == 0
+    assert main(["check", "my.pyproject/drift_env.py:Drift-v0"]) == 0
+
+
+@pytest.mark.parametrize("problem", ["raise ValueError('no gain')", "return int('no gain')"])
+def test_an_error_of_ones_own_code_says_where(problem, here, capsys):
+    source = here / "drift_env.py"
+    source.write_text(SOURCE.replace("self.x += float(action[0])", problem))
+    line = source.read_text().splitlines().index(f"        {problem}") + 1
+    assert f"(drift_env.py, line {line}, in step)" in error_of(
+        capsys, "train", "drift_env.py", "--steps", "9", "--out", "run"
+    )
 
 
 def test_keyword_arguments_and_wrappers_are_used_while_training_and_named_in_the_hint(here, capsys):
@@ -116,6 +146,7 @@ def test_the_console_script_finds_modules_in_the_current_folder(here):
     [
         (["no_such_env:X-v0"], "there is no module 'no_such_env' in"),
         (["no_such_env.py"], "there is no file no_such_env.py"),
+        (["drift_env"], "no environment is called 'drift_env'; did you mean the file drift_env.py?"),
         (["drift_env:Drif-v0"], "drift_env registers Drift-v0, not 'Drif-v0'"),
         (["empty_env.py"], "empty_env.py registers no environment; add gymnasium.register("),
         (["two_env.py"], "two_env.py registers A-v0 and B-v0; name one of them: two_env.py:A-v0"),
@@ -222,6 +253,14 @@ def test_a_run_folder_of_an_earlier_version_is_read(registered_run, tmp_path):
     assert folder.videos == tmp_path / "videos"
     (tmp_path / "films").mkdir()
     assert folder.videos == tmp_path / "films"
+
+
+def test_output_to_a_pipe_whose_encoding_lacks_a_character(registered_run, monkeypatch):
+    pipe = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", pipe)
+    assert main(["evaluate", str(registered_run), "--episodes", "1"]) == 0
+    pipe.flush()
+    assert b" ? " in pipe.buffer.getvalue()
 
 
 def test_film_every_is_still_accepted():

@@ -6,13 +6,17 @@ That module is imported when the command runs, so that help and errors in the ar
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import re
 import signal
 import sys
+import sysconfig
 import tempfile
+import traceback
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from tyro.extras import subcommand_cli_from_dict
@@ -40,6 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if [*argv] == ["--version"]:
         print(f"rejeu {rejeu.__version__}")
         return 0
+    for stream in (sys.stdout, sys.stderr):  # a pipe may have an encoding without ±
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
         os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with interrupt.leaving(), supervised.by_parent(), warnings.catch_warnings():
@@ -62,7 +69,7 @@ def run_command(argv: Sequence[str]) -> int:
     except Exception as error:
         if not isinstance(error, expected_errors()):
             raise
-        print(f"rejeu: error: {one_line(error)}", file=sys.stderr)
+        print(f"rejeu: error: {one_line(error)}{place_of(error)}", file=sys.stderr)
         return 2
 
 
@@ -77,6 +84,17 @@ def expected_errors() -> tuple[type[Exception], ...]:
 
     own = (errors.BadEnvironmentError, errors.NonFiniteError, errors.RunInUseError, errors.WorkerError)
     return ValueError, TypeError, ImportError, OSError, MemoryError, *own, gymnasium.error.Error
+
+
+def place_of(error: Exception) -> str:
+    """Returns where the user's own code raised an error, such as that of an environment; empty if it did not."""
+    not_own = Path(sysconfig.get_path("stdlib")).resolve(), Path(rejeu.__file__).resolve().parent
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
+        path = Path(frame.f_code.co_filename).resolve()
+        is_installed = "site-packages" in path.parts or any(path.is_relative_to(folder) for folder in not_own)
+        if path.is_file() and not is_installed:
+            return f" ({path.name}, line {line}, in {frame.f_code.co_name})"
+    return ""
 
 
 def one_line(error: Exception | Warning | str) -> str:

@@ -8,7 +8,6 @@ Everything else must be typed again, and the error says what.
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
@@ -23,6 +22,7 @@ from rejeu.cli.importing import find_id, find_wrapper, imports
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import are_plain, maker, register
 from rejeu.errors import CheckpointError
+from rejeu.reporting.text import quoted
 from rejeu.reporting.video import make_rendering_env
 
 DEFAULT_WORKERS = WorkerOptions()
@@ -94,7 +94,7 @@ class Environment:
         """
         recorded = not imports(self.typed) and not self.wrapper_names and are_plain(dict(self.kwargs))
         made = "" if recorded else options(self.typed, self.kwargs, self.wrapper_names)
-        return made + "".join(f" --import {shlex.quote(name)}" for name in self.modules)
+        return made + "".join(f" --import {quoted(name)}" for name in self.modules)
 
     def __str__(self) -> str:
         parts = [f"{key}={value!r}" for key, value in self.kwargs.items()]
@@ -122,7 +122,7 @@ def options(typed: str, kwargs: Mapping[str, Any], wrapper_names: Iterable[str])
     if kwargs:
         words += ["--env-kwargs", *(f"{key}={settings.written(value)}" for key, value in kwargs.items())]
     words += chain.from_iterable(("--wrapper", name) for name in wrapper_names)
-    return "".join(f" {shlex.quote(word)}" for word in words)
+    return "".join(f" {quoted(word)}" for word in words)
 
 
 def from_arguments(env: str, given: EnvironmentOptions) -> Environment:

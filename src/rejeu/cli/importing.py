@@ -28,13 +28,15 @@ def find_id(name: str) -> str:
         ValueError: if the module does not register it.
         ImportError: if there is no such module.
     """
-    if not imports(name):
-        return name
     import gymnasium as gym
 
+    if not name.endswith(".py") and ":" not in name:
+        if name not in gym.registry and Path(f"{name}.py").is_file():
+            raise ValueError(f"no environment is called {name!r}; did you mean the file {name}.py?")
+        return name
     before = set(gym.registry)
-    if ".py" in name and (name.endswith(".py") or ".py:" in name):
-        stem, _, env_id = name.partition(".py")
+    if name.endswith(".py") or ".py:" in name:
+        stem, _, env_id = name.rpartition(".py")
         env_id, source = env_id.removeprefix(":"), f"{stem}.py"
     else:
         source, _, env_id = name.partition(":")

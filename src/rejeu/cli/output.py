@@ -19,7 +19,7 @@ from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.interrupt import NAMES
 from rejeu.io import atomic
 from rejeu.reporting.logging import Sink
-from rejeu.reporting.text import counted
+from rejeu.reporting.text import counted, quoted
 
 echo = partial(print, flush=True)
 
@@ -80,7 +80,7 @@ def summary(
     lines = [""]
     if not is_complete:
         can_resume = folder.checkpoints.is_dir()
-        how = f"; rejeu resume {folder.path}{options} continues" if can_resume else ""
+        how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
         what = "paused" if signal is None else f"stopped by {NAMES[signal]}"
         saved = "; everything is saved" if agent.failed_writes.complete else ""
         lines.append(f"{what}{saved}{how}")
@@ -96,7 +96,7 @@ def summary(
             f"files         {folder.path}: {files}",
             f"time          {seconds:.1f} s in all, {compile_seconds:.1f} s of them compiling; "
             f"{agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s",
-            f"try it        rejeu evaluate {folder.path}{options}{backend}",
+            f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
         ]
     )
 

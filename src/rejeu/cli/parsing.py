@@ -38,11 +38,15 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
         ValueError: for an unknown command or option, with the nearest; a value that is missing, not a number or not among
             the choices; a positional argument that is missing, or one too many.
     """
-    if not argv or argv[0] in ("-h", "--help") or {"-h", "--help"} & {*argv[1:]}:
-        return [*argv]
+    if not argv:
+        raise ValueError("expected a command, such as rejeu train parking-v0; rejeu --help lists all")
     command, *words = argv
+    if command in ("-h", "--help"):
+        return [*argv]
     if command not in commands:
         raise ValueError(f"no command is called {command!r}; {nearest(command, commands)}")
+    if {"-h", "--help"} & {*words}:
+        return [command, "--help"]
     known = options(commands[command])
     positionals = [one for one in known if one.is_positional]
     by_name = {one.name: one for one in known if not one.is_positional}
@@ -58,6 +62,8 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
                 raise ValueError(f"rejeu {command} has no option {name}; {nearest(name, by_name)}")
             option = by_name[name]
             if option.is_flag:
+                if equals:
+                    raise ValueError(f"{name} takes no value, got {text!r}; leave it out or write {name} alone")
                 result.append(name)
                 continue
             end = i
@@ -70,6 +76,8 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
                 raise ValueError(f"{name} needs a value")
             result += [name, *(read(option, value) for value in values)]
             i = end
+        elif word.startswith("-"):
+            raise ValueError(f"rejeu {command} has no option {word}; {nearest(f'-{word}', by_name)}")
         elif filled == len(positionals):
             raise ValueError(f"rejeu {command} does not expect {word!r}; rejeu {command} --help shows what it takes")
         else:
@@ -90,6 +98,10 @@ def read(option: Option, text: str) -> str:
     if option.choices and text not in option.choices:
         raise ValueError(f"{option.name} {text!r} must be one of {', '.join(option.choices)}")
     if not {int, float} & {*option.kinds}:
+        if text.startswith("-"):
+            raise ValueError(
+                f"{option.name} needs a value, got {text!r}; a path that begins with a dash is written ./{text}"
+            )
         return text
     what = "whole number" if int in option.kinds else "number"
     try:

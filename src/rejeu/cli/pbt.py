@@ -15,6 +15,7 @@ from rejeu.cli.output import echo
 from rejeu.cli.run_folder import check_free
 from rejeu.cli.tune import shared
 from rejeu.interrupt import NAMES, Interrupt
+from rejeu.reporting.text import quoted
 from rejeu.sweeps.processes import default_workers, environment as variables, threads_of
 from rejeu.tuning import members as trained, population as populations
 from rejeu.tuning.members import Members
@@ -74,7 +75,7 @@ def train(members: Members, made: Environment, workers: int | None) -> tuple[int
         complete = trained.train(members, command, at_once, stop, echo)
     result = as_dict(members, complete, stop.signal)
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {members.path}{made.options()} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(members.path)}{made.options()} continues")
         return 128 + stop.signal, result
     echo(f"\nbest member   {result['best']['member']}: {plan.measure} {result['best']['score']:,.4g}")
     echo(f"model         {members.path / 'best.safetensors'}")

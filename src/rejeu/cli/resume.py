@@ -19,6 +19,7 @@ from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make
 from rejeu.envs.make import WorkerOptions
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
+from rejeu.reporting.text import quoted
 from rejeu.sweeps.folder import is_sweep
 from rejeu.tuning.study import StudyFolder
 
@@ -98,8 +99,8 @@ def choose_limits(agent: Agent, arguments: Resume) -> Limits:
             return Limits()
         if steps is None and minutes is None:
             raise ValueError(
-                f"the run is complete after {agent.num_timesteps:,} steps; to train further: rejeu resume {arguments.run} "
-                "--steps N, or --minutes M"
+                f"the run is complete after {agent.num_timesteps:,} steps; to train further: "
+                f"rejeu resume {quoted(arguments.run)} --steps N, or --minutes M"
             )
         return Limits(steps, minutes)
     assert agent.training_call is not None

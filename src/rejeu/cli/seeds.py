@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import shlex
 import time
 from itertools import chain
 from pathlib import Path
@@ -17,9 +16,10 @@ from rejeu.cli import jsonout, settings, sweep
 from rejeu.cli.commands import Train
 from rejeu.cli.run_folder import check_free
 from rejeu.interrupt import NAMES, Interrupt
+from rejeu.reporting.text import quoted
 from rejeu.sweeps.coordinator import Coordinator
 from rejeu.sweeps.folder import Sweep, open_folder
-from rejeu.sweeps.jobs import Code, Job, Options
+from rejeu.sweeps.jobs import Code, Job, Options, again
 from rejeu.sweeps.processes import LocalLauncher, default_workers, threads_of
 from rejeu.sweeps.table import echo, shown
 
@@ -65,7 +65,7 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
     ]
     result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {path}{again(jobs[0], code)} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, code)} continues")
         return 128 + stop.signal, result
     return (2 if any(one.state == "failed" for one in outcomes) else 0), result
 
@@ -110,9 +110,3 @@ def choose_folder(arguments: Train) -> Path:
     check_free(arguments.out)
     name = "-".join(filter(None, [arguments.env, arguments.algo, "seeds", time.strftime("%Y%m%d-%H%M%S")]))
     return arguments.out or Path("runs") / re.sub(r"[^\w.-]+", "-", name)
-
-
-def again(job: Job, code: Code) -> str:
-    """Returns the options that ``rejeu resume`` needs to import the same again."""
-    words = ["--env", job.env, *job.environment_words()] if job.names_code else []
-    return "".join(f" {shlex.quote(word)}" for word in [*words, *code.words()])

@@ -28,6 +28,7 @@ from rejeu.reporting import plots
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
 from rejeu.reporting.report import write_report
+from rejeu.reporting.text import quoted
 from rejeu.reporting.trackers import Background
 from rejeu.reporting.video import record_video
 
@@ -143,7 +144,7 @@ class Session(NamedTuple):
             else:
                 self.plot_curve(evaluate)
                 options = self.environment.options()
-                echo(f"no video of a run that was stopped; rejeu record {folder.path}{options} makes one")
+                echo(f"no video of a run that was stopped; rejeu record {quoted(folder.path)}{options} makes one")
         except Exception:
             self.write_report()
             raise

@@ -13,16 +13,16 @@ from rejeu.validation import number, whole, with_value
 MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
 INTEGERS = {
-    "steps": (1, 2**63 - 1),
+    "steps": (1, 2**62),
     "pause": (1, 2**63 - 1),
     "members": (2, 1000),
     "rounds": (1, 100_000),
     "round_steps": (1, 2**62),
     "envs": (1, MAX_ENVS),
     "episodes": (1, 2**63 - 1),
-    "evaluate_every": (1, 2**63 - 1),
+    "evaluate_every": (1, 2**62),
     "evaluate_episodes": (1, MAX_EPISODES),
-    "video_every": (1, 2**63 - 1),
+    "video_every": (1, 2**62),
     "seed": (0, 2**32 - 1),
     "seeds": (1, 1000),
     "jobs": (1, 1000),

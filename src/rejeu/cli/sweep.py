@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,10 @@ from rejeu.errors import MissingExtra
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.comparison import By, Comparison, compare
 from rejeu.reporting.tabular import interval_text
+from rejeu.reporting.text import quoted
 from rejeu.sweeps.coordinator import Coordinator
 from rejeu.sweeps.folder import SweepFolder, read_folder
-from rejeu.sweeps.jobs import Code
+from rejeu.sweeps.jobs import Code, again
 from rejeu.sweeps.sweep import SweepResult, make_launcher, prepare
 from rejeu.sweeps.table import closing_lines, echo, shown
 
@@ -67,8 +67,7 @@ def complete(
         "comparison": None if comparison is None else comparison.table(),
     }
     if stop.signal is not None:
-        again = "".join(f" {shlex.quote(word)}" for word in code.words())
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {folder.path}{again} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(folder.path)}{again(folder.jobs, code)} continues")
         return 128 + stop.signal, content
     return (2 if result.failed else 0), content
 
@@ -88,5 +87,5 @@ def summarize(folder: Path, by: By | None = None) -> Comparison | None:
     try:
         echo(f"comparison    {comparison.save(folder / 'compare.html')[0]}")
     except (MissingExtra, OSError) as error:
-        echo(f"no compare.html: {error}; rejeu compare {folder} --out compare.md writes the tables")
+        echo(f"no compare.html: {error}; rejeu compare {quoted(folder)} --out compare.md writes the tables")
     return comparison

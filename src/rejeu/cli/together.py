@@ -18,8 +18,9 @@ from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Session, Stopwatch
 from rejeu.envs.functional.registry import is_functional
 from rejeu.interrupt import NAMES, Interrupt
+from rejeu.reporting.text import quoted
 from rejeu.sweeps.folder import Sweep, SweepFolder, open_folder
-from rejeu.sweeps.jobs import Code
+from rejeu.sweeps.jobs import Code, again
 from rejeu.sweeps.processes import threads_of
 
 Begin = Callable[[Train, int, Session | None, ExitStack], Session]
@@ -74,9 +75,9 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
     ]
     result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
     if stop.signal is not None:
-        again = seeds.again(jobs[0], code)
         echo(
-            f"stopped by {NAMES[stop.signal]}; rejeu resume {path}{again} continues, each seed in a process of its own"
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, code)} continues, each seed in a "
+            "process of its own"
         )
         return 128 + stop.signal, result
     return max(statuses), result

@@ -23,7 +23,7 @@ from rejeu.presets import Preset
 from rejeu.reporting import notebook
 from rejeu.reporting.report.sections import duration
 from rejeu.reporting.tabular import number
-from rejeu.reporting.text import counted
+from rejeu.reporting.text import counted, quoted
 from rejeu.tuning import plan as plans, space, study as studies
 from rejeu.tuning.plan import Plan
 from rejeu.tuning.search import Watch
@@ -127,7 +127,7 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
         result = tuning.run(study, made.typed, options, workers, stop, watch, echo)
     echo()
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {study.folder.path}{made.options()} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.options()} continues")
     echo(str(result))
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()

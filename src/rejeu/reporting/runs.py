@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shlex
 import stat
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -26,6 +25,7 @@ from filelock import FileLock, Timeout
 from rejeu import presets
 from rejeu.io.records import Malformed, is_deep, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
+from rejeu.reporting.text import quoted
 
 RENAMED = {
     "time/seconds": "time/time_elapsed",
@@ -182,7 +182,7 @@ class Run:
         names = [name for name in values if name not in same]
         if names:
             words += ["--set", *(f"{name}={assigned(values[name])}" for name in names)]
-        return shlex.join(shown(word, MAX_WORD) for word in words)
+        return " ".join(quoted(shown(word, MAX_WORD)) for word in words)
 
 
 def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
@@ -255,7 +255,9 @@ def newest_inside(folder: Path) -> str:
     runs = [path.parent for path in folder.glob(f"*/{CONFIG}")] if folder.is_dir() else []
     if not runs:
         return ""
-    return f"; the newest of the {len(runs)} in it is {max(runs, key=lambda run: (run / CONFIG).stat().st_mtime)}"
+    return (
+        f"; the newest of the {len(runs)} in it is {quoted(max(runs, key=lambda run: (run / CONFIG).stat().st_mtime))}"
+    )
 
 
 def best_row(evaluations: Table) -> int | None:

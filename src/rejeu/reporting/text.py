@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import html
+import os
+import shlex
+import subprocess
 from collections.abc import Iterable
 
 
@@ -13,6 +16,15 @@ def counted(n: int, noun: str) -> str:
     ('1 episode', '1,200 episodes')
     """
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def quoted(word: object) -> str:
+    """Returns a word of a command line as it is typed: in quotes where the shell needs them.
+
+    >>> quoted("runs/first")
+    'runs/first'
+    """
+    return subprocess.list2cmdline([str(word)]) if os.name == "nt" else shlex.quote(str(word))
 
 
 def html_table(rows: Iterable[Iterable[str]]) -> str:

@@ -14,9 +14,10 @@ from filelock import FileLock
 
 from rejeu.agents import modules_of
 from rejeu.interrupt import Interrupt
+from rejeu.reporting.text import quoted
 from rejeu.supervised import TAKEN
 from rejeu.sweeps.folder import State, SweepFolder
-from rejeu.sweeps.jobs import Code, Job
+from rejeu.sweeps.jobs import Code, Job, again
 from rejeu.sweeps.process import LOST, last_line
 
 POLL = 0.2
@@ -200,7 +201,8 @@ class Coordinator:
 
     def _say_not_started(self, job: Job, error: OSError) -> None:
         self.say(
-            f"{job.name} could not be started: {' '.join(str(error).split())}; rejeu resume {self.folder.path} tries again"
+            f"{job.name} could not be started: {' '.join(str(error).split())}; "
+            f"rejeu resume {quoted(self.folder.path)}{again([job], self.code)} tries again"
         )
 
     def _end(self, attempt: Attempt, status: int) -> None:

@@ -34,6 +34,7 @@ from rejeu.io import atomic
 from rejeu.io.records import Malformed, convert, parse_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
+from rejeu.reporting.text import quoted
 from rejeu.sweeps.jobs import MAX_JOBS, Code, Job
 from rejeu.sweeps.resources import Resources
 
@@ -244,7 +245,7 @@ def check_same(folder: SweepFolder, sweep: Sweep) -> None:
     differing = next((name for name in [*given, *known] if given.get(name) != known.get(name)), "their order")
     raise ValueError(
         f"{folder.path} is the sweep of another plan: {differing} differs; name another folder with --out, or continue that "
-        f"sweep with rejeu resume {folder.path}"
+        f"sweep with rejeu resume {quoted(folder.path)}"
     )
 
 

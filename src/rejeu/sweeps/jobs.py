@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Annotated, Any
@@ -19,6 +19,7 @@ from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError
 from rejeu.io.records import Seed
 from rejeu.reporting.logging import check_logs
+from rejeu.reporting.text import quoted
 from rejeu.validation import assign, choice, coerce, flag, number, whole
 
 MAX_JOBS = 10_000
@@ -154,11 +155,22 @@ class Job:
         """Raises ``CheckpointError`` if the job imports something that the command line does not name."""
         if not self.names_code or (self.env == code.env and self.wrappers == code.wrappers):
             return
-        options = "".join(f" --wrapper {name}" for name in self.wrappers)
+        options = "".join(f" --wrapper {quoted(name)}" for name in self.wrappers)
         raise CheckpointError(
             f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
-            f"if you trust it, name it again: --env {self.env}{options}"
+            f"if you trust it, name it again: --env {quoted(self.env)}{options}"
         )
+
+
+def again(jobs: Iterable[Job], code: Code) -> str:
+    """Returns the options with which ``rejeu resume`` imports what jobs need, with a space before each.
+
+    >>> again([Job(name="seed_0", env="my_env.py", seed=0)], Code(env="my_env.py"))
+    ' --env my_env.py'
+    """
+    job = next((job for job in jobs if job.names_code), None)
+    words = [] if job is None else ["--env", job.env, *job.environment_words()]
+    return "".join(f" {quoted(word)}" for word in [*words, *code.words()])
 
 
 def assignments(option: str, values: Mapping[str, Any]) -> list[str]:

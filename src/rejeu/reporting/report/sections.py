@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +13,7 @@ import numpy as np
 from rejeu.io.records import shown
 from rejeu.reporting.report import curves, videos
 from rejeu.reporting.runs import MAX_WORD, Run, best_row, flat
-from rejeu.reporting.text import counted
+from rejeu.reporting.text import counted, quoted
 
 LAST = 100
 """Training episodes that stand in for a final evaluation."""
@@ -153,7 +151,7 @@ def describe(
         "warnings": [*run.warnings],
         "notes": [*run.notes, *notes],
         "command": run.command,
-        "replay_command": f"rejeu report {quoted(run.path)} --replay 100{env_options(run)}"
+        "replay_command": f"rejeu report {path_word(run.path)} --replay 100{env_options(run)}"
         if run.format == "rejeu" and run.models
         else "",
     }
@@ -322,7 +320,7 @@ def replay_command(run: Run) -> str:
     if run.format != "rejeu" or not run.models:
         return ""
     which = "" if "best.safetensors" in run.models else " --which last"
-    return f"rejeu watch {quoted(run.path)}{which} --seed N --episodes 1{env_options(run)}"
+    return f"rejeu watch {path_word(run.path)}{which} --seed N --episodes 1{env_options(run)}"
 
 
 def env_options(run: Run) -> str:
@@ -330,15 +328,10 @@ def env_options(run: Run) -> str:
     words = run.env_words
     if words or run.env_argument != run.env_id:
         words = ["--env", run.env_argument, *words]
-    words += run.import_words
-    return " " + shlex.join(shown(word, MAX_WORD) for word in words) if words else ""
+    return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in [*words, *run.import_words])
 
 
-def quoted(path: Path) -> str:
-    """Returns a path for a shell, relative to the current folder if it is inside."""
+def path_word(path: Path) -> str:
+    """Returns a path as a word of a command line, relative to the current folder if it is inside."""
     here = Path.cwd()
-    text = str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
-    text = shown(text, 500)
-    if os.name == "nt":
-        return f'"{text}"' if " " in text else text
-    return shlex.quote(text)
+    return quoted(shown(path.relative_to(here) if path.is_relative_to(here) else path, 500))
