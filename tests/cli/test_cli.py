@@ -311,6 +311,12 @@ def test_set_may_be_given_more_than_once(tmp_path):
             "LunarLander-v2 is an old version that Gymnasium no longer has; use LunarLander-v3",
         ),
         (["train", "ALE/Pong-v5"], "pip install ale-py; EnvPool has Pong-v5: backend='envpool' (--backend envpool)"),
+        (
+            ["train", "PongNoFrameskip-v4"],
+            "of the package ale-py, where it is called ALE/Pong-v5, which is not installed",
+        ),
+        (["train", "Pendulum-v1", "--env-cpus", "2"], "--env-cpus are for --backend ray"),
+        (["check", ":Walk-v0"], "':Walk-v0' must be MODULE:ID, such as my_env:Walk-v0"),
         (["check", "Pong-v5"], "Gymnasium has no Pong-v5, so it cannot be drawn or stepped by Gymnasium; EnvPool has"),
         (["trian", "Pendulum-v1"], "no command is called 'trian'; did you mean train?"),
         (["trian", "--help"], "no command is called 'trian'; did you mean train?"),

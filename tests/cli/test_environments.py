@@ -108,6 +108,24 @@ def test_a_file_in_a_folder_with_py_in_its_name(here):
     assert main(["check", "my.pyproject/drift_env.py:Drift-v0"]) == 0
 
 
+def test_a_file_that_was_imported_for_its_wrapper_and_registers_a_class(here):
+    (here / "drift_env.py").write_text(SOURCE.replace('"drift_env:Drift"', "Drift"))
+    assert main(["check", "drift_env.py", "--wrapper", "drift_env:Double"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("def f(:\n", "drift_env.py cannot be imported: SyntaxError: invalid syntax (drift_env.py, line 1)"),
+        ("\nx = y\n", "NameError: name 'y' is not defined (drift_env.py, line 2, in <module>)"),
+        ("import no_such\n", "No module named 'no_such' (drift_env.py, line 1, in <module>)"),
+    ],
+)
+def test_a_file_that_cannot_be_imported_is_one_line(source, message, here, capsys):
+    (here / "drift_env.py").write_text(source)
+    assert message in error_of(capsys, "check", "drift_env.py")
+
+
 @pytest.mark.parametrize("problem", ["raise ValueError('no gain')", "return int('no gain')"])
 def test_an_error_of_ones_own_code_says_where(problem, here, capsys):
     source = here / "drift_env.py"

@@ -89,7 +89,8 @@ def expected_errors() -> tuple[type[Exception], ...]:
 def place_of(error: Exception) -> str:
     """Returns where the user's own code raised an error, such as that of an environment; empty if it did not."""
     not_own = Path(sysconfig.get_path("stdlib")).resolve(), Path(rejeu.__file__).resolve().parent
-    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
+    cause = error.__cause__ or error
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__), *traceback.walk_tb(cause.__traceback__)]):
         path = Path(frame.f_code.co_filename).resolve()
         is_installed = "site-packages" in path.parts or any(path.is_relative_to(folder) for folder in not_own)
         if path.is_file() and not is_installed:

@@ -40,9 +40,11 @@ def find_id(name: str) -> str:
         env_id, source = env_id.removeprefix(":"), f"{stem}.py"
     else:
         source, _, env_id = name.partition(":")
+    if not source:
+        raise ValueError(f"{name!r} must be MODULE:ID, such as my_env:Walk-v0")
     module = import_source(source)
     new = set(gym.registry) - before
-    new |= {key for key, spec in gym.registry.items() if str(spec.entry_point).partition(":")[0] == module.__name__}
+    new |= {key for key, spec in gym.registry.items() if module_of(spec.entry_point) == module.__name__}
     new |= {key for key, entry in REGISTRY.items() if getattr(entry.kind, "__module__", None) == module.__name__}
     if env_id in gym.registry:
         return env_id
@@ -57,6 +59,11 @@ def find_id(name: str) -> str:
     if not env_id:
         raise ValueError(f"{source} registers {found}; name one of them: {source}:{min(new)}")
     raise ValueError(f"{source} registers {found}, not {env_id!r}")
+
+
+def module_of(entry_point: Any) -> str | None:
+    """Returns the module of an environment's entry point: a class, a function, or ``MODULE:NAME``."""
+    return entry_point.partition(":")[0] if isinstance(entry_point, str) else getattr(entry_point, "__module__", None)
 
 
 def find_wrapper(name: str) -> Callable[[Any], Any]:
@@ -77,8 +84,17 @@ def find_wrapper(name: str) -> Callable[[Any], Any]:
 
 
 def import_source(source: str) -> Any:
-    """Returns the module of this name, or of a Python file whose name ends in ``.py``; see the two functions below."""
-    return import_file(Path(source)) if source.endswith(".py") else import_module(source)
+    """Returns the module of this name, or of a Python file whose name ends in ``.py``; see the two functions below.
+
+    Raises:
+        ImportError: if there is none, or if its code raises an error.
+    """
+    try:
+        return import_file(Path(source)) if source.endswith(".py") else import_module(source)
+    except (ImportError, FileNotFoundError):
+        raise
+    except Exception as error:
+        raise ImportError(f"{source} cannot be imported: {type(error).__name__}: {error}") from error
 
 
 def import_module(name: str) -> Any:

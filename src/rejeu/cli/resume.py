@@ -46,8 +46,8 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     stopwatch = Stopwatch()
     folder = RunFolder(arguments.run)
     config = run_folder.read_config(folder)
-    if arguments.ray is not None and config.backend != "ray":
-        raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray is for these")
+    if config.backend != "ray" and (arguments.ray is not None or arguments.env_cpus is not None):
+        raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray and --env-cpus are for these")
     require(config.log)
     device = arguments.device or ("cpu" if config.device == "cpu" else "auto")  # a GPU may not be here
     devices.start_with("--device", device)

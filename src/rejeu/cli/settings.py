@@ -43,13 +43,15 @@ def check_values(arguments: Any) -> None:
         raise ValueError("--pause is for a single run; leave it out, or --seeds")
     if "jobs" in given and "seeds" not in given:
         raise ValueError("--jobs is for several seeds; give --seeds N too")
+    if "backend" in vars(arguments) and given.get("backend") != "ray" and {"ray", "env_cpus"} & given.keys():
+        raise ValueError("--ray and --env-cpus are for --backend ray; give it too, or leave them out")
     for key, value in given.items():
         option = f"--{key.replace('_', '-')}"
         if key in INTEGERS:
             whole(option, value, *INTEGERS[key])
         elif key == "minutes":
             number(option, value, above=0)
-        elif key == "checkpoint_minutes":
+        elif key in ("checkpoint_minutes", "env_cpus"):
             number(option, value, least=0)
         elif key in ("success_threshold", "threshold"):
             number(option, value)

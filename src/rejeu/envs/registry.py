@@ -158,16 +158,17 @@ class _Maker:
 
 def unknown_environment(env_id: str) -> str:
     """Returns the error message for an unknown id, with what to install, or similar ids."""
-    short = env_id.removeprefix("ALE/")
+    short = re.sub(r"(NoFrameskip|Deterministic)-v\d+$", "-v5", env_id.removeprefix("ALE/"))
     elsewhere = f"EnvPool has {short}: backend='envpool' (--backend envpool)" if in_envpool(short) else ""
-    if env_id.startswith("ALE/"):
+    if short != env_id:
         also = f"; {elsewhere}" if elsewhere else ""
-        return f"{env_id} is of the package ale-py, which is not installed: pip install ale-py{also}"
+        old = "" if env_id.startswith("ALE/") else f", where it is called ALE/{short}"
+        return f"{env_id} is of the package ale-py{old}, which is not installed: pip install ale-py{also}"
     if newer := newer_version(env_id):
         return f"{env_id} is an old version that Gymnasium no longer has; use {newer}"
     if elsewhere:
         return f"Gymnasium has no {env_id}, so it cannot be drawn or stepped by Gymnasium; {elsewhere}"
-    known = [*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"]
+    known = {*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"}
     near = difflib.get_close_matches(env_id, known, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else "rejeu list shows the environments that have presets"
     return f"no environment is called {env_id!r}; {hint}"
