@@ -12,6 +12,13 @@ from tyro.conf import Positional, arg
 
 RENAMED = {"--film-every": "--video-every"}
 """Options of earlier versions, which are still accepted."""
+ELSEWHERE = {
+    "--env": "the environment is given without an option: rejeu {command} ENV",
+    "--lr": "hyperparameters are given as --set learning_rate=1e-3",
+    "--learning-rate": "hyperparameters are given as --set learning_rate=1e-3",
+    "-n": "did you mean --steps?",
+}
+"""What other programs have as options, and what replaces it in ``rejeu train``, by their names."""
 
 
 class Option(NamedTuple):
@@ -59,7 +66,7 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
             name = name.replace("_", "-")
             name = RENAMED.get(name, name)
             if name not in by_name:
-                raise ValueError(f"rejeu {command} has no option {name}; {nearest(name, by_name)}")
+                raise ValueError(f"rejeu {command} has no option {name}; {replacement(name, command, by_name)}")
             option = by_name[name]
             if option.is_flag:
                 if equals:
@@ -77,7 +84,7 @@ def checked(argv: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
             result += [name, *(read(option, value) for value in values)]
             i = end
         elif word.startswith("-"):
-            raise ValueError(f"rejeu {command} has no option {word}; {nearest(f'-{word}', by_name)}")
+            raise ValueError(f"rejeu {command} has no option {word}; {replacement(word, command, by_name)}")
         elif filled == len(positionals):
             raise ValueError(f"rejeu {command} does not expect {word!r}; rejeu {command} --help shows what it takes")
         else:
@@ -116,6 +123,13 @@ def read(option: Option, text: str) -> str:
         if not value.is_integer():
             raise ValueError(f"{option.name} {text} must be a whole number") from None
         return str(int(value))
+
+
+def replacement(name: str, command: str, known: Mapping[str, Any]) -> str:
+    """Returns the part of a message that says what to write instead of an unknown option."""
+    if name in ELSEWHERE and "--envs" in known:
+        return ELSEWHERE[name].format(command=command)
+    return nearest(name if name.startswith("--") else f"-{name}", known)
 
 
 def nearest(name: str, known: Mapping[str, Any]) -> str:
