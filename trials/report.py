@@ -267,12 +267,14 @@ def signals() -> str:
     found = read("signals")
     counted = found["signals"] - len(found["before_rejeu"])
     left = ", ".join(f"{what} {n}" for what, n in found["left"].items())
-    return f"""## Ctrl-C and SIGTERM
+    status = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
+    kinds = ", ".join(f"{value} for {name}" for name, value in status.items() if name in found)
+    return f"""## Signals
 
-`rejeu train` received one or two signals at {found["signals"]} random moments: {
+`rejeu train` received one or two signals (expected exit status: {kinds}) at {found["signals"]} random moments: {
         ", ".join(f"{phase} {n}" for phase, n in found["by_phase"].items())
     }. Of the {counted} runs in which the import of rejeu had begun,
-{found["right_status"]} ended with the right exit status (130, 143) and {
+{found["right_status"]} ended with the right exit status and {
         found["one_line_at_most"]
     } printed at most one line. Result:
 {left}. The longest shutdown took {found["most_seconds_until_the_end"]:.1f} s.

@@ -1,10 +1,10 @@
-"""Sends Ctrl-C and SIGTERM to ``rejeu train`` at random moments and checks the state that it leaves behind.
+"""Sends Ctrl-C, SIGTERM and SIGHUP to ``rejeu train`` at random moments and checks the state that it leaves behind.
 
     python trials/signals.py --signals 48
 
 The run is SAC on ``rejeu/Ball-v0``: imports, compilation, training with evaluations and checkpoints, the last
 evaluation, the learning curve and the video. Its duration is measured once without a signal. Each further run receives
-a signal, or two in succession, at a random moment. The exit status must then be 130 for Ctrl-C and 143 for SIGTERM.
+a signal, or two in succession, at a random moment. The exit status must then be 130, 143 or 129.
 Standard error must contain at most one line and no traceback. Both models in the folder must load. If there is a
 checkpoint, the run must resume and train.
 
@@ -45,7 +45,7 @@ TRAIN = [
     "1000",
 ]
 TRAIN += ["--evaluate-every", "1000", "--evaluate-episodes", "5", "--checkpoint-minutes", "0.01"]
-STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
+STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 PHASES = ("before rejeu", "imports and compiling", "training", "evaluation, curve and video")
 
 
@@ -79,7 +79,7 @@ def phase(root: Path, process: subprocess.Popen[bytes]) -> str:
 
 def attempt(number: int, seconds: float, rng: random.Random) -> dict[str, Any] | None:
     """Starts a run, sends a signal and returns the outcome; None if the run ended first."""
-    sent = rng.choice([signal.SIGINT, signal.SIGTERM])
+    sent = rng.choice([*STATUS])
     twice = rng.random() < 0.15
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -162,8 +162,7 @@ def main() -> None:
         "seconds_of_a_run": round(lengths[-1], 1),
         "signals": len(found),
         "by_phase": {name: sum(one["phase"] == name for one in found) for name in PHASES},
-        "SIGINT": sum(one["signal"] == "SIGINT" for one in counted),
-        "SIGTERM": sum(one["signal"] == "SIGTERM" for one in counted),
+        **{kind.name: sum(one["signal"] == kind.name for one in counted) for kind in STATUS},
         "sent_twice": sum(one["twice"] for one in counted),
         "right_status": sum(one["right_status"] for one in counted),
         "one_line_at_most": sum(one["one_line"] for one in counted),
