@@ -247,6 +247,15 @@ def test_list_groups_presets_by_environment_in_columns(capsys):
     assert sorted(named) == sorted({preset.env_id for preset in rejeu.presets.every()})
 
 
+def test_a_reader_that_closes_the_output_is_no_error(monkeypatch, capsys):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w", buffering=1) as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert main(["list"]) == 141
+    assert capsys.readouterr().err == ""
+
+
 def test_version_is_printed(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"rejeu {rejeu.__version__}\n"
@@ -339,6 +348,7 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["evaluate", "run", "--which", "bets"], "--which 'bets' must be one of best, last"),
         (["train", "rejeu-test/Words-v0"], "which no algorithm here takes"),
         (["train", "rejeu-test/Switches-v0", "--algo", "SAC"], "MultiBinary(3)"),
+        (["runs"], "there is no folder runs; rejeu train ENV makes runs in the folder runs"),
         (["evaluate", "no-such-run"], "no run folder or model file no-such-run"),
         (["record", "no-such-run"], "no run folder or model file no-such-run"),
     ],

@@ -30,6 +30,9 @@ DESCRIPTION = """Trains agents on Gymnasium environments.
 
 The shortest use: rejeu train parking-v0. Version: rejeu --version."""
 
+CLOSED = 141
+"""Exit status if the reader of the output has closed it, as after ``| head``; that of SIGPIPE in shells."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit status: 0, 2 after an error, 130 after Ctrl-C, 143 after SIGTERM.
@@ -66,6 +69,9 @@ def run_command(argv: Sequence[str]) -> int:
     except KeyboardInterrupt as error:
         print("rejeu: interrupted", file=sys.stderr)
         return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains when it exits
+        return CLOSED
     except Exception as error:
         if not isinstance(error, expected_errors()):
             raise

@@ -17,6 +17,8 @@ from rejeu.reporting import run_list
 def run(arguments: Runs) -> int:
     """Prints a table of the runs in a folder, or JSON, and returns the exit status."""
     rows, unreadable = [], []
+    if not arguments.folder.exists():
+        raise FileNotFoundError(f"there is no folder {arguments.folder}; rejeu train ENV makes runs in the folder runs")
     for path in run_list.find(arguments.folder):
         try:
             rows.append({"run": str(path), **describe(run_list.read(path))})
