@@ -166,15 +166,10 @@ def make(
         ValueError: for an unknown algorithm, an empty space, or a value out of range.
         TypeError: for a hyperparameter that the algorithm does not have, with the nearest one.
     """
-    given = presets.find(env_id, None if algorithm is None else find_agent(algorithm).algorithm.Config.name)
-    base = preset or given
-    if base is None and algorithm is None:
-        raise ValueError(f"{env_id} has no preset; name the algorithm to tune, such as --algo PPO")
-    name = base.algorithm if base is not None else find_agent(str(algorithm)).algorithm.Config.name
-    base = base or presets.default(env_id, name)
+    base = starting_point(env_id, algorithm, preset)
     fixed = {key: configs.value_to_json(value) for key, value in (fixed or {}).items()}
     values = {**base.hyperparameters, **fixed}
-    space = choose_space(name, values, fixed, search or {}, only)
+    space = choose_space(base.algorithm, values, fixed, search or {}, only)
     if 0 < final_seeds < MIN_FINAL_SEEDS:
         raise ValueError(
             f"final_seeds={final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
@@ -185,7 +180,7 @@ def make(
         env_argument=env_argument or env_id,
         env_kwargs=dict(env_kwargs or {}),
         wrappers=wrappers,
-        algorithm=name,
+        algorithm=base.algorithm,
         default=dict(base.hyperparameters),
         fixed=values,
         space={key: spaces.to_json(one) for key, one in space.items()},
@@ -202,6 +197,29 @@ def make(
         measure=measure,
         checkpoint_minutes=checkpoint_minutes,
     )
+    return as_written(plan)
+
+
+def starting_point(env_id: str, algorithm: str | None, preset: Preset | None) -> Preset:
+    """Returns the preset that trials start from: the given one, rejeu's own, or one of the algorithm's defaults.
+
+    Raises:
+        ValueError: for an unknown algorithm, or if there is none and the environment has no preset.
+    """
+    name = None if algorithm is None else find_agent(algorithm).algorithm.Config.name
+    base = preset or presets.find(env_id, name)
+    if base is None and name is None:
+        raise ValueError(f"{env_id} has no preset; name the algorithm to tune, such as --algo PPO")
+    return base or presets.default(env_id, str(name))
+
+
+def as_written(plan: Plan) -> Plan:
+    """Returns a plan as :func:`read` gives it back, so that a study begins and goes on with the same.
+
+    Raises:
+        ValueError: for a value out of range.
+        TypeError: for a hyperparameter that JSON cannot express.
+    """
     try:
         return convert(json.loads(text(plan)), Plan)
     except CheckpointError as error:
