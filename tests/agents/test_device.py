@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import rejeu
+from rejeu.agents import device
 from rejeu.callbacks import TrainingCallback
 from rejeu.cli import main
+from rejeu.loops.device import driver
 from rejeu.sb3.common.callbacks import BaseCallback
 from tests.loops.device.test_off_policy import make
 
@@ -85,6 +88,21 @@ def test_the_progress_bar_counts_the_steps_of_a_first_chunk_of_many_turns(capsys
     assert "100%  30/30 steps" in capsys.readouterr().out
     agent.learn(31, progress_bar=True)
     assert "100%  31/31 steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "limit", [{"total_timesteps": 150}, {"total_timesteps": 200}, {"total_timesteps": 250}, {"episodes": 5}], ids=str
+)
+def test_all_episodes_are_judged_when_learn_reaches_its_limit(limit: Any, monkeypatch: Any) -> None:
+    """Before that, once in 100 turns."""
+    monkeypatch.setattr(device, "MAX_TURNS", 100)
+    monkeypatch.setattr(driver, "MAX_TURNS", 100)
+    agent = make(rejeu.DQN, "jax/CartPole-v1", learning_starts=10_000, best_window=3).learn(**limit)
+    assert agent.stops is not None
+    means = np.convolve(agent.history["return"], np.full(3, 1 / 3), "valid")
+    assert agent.best is not None
+    assert agent.best.score == pytest.approx(means.max())
+    assert agent.best.step in (100, 200, agent.num_timesteps)
 
 
 @pytest.mark.parametrize(

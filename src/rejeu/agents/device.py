@@ -106,9 +106,8 @@ def episodes_to_judge(agent: BaseAgent, call: TrainingCall, turn: Progress) -> i
     """
     if agent.stops is None:
         return len(turn.episodes)
-    period, n_envs = MAX_TURNS * agent.n_envs, agent.n_envs
-    is_last = call.last_step is not None and turn.step >= call.last_step
-    if turn.step // period == (turn.step - n_envs) // period and not is_last:
+    period = MAX_TURNS * agent.n_envs
+    n_periods = (turn.step - agent.n_envs) // period  # of which the episodes were judged
+    if turn.step // period == n_periods and not call.is_over(turn.step, agent.run.episode):
         return 0
-    before = (turn.step // period - (0 if is_last else 1)) * period
-    return int(np.count_nonzero(agent.history["step"] > before))
+    return int(np.count_nonzero(agent.history["step"] > n_periods * period))
