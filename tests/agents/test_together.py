@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -167,3 +168,58 @@ def test_an_error_of_one_run_on_the_host_names_its_batch(tmp_path: Any, normaliz
         rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "CartPole-v1", 120, seeds=2, callback=callbacks, **settings)
     assert raised.value.batch is not None
     assert all(np.isfinite(value).all() for value in agents[0].get_parameters().values())
+
+
+class Echo(gym.Env):
+    """Its observation is the action; the rewards of environments with the seed 4 become huge."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self) -> None:
+        self.n_steps, self.is_huge = 0, False
+        self.taken: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.is_huge |= seed == 4
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.n_steps += 1
+        self.taken.append(action)
+        return action, 1e30 if self.is_huge and self.n_steps > 40 else 0.0, False, self.n_steps % 10 == 0, {}
+
+
+@pytest.fixture
+def echo() -> Any:
+    """The id of an environment."""
+    gym.register("Echo-v0", Echo)
+    yield "Echo-v0"
+    del gym.registry["Echo-v0"]
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("overlap", [True, False])
+@pytest.mark.parametrize("rate", [1e-3, lambda progress: jnp.where(progress > 0.5, 1e30, 1e-3)])
+def test_a_bad_update_on_the_host_ends_all_runs_with_the_next_turn(
+    tmp_path: Any, echo: str, overlap: bool, rate: Any
+) -> None:
+    """With the second learning rate all actions of both runs would be NaN in the middle of a chunk."""
+
+    def callbacks(agent: Any) -> list[Any]:
+        agent.report_folder = tmp_path
+        agents.append(agent)
+        return []
+
+    agents: list[Any] = []
+    settings = {**SMALL, "learning_rate": rate, "overlap": overlap}
+    seeds = [4, 9] if rate == 1e-3 else [5, 9]
+    with pytest.raises(rejeu.NonFiniteError, match=rf"seed {seeds[0]}: .* The agent is as it was") as raised:
+        rejeu.train_seeds(rejeu.SAC, "MlpPolicy", echo, 120, seeds=seeds, callback=callbacks, **settings)
+    for agent in agents:
+        assert raised.value.step <= agent.run.step <= raised.value.step + overlap
+        assert np.isfinite(agent.env.envs[0].unwrapped.taken).all()
+        assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+    which = agents if rate == 1e-3 else agents[:1]
+    assert all(agent.n_updates == agent.get_parameters()["n_updates"] for agent in which)

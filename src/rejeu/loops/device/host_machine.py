@@ -14,6 +14,7 @@ import numpy as np
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Clock
+from rejeu.errors import NonFiniteError
 from rejeu.loops.checks import check_step, checked_reset
 from rejeu.loops.device.driver import MAX_TURNS
 from rejeu.loops.device.turns import NO_LIMIT, Limits
@@ -79,25 +80,33 @@ class HostMachine:
                 run.action = np.array(action) if run.action is None else run.action
 
     def call(self, limits: Limits) -> None:
-        """Takes a chunk of turns."""
+        """Takes a chunk of turns, which ends early if an update is bad."""
         found: list[Readings] = []
         self.before, self.calls = [np.array(part) for part in self.state], []
-        self.after = self.before
         self.episodes = [[] for _ in self.runs]
         try:
-            for i in range(int(limits.n_turns)):
-                found += self.turn(limits, float(limits.progress[i + 1]))
-        except BaseException:
+            self.take(limits, found)
+        except NonFiniteError:  # of an action
+            if is_finite(self.state):
+                raise
+        finally:
             self.fetch()
-            for i, run in enumerate(self.runs):
-                run.state = self.state_of(i)
-            raise
-        self.fetch()
-        bad = [np.asarray(one.vector)[:, -1].astype(np.int64) for one in found]
+        bad = [n_bad(one) for one in found]
         self.n_bad = np.sum(bad, axis=0) if bad else np.zeros(len(self.runs), np.int64)
         for one in bad:
             self.in_a_row = np.where(one > 0, self.in_a_row + one, 0)
         self.readings = found[-1] if found else None
+
+    def take(self, limits: Limits, found: list[Readings]) -> None:
+        """Takes the turns of a chunk, and adds what the updates reported to ``found``."""
+        n_read = 0
+        for i in range(int(limits.n_turns)):
+            n_done = len(found)  # those are done, since the actions came after them
+            found += self.turn(limits, float(limits.progress[i + 1]))
+            n_done = n_done if self.config.overlap else len(found)
+            if not self.learner.skips and any(n_bad(one).any() for one in found[n_read:n_done]):
+                return
+            n_read = n_done
 
     def turn(self, limits: Limits, progress: float) -> list[Readings]:
         """Takes one turn of all runs, and returns what the updates reported."""
@@ -169,10 +178,11 @@ class HostMachine:
         return bool(self.n_bad[which] or not is_finite(self.state_of(which)))
 
     def fetch(self) -> None:
-        """Copies the states to the host, and gives each run its state of exploration."""
+        """Copies the states to the host, and gives each run its own, if that is finite, and that of its exploration."""
         self.after = [np.array(part) for part in self.state]
         carry = jax.device_get(self.carry)
         for i, run in enumerate(self.runs):
+            run.state = state if is_finite(state := self.state_of(i)) else run.state
             run.carry = jax.tree.map(lambda part, i=i: np.array(part[i]), carry)
 
     def state_of(self, which: int) -> PackedState:
@@ -182,7 +192,6 @@ class HostMachine:
     def pull(self, which: int, run: Run) -> Progress:
         """Puts what the last chunk did into a run, and returns it."""
         which = self.order.index(which)
-        run.state = self.state_of(which)
         run.monitor.n_skipped += int(self.n_bad[which]) if self.learner.skips else 0
         if self.readings is not None:
             run.metrics = Readings(self.readings.names, self.readings.vector[which])
@@ -208,6 +217,11 @@ class HostMachine:
                 assert learner.observe is not None
                 state = learner.observe(state, *own)
         raise AssertionError("the chunk was not finite, and its updates are")
+
+
+def n_bad(readings: Readings) -> np.ndarray:
+    """Returns the number of bad gradient steps of an update of several runs, ``int64 (n_runs,)``; waits for the device."""
+    return np.asarray(readings.vector)[:, -1].astype(np.int64)
 
 
 def stacked(trees: Sequence[Any]) -> Any:
