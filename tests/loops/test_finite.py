@@ -18,6 +18,7 @@ from rejeu.algorithms import sac
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.rollout import RolloutBuffer
+from rejeu.callbacks import Checkpoint
 from rejeu.core import EXPLAINED_VARIANCE, TD_ERROR, Rollout
 from rejeu.envs.make import InProcess
 from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
@@ -26,7 +27,7 @@ from rejeu.loops.packing import Readings
 from rejeu.normalization import merged, no_moments
 from rejeu.spaces import Leaf
 from tests.environments import Counter, Reach, Sampled
-from tests.tiers import crossed, only
+from tests.tiers import crossed, exhaustive, only
 
 NETS = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
 OFF = {"learning_starts": 8, "batch_size": 4, "buffer_size": 300, **NETS}
@@ -154,6 +155,28 @@ def test_an_update_that_breaks_something_ends_training_with_the_state_before_it(
     assert found.batch == ["reward (nan)"]
     agent.learn(2 * turn, reset_num_timesteps=False)  # the batch is gone, and learning goes on
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        MAKE["RecurrentPPO"],
+        pytest.param(
+            lambda: rejeu.DDPG("MlpPolicy", box(), action_noise=rejeu.ParameterNoise(), **OFF), marks=exhaustive
+        ),
+    ],
+)
+def test_a_checkpoint_right_after_a_bad_update_can_be_resumed(make, tmp_path):
+    """The bad weights had chosen actions, which left NaN in the memory of the policy and in the distances of the noise."""
+    agent = make()
+    agent.report_folder = tmp_path
+    poison(agent, 1, np.nan)
+    with pytest.raises(NonFiniteError):
+        agent.learn(TOTAL)
+    Checkpoint(tmp_path / "run").save(agent)
+    with pytest.warns(UserWarning, match="at the start of new episodes"):
+        again = type(agent).resume(tmp_path / "run", agent.env)
+    assert again.learn(TOTAL).n_updates > agent.n_updates
 
 
 @pytest.mark.parametrize(("name", "value"), crossed(["SAC", "DQN with priorities", "A2C"], [np.inf, -np.inf, 1e30]))
@@ -506,6 +529,36 @@ def test_an_environment_is_not_blamed_for_an_action_that_was_not_finite():
     agent.run.action = np.full((1, 1), np.nan, np.float32)
     with pytest.raises(NonFiniteError, match=r"the policy chose the action \[nan\] in environment 0 after 12 steps"):
         agent.learn(3, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_no_action_is_taken_that_a_bad_update_led_to(overlap, tmp_path):
+    """The first update makes all actions NaN, and with them all observations."""
+    env, taken = Echo(gym.spaces.Box(-1.0, 1.0, (3,))), []
+    step = env.step
+    env.step = lambda action: (taken.append(action), step(action))[1]
+    agent = rejeu.SAC("MlpPolicy", InProcess([env], seed=0), learning_rate=1e30, overlap=overlap, **OFF)
+    agent.report_folder = tmp_path
+    with pytest.raises(NonFiniteError, match=r"\(nan\) of the state .* update 1\. The agent is as it was"):
+        agent.learn(TOTAL)
+    assert np.isfinite(taken).all()
+    assert agent.n_updates == 0
+    assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+@exhaustive
+def test_an_action_that_a_bad_weight_between_wide_layers_led_to_is_explained_by_the_update(monkeypatch, tmp_path):
+    """That weight is found with the loss of the next update, whose report is read after the action was taken."""
+    monkeypatch.setattr(sac, "make", broken_at(lambda s: s.actor.torso.layers[1].weight))
+    env = InProcess([Echo(gym.spaces.Box(-1.0, 1.0, (3,)))], seed=0)
+    agent = rejeu.SAC("MlpPolicy", env, **{**OFF, "policy_kwargs": {"net_arch": [100, 100]}})
+    agent.report_folder = tmp_path
+    poison(agent, 4, 100.0)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    assert caught.value.names == ("actor.torso.layers.1.weight",)
+    assert caught.value.step == 13
+    assert agent.state.n_updates == 4
 
 
 def test_large_finite_observations_are_fine():

@@ -26,6 +26,7 @@ def check_step(run: Run, step: Step) -> None:
     Raises:
         BadEnvironmentError: if a reward or an observation is NaN or infinite: nothing can be learned from it.
         NonFiniteError: if the agent's own action was not finite, so that the environment is not to blame.
+        NonFiniteUpdate: if that action came from weights that an update left not finite.
     """
     check_finite(run, step, run.step)
     if run.step >= run.next_look:
@@ -99,6 +100,7 @@ def check_bounds(run: Run, obs: PyTree) -> None:
 
 def _check_action(run: Run, taken: int) -> None:
     if run.action is not None and not is_finite(run.action):
+        run.monitor.read()
         which = int(np.argwhere(~np.isfinite(run.action))[0][0])
         raise NonFiniteError(
             f"the policy chose the action {run.action[which]} in environment {which} after {taken} steps, and "

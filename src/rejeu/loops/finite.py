@@ -62,6 +62,8 @@ def reported(agent: Any, update: NonFiniteUpdate, of: str = "") -> NonFiniteErro
     """
     run, learner, clock = agent.run, agent.learner, update.clock
     run.td_errors, run.obs, run.action = [], None, None
+    keep_finite = lambda fresh, leaf: leaf if np.isfinite(leaf).all() else fresh  # noqa: E731
+    run.carry = jax.tree.map(keep_finite, learner.initial_carry(agent.n_envs), run.carry)
     run.state = run.state if update.state is None else update.state
     state, found, batch, n_updates = learner.state(run.state), Found([], [], []), update.batches, update.n_updates
     for i, one in enumerate(_one_by_one(update.batches)):

@@ -75,7 +75,7 @@ def first_of_n(
         n_unread = len(run.monitor)
         update(run, learner, samples, clock)
         if not config.overlap:
-            chosen = choose(run, learner, config, clock, step.which)
+            chosen, n_unread = choose(run, learner, config, clock, step.which), len(run.monitor)
         run.action = run.action.copy()
         run.action[step.which] = np.asarray(chosen)
         run.monitor.read(n_unread)  # those are done, since the actions came after them

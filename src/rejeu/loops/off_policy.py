@@ -94,7 +94,7 @@ def off_policy(
         n_unread = len(run.monitor)
         update(run, learner, samples, clock)
         if not config.overlap:
-            chosen = choose(run, learner, config, clock)
+            chosen, n_unread = choose(run, learner, config, clock), len(run.monitor)
         run.action = np.asarray(chosen)
         run.monitor.read(n_unread)  # those are done, since the actions came after them
         timer.lap("update")
