@@ -296,6 +296,15 @@ def test_masks_may_come_as_a_list_of_parts():
     assert np.array_equal(np.unique(env.actions, axis=0), [[0, 1]])
 
 
+def test_an_info_that_is_no_dict_is_reported_at_its_step():
+    class Mute(Fixed):
+        def step(self, action):
+            return (*super().step(action)[:4], None if self.time == 3 else {})
+
+    with pytest.raises(BadEnvironmentError, match="Mute, environment 0, step 3: step returned the info None"):
+        small(Mute([1, 1, 0]), n_steps=4).learn(4)
+
+
 def test_an_environment_that_says_nothing_is_refused_with_the_fix():
     with pytest.raises(BadEnvironmentError, match=r'put info\["action_mask"\] into what reset and step return'):
         small(Silent(), n_steps=4).learn(4)
@@ -352,3 +361,7 @@ def test_predict_takes_what_an_environment_with_its_mask_shows():
     agent = small(vector("discrete"))
     shown = {"observation": np.zeros(2, np.float32), "action_mask": np.array([0, 0, 0, 1, 0], np.int8)}
     assert agent.predict(shown)[0] == 3
+    shown = agent.get_env().reset()
+    for _ in range(20):
+        actions, _ = agent.predict(shown)
+        assert shown.mask[np.arange(3), actions].all()

@@ -79,6 +79,8 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"the state of {type(self).__name__} has {sorted(state)}, expected nothing")
 
     def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
+        if not isinstance(info, dict):  # reported by the vector, with the number of the environment
+            return np.zeros(self._n, np.int8)
         if MASK in info:
             given = info[MASK]
         else:
@@ -185,7 +187,9 @@ def for_agent(agent: Any, env: gym.Env) -> gym.Env:
 
 
 def split(observation: Any, masks: Any) -> tuple[Any, Any]:
-    """Returns an observation and its mask, from what :class:`MaskInObservation` shows or from the two apart."""
+    """Returns an observation and its mask, from both in one as environments with masks show them, or from the two apart."""
+    if isinstance(observation, Masked):
+        return observation.obs, observation.mask if masks is None else masks
     if isinstance(observation, Mapping) and {*observation} == {OBSERVATION, MASK}:
         return observation[OBSERVATION], observation[MASK] if masks is None else masks
     return observation, masks
