@@ -264,6 +264,9 @@ class Agent(BaseAgent):
         If the number of environments changes, a replay buffer starts empty, and ``learning_starts`` steps are taken before
         the next gradient step, as after ``load``. Otherwise the buffer is kept.
 
+        The best weights are kept, and later returns are compared with theirs: set ``best`` to None if returns in the new
+        environment mean something else.
+
         Raises:
             ValueError: if the spaces differ.
             RuntimeError: during ``learn``.

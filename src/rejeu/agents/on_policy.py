@@ -173,4 +173,5 @@ class PQN(OnPolicyAgent):
         >>> agent.q_values(np.zeros((50, 4), np.float32)).shape
         (50, 2)
         """
-        return policy.q_values(self, observation, action, critics)
+        with devices.chosen(self.device):
+            return policy.q_values(self, observation, action, critics)
