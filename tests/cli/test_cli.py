@@ -1,4 +1,5 @@
 import csv
+import importlib.util
 import json
 import os
 import re
@@ -194,6 +195,27 @@ def test_without_the_video_extra_the_run_goes_on_and_says_so(tmp_path, capsys, m
     assert re.search(r"no curve: .*rejeu\[plot\]", text)
     assert re.search(r"no video: .*rejeu\[video\]", text)
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES - {"curve.png", "report.html", "video.mp4"}
+
+
+@pytest.mark.parametrize(
+    ("missing", "argv", "extra"),
+    [
+        ("imageio_ffmpeg", ["train", "Pendulum-v1", "--video-every", "9"], "video"),
+        ("jinja2", ["class", "{models}"], "course"),
+        ("highway_env", ["train", "parking-v0"], "parking"),
+    ],
+)
+def test_a_missing_extra_is_named_before_anything_runs(missing, argv, extra, run, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, missing, None)
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    find = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in (missing, "envpool") else find(name))
+    if missing == "highway_env":
+        for name in [name for name in gym.registry if name.startswith("parking-")]:
+            monkeypatch.delitem(gym.registry, name)
+    assert f'pip install "rejeu[{extra}]"' in error_of(capsys, *(one.format(models=run) for one in argv))
+    assert not [*tmp_path.iterdir()]
 
 
 def test_evaluate_prints_the_result_and_writes_nothing(run, capsys):

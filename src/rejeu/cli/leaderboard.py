@@ -21,6 +21,8 @@ def run(arguments: Class) -> int:
     if out.suffix not in formats:
         raise ValueError(f"--out {out} must end in {', '.join(formats)}")
     paths = leaderboard.models(arguments.folder)
+    if out.suffix == ".html":
+        leaderboard.template()  # a missing package is named before the evaluations
     made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
     with jsonout.messages(arguments.json) as output:
         print(f"{made}, {episodes} episodes of each of {len(paths)} models", flush=True)

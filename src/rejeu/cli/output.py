@@ -85,7 +85,9 @@ def summary(
         saved = "; everything is saved" if agent.failed_writes.complete else ""
         lines.append(f"{what}{saved}{how}")
     if agent.ep_info_buffer:
-        lines.append(f"training      last {len(agent.ep_info_buffer)} episodes: {training_statistics(agent)}")
+        lines.append(
+            f"training      last {counted(len(agent.ep_info_buffer), 'episode')}: {training_statistics(agent)}"
+        )
     if evaluate.best is not None:
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
     files = ", ".join(sorted(path.name for path in folder.path.iterdir()))

@@ -23,11 +23,12 @@ from rejeu.cli.output import echo, header
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
 from rejeu.envs.make import VectorEnv, WorkerOptions
-from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed
+from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.interrupt import Interrupt
 from rejeu.io.records import shown
 from rejeu.presets import Preset
 from rejeu.reporting.logging import check_logs, require
+from rejeu.reporting.video import ffmpeg
 
 
 def run(arguments: Train) -> int:
@@ -65,6 +66,8 @@ def begin(arguments: Train, seed: int, first: Session | None, stack: ExitStack) 
     """
     logs = check_logs("--log", chain.from_iterable(arguments.log))
     require(logs)
+    if arguments.video_every is not None:
+        ffmpeg()
     algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments) if first is None else first.environment
     preset = find_preset(arguments, made, algorithm)
@@ -120,7 +123,7 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     """Returns the training environments."""
     n_envs = arguments.envs or (preset.n_envs if preset else 1)
     backend = default_backend(made, preset)
-    if backend == "envpool" and not is_envpool_installed() and made.is_registered():
+    if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
         backend = "gymnasium"
     backend = arguments.backend or backend
     ray = (

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from rejeu.errors import MissingExtra
 from rejeu.io import checkpoint
 from rejeu.io.records import shown
 from rejeu.reporting.evaluation import Evaluation, evaluate
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 MAX_MODELS = 1_000
 """Upper limit on the models of a folder; the others are left out, with a line that says so."""
@@ -263,13 +266,22 @@ def page(board: Leaderboard) -> str:
     Raises:
         MissingExtra: if Jinja2 is not installed.
     """
-    try:
-        from jinja2 import Environment
-    except ImportError:
-        raise MissingExtra("the page", "jinja2", "course") from None
-    template = (resources.files("rejeu.courses") / "leaderboard.html").read_text(encoding="utf-8")
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     low, width = min(ends), max(max(ends) - min(ends), 1e-9)
     bars = [[100 * (end - low) / width for end in (*row.interval, row.evaluation.mean_return)] for row in board.rows]
     rows = [(row, [*cells_of(row)], bar) for row, bar in zip(board.rows, bars, strict=True)]
-    return Environment(autoescape=True).from_string(template).render(board=board, rows=rows) + "\n"
+    return f"{template().render(board=board, rows=rows)}\n"
+
+
+def template() -> Template:
+    """Returns the template of the page.
+
+    Raises:
+        MissingExtra: if Jinja2 is not installed.
+    """
+    try:
+        from jinja2 import Environment
+    except ImportError:
+        raise MissingExtra("the page", "jinja2", "course") from None
+    text = (resources.files("rejeu.courses") / "leaderboard.html").read_text(encoding="utf-8")
+    return Environment(autoescape=True).from_string(text)
