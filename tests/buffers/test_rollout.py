@@ -315,3 +315,9 @@ def test_as_many_steps_are_learnt_from_as_are_asked_for(n_envs, total):
     np.testing.assert_array_equal(obs[turns, :, 1], times)
     np.testing.assert_array_equal(ended[turns - 1], [time == 0 for time in times])
     np.testing.assert_array_equal(obs[1:, :, 1] == 0, ended[:-1])
+
+
+def test_a_rollout_that_the_memory_cannot_hold_is_refused_with_the_numbers():
+    """Linux would grant the memory, and end the process when it is used."""
+    with pytest.raises(MemoryError, match=r"n_steps=20000000000000 takes [\d.]+ GiB .* try n_steps=\d+"):
+        rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=2 * 10**13)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import numpy as np
 
+from rejeu.buffers.ring import check_memory
 from rejeu.core import PyTree, Rollout
 from rejeu.spaces import Leaf
 
@@ -25,7 +27,15 @@ class RolloutBuffer:
         action_dtype: Any,
         gamma: float,
     ) -> None:
-        """Allocates memory for ``n_steps`` steps of each environment."""
+        """Allocates memory for ``n_steps`` steps of each environment.
+
+        Raises:
+            MemoryError: if the machine cannot hold them, with the numbers.
+        """
+        row = (
+            2 * sum(leaf.nbytes for leaf in obs_leaves) + math.prod(action_shape) * np.dtype(action_dtype).itemsize + 14
+        )
+        check_memory(n_envs * row * n_steps, n_steps, "n_steps")
         self.n_steps, self.n_envs, self.gamma = n_steps, n_envs, gamma
         self.obs_leaves, self.obs_structure = obs_leaves, obs_structure
         shape = (n_steps, n_envs)
