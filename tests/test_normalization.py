@@ -23,6 +23,8 @@ from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
 from tests.tiers import only
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 GAMMA = 0.9
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 WIDTH = 8

@@ -23,6 +23,8 @@ from tests.tiers import crossed
 from tests.worker_environments import ACTIONS, Leaving, Rules, Silent, sizes
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "n_steps": 64, "batch_size": 64, "n_epochs": 1, "seed": 0}
 
 

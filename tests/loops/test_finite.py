@@ -29,6 +29,8 @@ from rejeu.spaces import Leaf
 from tests.environments import Counter, Reach, Sampled
 from tests.tiers import crossed, exhaustive, only
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 NETS = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
 OFF = {"learning_starts": 8, "batch_size": 4, "buffer_size": 300, **NETS}
 ON = {"n_steps": 8, **NETS}
