@@ -17,6 +17,7 @@ import rejeu
 from rejeu.cli import main, parsing
 from rejeu.cli.commands import COMMANDS
 from rejeu.cli.environment import Environment
+from rejeu.errors import WorkerError
 from rejeu.reporting.text import quoted
 from rejeu.sweeps.jobs import Code, Job, again
 from tests.cli.test_cli import FEWER_FILES, TINY, error_of
@@ -124,6 +125,22 @@ def test_a_file_that_was_imported_for_its_wrapper_and_registers_a_class(here):
 def test_a_file_that_cannot_be_imported_is_one_line(source, message, here, capsys):
     (here / "drift_env.py").write_text(source)
     assert message in error_of(capsys, "check", "drift_env.py")
+
+
+def test_a_step_of_four_values_is_explained(here, capsys):
+    (here / "drift_env.py").write_text(SOURCE.replace("self.gain, False, False, {}", "self.gain, False, {}"))
+    assert "; step must return observation, reward, terminated, truncated and info" in error_of(
+        capsys, "check", "drift_env.py"
+    )
+
+
+def test_a_traceback_from_a_worker_process_keeps_its_lines(monkeypatch, capsys):
+    def fail(arguments):
+        raise WorkerError("environment 0 failed in a worker process:\nTraceback\n  line 3")
+
+    monkeypatch.setattr("rejeu.cli.list.run", fail)
+    assert main(["list"]) == 2
+    assert "process:\nTraceback\n  line 3 (" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("problem", ["raise ValueError('no gain')", "return int('no gain')"])

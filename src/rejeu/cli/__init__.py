@@ -75,7 +75,8 @@ def run_command(argv: Sequence[str]) -> int:
     except Exception as error:
         if not isinstance(error, expected_errors()):
             raise
-        print(f"rejeu: error: {one_line(error)}{place_of(error)}", file=sys.stderr)
+        has_trace = isinstance(error, errors.WorkerError)  # of the environment's code
+        print(f"rejeu: error: {error if has_trace else one_line(error)}{place_of(error)}", file=sys.stderr)
         return 2
 
 
@@ -93,7 +94,7 @@ def expected_errors() -> tuple[type[Exception], ...]:
 
 
 def place_of(error: Exception) -> str:
-    """Returns where the user's own code raised an error, such as that of an environment; empty if it did not."""
+    """Returns where the user's own code raised an error, such as an environment, or what it should do; else nothing."""
     not_own = Path(sysconfig.get_path("stdlib")).resolve(), Path(rejeu.__file__).resolve().parent
     cause = error.__cause__ or error
     for frame, line in reversed([*traceback.walk_tb(error.__traceback__), *traceback.walk_tb(cause.__traceback__)]):
@@ -101,6 +102,8 @@ def place_of(error: Exception) -> str:
         is_installed = "site-packages" in path.parts or any(path.is_relative_to(folder) for folder in not_own)
         if path.is_file() and not is_installed:
             return f" ({path.name}, line {line}, in {frame.f_code.co_name})"
+    if "values to unpack (expected 5" in str(error):  # by a wrapper of Gymnasium
+        return "; step must return observation, reward, terminated, truncated and info"
     return ""
 
 
