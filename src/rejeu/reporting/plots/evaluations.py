@@ -58,8 +58,8 @@ def evaluation(evaluation: Evaluated, path: str | Path | None = None, title: str
     )
     for chosen, marker, color, label in (
         (np.isnan(successes), "o", style.DOT_COLOR, "episodes"),
-        (successes == 1, "o", style.GOOD_COLOR, f"success ({np.sum(successes == 1)})"),
-        (successes == 0, "X", style.BAD_COLOR, f"no success ({np.sum(successes == 0)})"),
+        (successes == 1, "o", style.GOOD_COLOR, f"success ({np.sum(successes == 1):,})"),
+        (successes == 0, "X", style.BAD_COLOR, f"no success ({np.sum(successes == 0):,})"),
     ):
         if chosen.any():
             size = float(np.clip(60 / math.sqrt(len(returns)), 2.4, 5.0))
