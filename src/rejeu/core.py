@@ -133,15 +133,15 @@ class Algorithm(NamedTuple):
     """``recall(carry, actor, obs, ended) -> (action, carry)``: the deterministic policy where it has a memory, with the
     carry of ``explorer``. None where the present observation is all that it needs."""
     action_values: Callable[[PyTree, PyTree, Any], Array] | None = None
-    """``action_values(state, obs, action)``: what each critic says of actions ``(batch, action_dim)`` in [-1, 1],
-    ``(n_critics, batch)``; of Discrete actions what each says of all of them, ``(n_critics, batch, n_actions)``, and
+    """``action_values(state, obs, action)``: the critics' values of actions ``(batch, action_dim)`` in [-1, 1],
+    ``(n_critics, batch)``; for Discrete actions the values of all of them, ``(n_critics, batch, n_actions)``, and
     ``action`` is None. None for algorithms without such critics."""
     state_value: Callable[[PyTree, PyTree, PyTree, Array], Array] | None = None
-    """``state_value(carry, actor, obs, ended) -> (batch,)``: what the critic says of observations, with the carry of
+    """``state_value(carry, actor, obs, ended) -> (batch,)``: the critic's values of observations, with the carry of
     ``explorer`` where the policy has a memory and ``()`` elsewhere. None for algorithms without such a critic."""
     observe: Callable[[PyTree, PyTree, Array], PyTree] | None = None
-    """``observe(state, obs, running_return) -> state``: takes in observations ``(batch, ...)`` and discounted sums of
-    rewards ``(batch,)`` as they come, for statistics. None where the state needs no more than ``update``."""
+    """``observe(state, obs, running_return) -> state``: adds observations ``(batch, ...)`` and discounted sums of
+    rewards ``(batch,)`` to running statistics. None where the state needs no more than ``update``."""
 
 
 TD_ERROR = "td_error"
@@ -212,7 +212,7 @@ def minimize(
 ) -> tuple[PyTree, PyTree, Array, Any]:
     """Takes one gradient step on ``loss(params, *arguments)``, which returns a value and something else.
 
-    Returns the parameters and the optimizer state after the step, the loss, and what it returned beside it.
+    Returns the parameters and the optimizer state after the step, the loss, and the other value that ``loss`` returned.
     """
     (value, extra), gradients = value_and_grad(loss, has_aux=True)(params, *arguments)
     params, optimizer_state = descend(params, gradients, optimizer_state, optimizer, rate)

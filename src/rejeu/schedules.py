@@ -1,4 +1,4 @@
-"""Schedules: hyper-parameters as functions of the progress of a run.
+"""Schedules: hyperparameters as functions of the progress of a run.
 
 A schedule is called with ``progress`` in [0, 1], a Python number or a traced array, and returns the value.
 :class:`Linear` and :class:`Exponential` are saved with a model. Any other function that JAX can trace is a schedule too; a

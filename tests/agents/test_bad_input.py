@@ -34,7 +34,7 @@ def sac(env, policy="MlpPolicy", **settings):
 
 HER = {"replay_buffer_class": rejeu.HerReplayBuffer}
 MISTAKES = {
-    "misspelt hyper-parameter": (
+    "misspelt hyperparameter": (
         sac(Counter(), learning_rat=1e-3),
         TypeError,
         "SAC has no setting 'learning_rat'; did you mean learning_rate?",
@@ -44,7 +44,7 @@ MISTAKES = {
         TypeError,
         "SAC has no setting 'seeds'; several runs at once are rejeu.train_seeds",
     ),
-    "hyper-parameter of nothing": (sac(Counter(), zzz=1), TypeError, "SAC has no setting 'zzz'; known: learning_rate"),
+    "hyperparameter of nothing": (sac(Counter(), zzz=1), TypeError, "SAC has no setting 'zzz'; known: learning_rate"),
     "misspelt argument": (sac(Counter(), verbos=1), TypeError, "no setting 'verbos'; did you mean verbose"),
     "unbounded actions": (
         sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-np.inf, np.inf, (2,)))),

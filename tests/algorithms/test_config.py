@@ -1,4 +1,4 @@
-"""Hyper-parameters: what may be written, what is kept, and how mistakes are named."""
+"""Hyperparameters: what may be written, what is kept, and how mistakes are named."""
 
 from __future__ import annotations
 

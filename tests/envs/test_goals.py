@@ -52,7 +52,7 @@ def test_rewards_of_a_batch_are_those_of_its_rows(function):
         np.testing.assert_allclose(given, expected, rtol=1e-6)
 
 
-def test_a_vectorised_function_is_called_once_a_batch_after_it_was_found_out():
+def test_a_vectorized_function_is_called_once_a_batch_after_it_was_found_out():
     function = counted(distance)
     batched = over_batches(function, np.float32)
     batched(*goals(20))
@@ -62,7 +62,7 @@ def test_a_vectorised_function_is_called_once_a_batch_after_it_was_found_out():
     assert function.shapes == [(20, 2), (7, 2), (1, 2)]
 
 
-def test_whether_a_function_is_vectorised_is_found_out_once():
+def test_whether_a_function_is_vectorized_is_found_out_once():
     function = counted(one_distance)
     batched = over_batches(function, np.float32)
     batched(*goals(20))

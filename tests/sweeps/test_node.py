@@ -9,7 +9,7 @@ import pytest
 from rejeu import cluster
 from rejeu.errors import ClusterError
 from rejeu.sweeps import node, process
-from rejeu.sweeps.node import PACKAGES, Copy, Desk, Spec, order, sees, train
+from rejeu.sweeps.node import PACKAGES, Copy, FileServer, Spec, order, sees, train
 
 PROGRAM = """
 import pathlib, sys, time
@@ -28,8 +28,8 @@ sys.exit(143 if "--wait" in sys.argv else 0)
 """
 
 
-class Recorded(Desk):
-    """A desk that records what is written."""
+class Recorded(FileServer):
+    """A server that records what is written."""
 
     def __init__(self, folder):
         super().__init__(folder)
@@ -41,7 +41,7 @@ class Recorded(Desk):
 
 
 @pytest.fixture
-def desk(tmp_path, monkeypatch):
+def server(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-c", PROGRAM, *words])
     monkeypatch.setattr(node, "POLL", 0.01)
     monkeypatch.setattr(node, "ASK", 0.01)
@@ -67,17 +67,17 @@ def make_spec(tmp_path, *words, token="other", **changes):
     return spec._replace(**changes)
 
 
-def test_a_node_that_sees_the_folder_trains_in_it(tmp_path, desk):
+def test_a_node_that_sees_the_folder_trains_in_it(tmp_path, server):
     assert sees(str(tmp_path / "marker"), "token")
     assert not sees(str(tmp_path / "none"), "token")
-    assert train(make_spec(tmp_path, token="token"), desk) == 0
-    assert desk.written == []
+    assert train(make_spec(tmp_path, token="token"), server) == 0
+    assert server.written == []
     assert (tmp_path / "sweep" / "a" / "config.json").is_file()
 
 
-def test_another_node_copies_the_run_folder_back(tmp_path, desk):
-    assert train(make_spec(tmp_path), desk) == 0
-    names = [path for path, _, _ in desk.written]
+def test_another_node_copies_the_run_folder_back(tmp_path, server):
+    assert train(make_spec(tmp_path), server) == 0
+    names = [path for path, _, _ in server.written]
     assert names == [
         "config.json",
         "checkpoints/rows_000000000000_aa.safetensors",
@@ -89,10 +89,10 @@ def test_another_node_copies_the_run_folder_back(tmp_path, desk):
     assert (tmp_path / "sweep" / "a.log").read_text(encoding="utf-8").split() == ["checkpoints", "0"]
 
 
-def test_a_resumed_run_is_copied_there_first(tmp_path, desk):
-    train(make_spec(tmp_path), desk)
+def test_a_resumed_run_is_copied_there_first(tmp_path, server):
+    train(make_spec(tmp_path), server)
     spec = make_spec(tmp_path)
-    assert train(spec._replace(words=("resume", spec.run)), desk) == 0
+    assert train(spec._replace(words=("resume", spec.run)), server) == 0
     assert (tmp_path / "sweep" / "a.log").read_text(encoding="utf-8").split() == [
         "checkpoints",
         "0",
@@ -102,7 +102,7 @@ def test_a_resumed_run_is_copied_there_first(tmp_path, desk):
     assert (tmp_path / "sweep" / "a" / "checkpoints" / "run_000000000001.safetensors").is_file()
 
 
-def test_a_checkpoint_is_copied_while_the_run_goes_on_and_a_stop_is_passed_on(tmp_path, desk):
+def test_a_checkpoint_is_copied_while_the_run_goes_on_and_a_stop_is_passed_on(tmp_path, server):
     copied = tmp_path / "sweep" / "a" / "checkpoints" / "run_000000000000.safetensors"
     asked = []
 
@@ -110,20 +110,20 @@ def test_a_checkpoint_is_copied_while_the_run_goes_on_and_a_stop_is_passed_on(tm
         asked.append(copied.is_file())
         return copied.is_file()
 
-    desk.is_stopping = is_stopping
-    assert train(make_spec(tmp_path, "--wait"), desk) == 143
+    server.is_stopping = is_stopping
+    assert train(make_spec(tmp_path, "--wait"), server) == 143
     assert asked[-1]
 
 
-def test_large_files_are_sent_in_parts_and_removed_ones_are_removed(tmp_path, desk, monkeypatch):
+def test_large_files_are_sent_in_parts_and_removed_ones_are_removed(tmp_path, server, monkeypatch):
     monkeypatch.setattr(node, "CHUNK", 10)
-    copy = Copy("a", tmp_path / "here", desk)
+    copy = Copy("a", tmp_path / "here", server)
     copy.run.mkdir(parents=True)
     (copy.run / "large").write_bytes(bytes(range(25)))
     (copy.run / "empty").touch()
     copy.send()
     assert (tmp_path / "sweep" / "a" / "large").read_bytes() == bytes(range(25))
-    assert [one for one in desk.written if one[0] == "large"] == [
+    assert [one for one in server.written if one[0] == "large"] == [
         ("large", 0, False),
         ("large", 10, False),
         ("large", 20, True),
@@ -131,7 +131,7 @@ def test_large_files_are_sent_in_parts_and_removed_ones_are_removed(tmp_path, de
     (copy.run / "large").unlink()
     copy.send()
     assert sorted(os.listdir(tmp_path / "sweep" / "a")) == ["empty"]
-    other = Copy("a", tmp_path / "there", desk)
+    other = Copy("a", tmp_path / "there", server)
     other.fetch()
     assert sorted(os.listdir(other.run)) == ["empty"]
 
@@ -142,17 +142,17 @@ def test_checkpoints_are_sent_after_what_they_refer_to():
 
 
 @pytest.mark.parametrize("path", ["../evil", "/evil", "a/../../evil", ""])
-def test_nothing_is_written_outside_of_a_run_folder(desk, path):
+def test_nothing_is_written_outside_of_a_run_folder(server, path):
     with pytest.raises(ValueError, match="is no file of a run folder"):
-        desk.write("a", path, 0, b"", True)
+        server.write("a", path, 0, b"", True)
     with pytest.raises(ValueError, match="is no file of a run folder"):
-        desk.write("../a", "file", 0, b"", True)
+        server.write("../a", "file", 0, b"", True)
 
 
-def test_other_versions_are_refused(tmp_path, desk):
+def test_other_versions_are_refused(tmp_path, server):
     spec = make_spec(tmp_path)
     with pytest.raises(ClusterError, match=r"the node .* has jax .* and not 0\.0\.1"):
-        train(spec._replace(versions={**spec.versions, "jax": "0.0.1"}), desk)
+        train(spec._replace(versions={**spec.versions, "jax": "0.0.1"}), server)
 
 
 def test_a_node_does_not_import_jax():

@@ -43,7 +43,7 @@ def test_states_progress_best_result_and_remaining_time(tmp_path):
 
 def test_the_remaining_time_is_that_of_the_remaining_steps(tmp_path):
     coordinator = make(tmp_path)
-    glance = {"job-2": coordinator.folder.glance(coordinator.folder.jobs[2])}
-    left = remaining(coordinator, coordinator.outcomes(), glance, {})
+    progress = {"job-2": coordinator.folder.progress(coordinator.folder.jobs[2])}
+    left = remaining(coordinator, coordinator.outcomes(), progress, {})
     assert left == (2000 - 500) * 10 / 500
     assert math.isnan(remaining(coordinator, coordinator.outcomes(), {}, {}))

@@ -1,4 +1,4 @@
-"""Model files: everything that an agent has learned, its hyper-parameters and counters, and loading them."""
+"""Model files: everything that an agent has learned, its hyperparameters and counters, and loading them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv
 
 SIZES = ("n_critics", "n_quantiles")
-"""Hyper-parameters outside ``policy_kwargs`` that set the size of networks."""
+"""Hyperparameters outside ``policy_kwargs`` that set the size of networks."""
 MAX_LAYERS = 256
 """Upper limit on the layers of any kind in the networks of a file: each takes time to build, even if it is empty."""
 SMALL_WIDTH = 2**16
@@ -94,7 +94,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         header: JSON values of schema ``checkpoint.SCHEMA``.
         room: bytes that the file holds.
         kind: class of the algorithm's configuration.
-        changes: hyper-parameters that the user sets otherwise than they were saved.
+        changes: hyperparameters that the user sets otherwise than they were saved.
 
     Raises:
         CheckpointError: if the header is damaged, or names an object of the user's own that is not given.
@@ -243,7 +243,7 @@ def load(
         cls: the class of the agent.
         file: its header holds what :func:`header` returned.
         make_env: returns the environment to continue training in; None for an agent that only predicts.
-        changes: constructor arguments or hyper-parameters that replace the saved ones.
+        changes: constructor arguments or hyperparameters that replace the saved ones.
         threads: of JAX's device; None for the number that suits the agent.
         prefix: of the names of the agent's arrays in the file.
 
@@ -287,7 +287,7 @@ def load(
 
 
 def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
-    """Sets what a model file says of an agent, and what the user sets otherwise.
+    """Sets the attributes of an agent from a model file, and from the user's changes.
 
     Raises:
         ValueError: if ``given`` is invalid.

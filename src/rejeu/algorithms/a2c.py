@@ -45,7 +45,7 @@ from rejeu.validation import coerce, flag, number
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """Hyper-parameters of A2C; the defaults are Stable-Baselines3's, except for the variant of RMSprop (see above)."""
+    """Hyperparameters of A2C; the defaults are Stable-Baselines3's, except for the variant of RMSprop (see above)."""
 
     learning_rate: float | Schedule = 7e-4
     """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

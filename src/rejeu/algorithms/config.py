@@ -1,4 +1,4 @@
-"""The hyper-parameters of off-policy algorithms, and configurations as JSON.
+"""The hyperparameters of off-policy algorithms, and configurations as JSON.
 
 A configuration is a frozen, hashable dataclass. Each field has an attribute docstring, from which ``help()``, the command
 line and the documentation are generated. Values are given in the form of Stable-Baselines3 and converted when the
@@ -39,7 +39,7 @@ OWN_MODULES = ("encoder", "torso", "head")
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyConfig:
-    """The hyper-parameters of every algorithm with a replay buffer."""
+    """The hyperparameters of every algorithm with a replay buffer."""
 
     learning_rate: float | Schedule = 3e-4
     """Step size of every network's optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

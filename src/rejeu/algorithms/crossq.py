@@ -55,7 +55,7 @@ ADAM_B1 = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Config(EntropyConfig):
-    """Hyper-parameters of CrossQ; the defaults are those of Stable-Baselines3 Contrib."""
+    """Hyperparameters of CrossQ; the defaults are those of Stable-Baselines3 Contrib."""
 
     learning_rate: float | Schedule = 1e-3
     """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

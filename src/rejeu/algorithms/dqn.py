@@ -61,7 +61,7 @@ HIDDEN_LAYERS = (64, 64)
 
 @dataclass(frozen=True, kw_only=True)
 class QLearningConfig(OffPolicyConfig):
-    """The hyper-parameters that DQN and QR-DQN share. Abstract."""
+    """The hyperparameters that DQN and QR-DQN share. Abstract."""
 
     batch_size: int = 32
     """Transitions per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
@@ -108,7 +108,7 @@ class QLearningConfig(OffPolicyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Config(QLearningConfig):
-    """Hyper-parameters of DQN; the defaults are those of Stable-Baselines3."""
+    """Hyperparameters of DQN; the defaults are those of Stable-Baselines3."""
 
     learning_rate: float | Schedule = 1e-4
     """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
@@ -307,7 +307,7 @@ def moves_due(last_step: Array, step: Any, interval: int) -> Array:
 
 
 def moved_target(target: PyTree, online: PyTree, moves: Array, tau: float) -> PyTree:
-    """Returns ``target`` after so many soft updates of ``tau`` towards ``online``; exactly ``online`` for ``tau`` 1."""
+    """Returns ``target`` after so many soft updates of ``tau`` toward ``online``; exactly ``online`` for ``tau`` 1."""
     if tau == 1.0:
         return jax.tree.map(lambda t, o: jnp.where(moves > 0, o, t), target, online)
     return polyak(target, online, 1.0 - (1.0 - tau) ** moves.astype(jnp.float32))

@@ -18,6 +18,6 @@ __all__ = ["Config", "make"]
 
 @dataclass(frozen=True, kw_only=True)
 class Config(ppo.Config):
-    """Hyper-parameters of PPO with action masks; those of PPO."""
+    """Hyperparameters of PPO with action masks; those of PPO."""
 
     name: ClassVar[str] = "MaskablePPO"

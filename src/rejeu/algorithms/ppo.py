@@ -62,7 +62,7 @@ KL_FACTOR = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """Hyper-parameters of PPO; the defaults are Stable-Baselines3's."""
+    """Hyperparameters of PPO; the defaults are Stable-Baselines3's."""
 
     batch_size: int = 64
     """Steps per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
@@ -212,7 +212,7 @@ def epochs(
         minibatch: ``minibatch(i)`` returns the i-th of all epochs, as ``loss`` takes it.
         n_minibatches: of all epochs, ``int32[]``.
         optimizer: without a learning rate.
-        config: the hyper-parameters.
+        config: the hyperparameters.
         clock: the progress of the run.
     """
 

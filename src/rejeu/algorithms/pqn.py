@@ -64,7 +64,7 @@ class NormalizedConfig(PolicyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Config(RolloutConfig):
-    """Hyper-parameters of PQN; the defaults are those of the authors for Atari, with 128 environments."""
+    """Hyperparameters of PQN; the defaults are those of the authors for Atari, with 128 environments."""
 
     learning_rate: float | Schedule = 2.5e-4
     """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

@@ -58,7 +58,7 @@ from rejeu.validation import coerce, whole
 
 @dataclass(frozen=True, kw_only=True)
 class Config(QLearningConfig):
-    """Hyper-parameters of QR-DQN; the defaults are those of sb3-contrib."""
+    """Hyperparameters of QR-DQN; the defaults are those of sb3-contrib."""
 
     learning_rate: float | Schedule = 5e-5
     """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

@@ -75,7 +75,7 @@ class RecurrentConfig(ActorCriticConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Config(ppo.Config):
-    """Hyper-parameters of recurrent PPO; the defaults are those of Stable-Baselines3's contributions."""
+    """Hyperparameters of recurrent PPO; the defaults are those of Stable-Baselines3's contributions."""
 
     n_steps: int = 128
     """Steps of each environment between two updates, and the length over which gradients are propagated."""

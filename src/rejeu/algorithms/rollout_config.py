@@ -1,4 +1,4 @@
-"""The hyper-parameters of every algorithm that learns from rollouts: what the loops and the rollout buffer read."""
+"""The hyperparameters of every algorithm that learns from rollouts: what the loops and the rollout buffer read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rejeu.validation import assign, choice, coerce, nested, number, whole
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutConfig:
-    """The hyper-parameters of every algorithm that learns from rollouts of its present policy."""
+    """The hyperparameters of every algorithm that learns from rollouts of its present policy."""
 
     learning_rate: float | Schedule = 3e-4
     """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

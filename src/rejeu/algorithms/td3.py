@@ -54,7 +54,7 @@ from rejeu.validation import coerce, number, whole
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OffPolicyConfig):
-    """Hyper-parameters of TD3; the defaults are those of Stable-Baselines3."""
+    """Hyperparameters of TD3; the defaults are those of Stable-Baselines3."""
 
     learning_rate: float | Schedule = 1e-3
     """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

@@ -46,7 +46,7 @@ from rejeu.validation import coerce, whole
 
 @dataclass(frozen=True, kw_only=True)
 class Config(EntropyConfig):
-    """Hyper-parameters of TQC; the defaults are those of Stable-Baselines3 Contrib."""
+    """Hyperparameters of TQC; the defaults are those of Stable-Baselines3 Contrib."""
 
     n_quantiles: int = 25
     """Quantiles that each critic predicts. A larger number describes the return more finely at a higher cost."""

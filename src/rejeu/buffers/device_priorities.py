@@ -1,8 +1,8 @@
 """Prioritized replay on the device: :class:`rejeu.buffers.prioritized.Priorities` as arrays and pure functions.
 
 The sum tree has three levels: the priorities, their sums in blocks of ``WIDTH``, and the sums of these. A change of some
-priorities adds up their blocks anew, so it does not matter in which order several are changed. With few levels, few
-programs run on the device, each on many numbers.
+priorities computes the sums of their blocks again, so it does not matter in which order several are changed. With few
+levels, few programs run on the device, each on many numbers.
 
 For equal random numbers the steps and weights are those of the host, up to the rounding of sums: priorities have 32 bits
 here, 64 on the host.

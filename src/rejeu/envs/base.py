@@ -101,7 +101,7 @@ class VectorEnv(ABC):
 
         Args:
             seed: a number, after which environment i takes the i-th, or a sequence of one number for each. None lets the
-                random numbers go on, at first from the seed that the environments were made with.
+                random numbers continue, at first from the seed that the environments were made with.
         """
 
     def step(self, action: np.ndarray, active: np.ndarray | None = None) -> Step:

@@ -64,7 +64,7 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
     Raises:
         BadEnvironmentError: by the returned function, if ``function`` does not return a number for a single goal.
     """
-    vectorised: bool | None = None
+    vectorized: bool | None = None
 
     def by_row(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
         rows = [function(a, d, {}) for a, d in zip(achieved, desired, strict=True)]
@@ -77,12 +77,12 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
         return np.array(rows, dtype)
 
     def call(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        nonlocal vectorised
-        if vectorised:
+        nonlocal vectorized
+        if vectorized:
             return np.asarray(function(achieved, desired, {})).astype(dtype, copy=False)
-        if vectorised is None and len(achieved) > 1:
+        if vectorized is None and len(achieved) > 1:
             whole = _whole(function, by_row, achieved, desired)
-            vectorised = whole is not None
+            vectorized = whole is not None
             if whole is not None:
                 return whole.astype(dtype, copy=False)
         return by_row(achieved, desired)

@@ -90,7 +90,7 @@ def make_vector(
             and their episode counted as truncated there; after that, and by default, :class:`rejeu.errors.WorkerError` is
             raised. Only for ``"gymnasium-async"`` and ``"ray"``, like the options that follow.
         wait_for: how many results off-policy algorithms take at a time, from 1 to ``n_envs``: those that arrive first.
-            They are stored, and these environments go on, while the others still step. None: all environments step
+            They are stored, and these environments continue while the others still step. None: all environments step
             together.
         arrivals: the attribute ``arrivals`` of the environments of an earlier run with the same ``wait_for``, to take the
             results in the same order. None: in the order in which they arrive.

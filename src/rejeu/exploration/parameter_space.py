@@ -106,14 +106,14 @@ def act(
     draw_key, action_key = jax.random.split(key)
     n_envs = ended.shape[0]
     discrete = jnp.issubdtype(jax.eval_shape(algorithm.exploit, actor, obs).dtype, jnp.integer)
-    behaviour = preferences if discrete else algorithm.exploit
-    plain = behaviour(actor, obs)
+    behavior = preferences if discrete else algorithm.exploit
+    plain = behavior(actor, obs)
     target = divergence_target(noise.target_distance, plain.shape[-1]) if discrete else noise.target_distance**2
     state = begin_episodes(noise, state, ended | (state.count < 0), target, draw_key)
 
     def one(perturbation: list[Array], obs: PyTree, key: Array) -> tuple[Array, Array]:
         perturbed, obs = perturb(actor, perturbation), jax.tree.map(lambda leaf: leaf[None], obs)
-        return algorithm.explore(perturbed, obs, key, clock)[0], behaviour(perturbed, obs)[0]
+        return algorithm.explore(perturbed, obs, key, clock)[0], behavior(perturbed, obs)[0]
 
     action, varied = jax.vmap(one)(state.perturbation, obs, jax.random.split(action_key, n_envs))
     distance = divergence(plain, varied) if discrete else squared_distance(plain, varied)
@@ -147,7 +147,7 @@ def begin_episodes(noise: ParameterNoise, state: State, begins: Array, target: f
 
 
 def adapt(noise: ParameterNoise, state: State, ended: Array, target: float) -> Array:
-    """Returns ``sigma`` after the episodes that ``ended``, each of which moves it towards the target distance."""
+    """Returns ``sigma`` after the episodes that ``ended``, each of which moves it toward the target distance."""
     count = state.count.astype(jnp.float32)
     too_close = state.distance <= target * count
     times = jnp.maximum(count / noise.adaptation_interval, 1.0)

@@ -36,7 +36,7 @@ from rejeu.spaces import Leaf
 Network = TypeVar("Network")
 
 MOMENTUM = 0.99
-"""Decay of the running statistics (arXiv 1902.05605, table of hyper-parameters)."""
+"""Decay of the running statistics (arXiv 1902.05605, table of hyperparameters)."""
 EPSILON = 1e-3
 """Added to every variance, in the square of the input's unit."""
 R_MAX = 3.0

@@ -1,4 +1,4 @@
-"""Working through the jobs of a sweep: which run starts when, and what its end means."""
+"""Schedules the jobs of a sweep: which run starts when, and how its exit status is handled."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one job."""
+    """The outcome of one job."""
 
     job: Job
     state: State
@@ -133,7 +133,7 @@ class Coordinator:
             self.launcher.close()
 
     def turn(self) -> bool:
-        """Takes note of what has ended, starts what fits, and returns whether there is more to do."""
+        """Handles the runs that have ended, starts those that fit, and returns whether there is more to do."""
         for attempt in [*self.running]:
             status = attempt.handle.poll()
             if status is not None:
@@ -206,7 +206,7 @@ class Coordinator:
         )
 
     def _end(self, attempt: Attempt, status: int) -> None:
-        """Notes how a run ended: it is done, has failed, was stopped, or was lost and goes on later."""
+        """Records how a run ended: it is done, has failed, was stopped, or was lost and continues later."""
         job, folder = attempt.job, self.folder
         self.running.remove(attempt)
         self.statuses[job.name] = status
@@ -232,7 +232,7 @@ class Coordinator:
                 job, status, f"was lost {MAX_LOST} times in a row without a new checkpoint (exit status {status})"
             )
             return
-        how = f"continues from step {step:,}" if step >= 0 else "starts anew"
+        how = f"continues from step {step:,}" if step >= 0 else "starts from the beginning"
         self.say(f"{job.name} was lost (exit status {status}); it {how}")
         self.waiting.appendleft(job)
 

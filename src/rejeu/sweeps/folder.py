@@ -60,7 +60,7 @@ class Sweep:
     schema: Annotated[int, Meta(ge=1, le=1)] = 1
 
 
-class Glance(NamedTuple):
+class JobProgress(NamedTuple):
     """Progress of a run, from the ends of its tables."""
 
     step: int = 0
@@ -166,7 +166,7 @@ class SweepFolder:
         shutil.move(self.run(job), target)
         return target
 
-    def glance(self, job: Job) -> Glance:
+    def progress(self, job: Job) -> JobProgress:
         """Returns how far the run of a job is."""
         run = self.run(job)
         metrics = read_table(run / METRICS, ("step", "time/time_elapsed", "rollout/ep_rew_mean"))
@@ -180,7 +180,7 @@ class SweepFolder:
             return float(column[-1]) if len(column) else float("nan")
 
         best = float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
-        return Glance(int(max(steps, default=0)), last("time/time_elapsed"), last("rollout/ep_rew_mean"), best)
+        return JobProgress(int(max(steps, default=0)), last("time/time_elapsed"), last("rollout/ep_rew_mean"), best)
 
 
 def is_sweep(path: Path) -> bool:

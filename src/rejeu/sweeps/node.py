@@ -1,7 +1,7 @@
 """One run on a node of a Ray cluster. This module is imported there, so it does not import JAX.
 
 The node trains in the folder of the sweep if it sees it. Otherwise it trains in a folder of its own and sends new files to the
-:class:`Desk`, a Ray actor next to the folder of the sweep: at every new checkpoint and at the end.
+:class:`FileServer`, a Ray actor next to the folder of the sweep: at every new checkpoint and at the end.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PACKAGES = ("jax", "jaxlib", "optax")
 
 
 class Spec(NamedTuple):
-    """What a node needs to know of a run: paths, as strings, of the machine of the sweep."""
+    """A run as a node trains it; paths are strings, of the machine of the sweep."""
 
     name: str
     words: tuple[str, ...]
@@ -54,8 +54,8 @@ class Spec(NamedTuple):
     """Versions that the node must have."""
 
 
-class Clerk(Protocol):
-    """What a run asks of the machine of the sweep."""
+class FileAccess(Protocol):
+    """Access to the run folders on the machine of the sweep."""
 
     def is_stopping(self, name: str) -> bool:
         """Returns whether a run is asked to stop."""
@@ -76,7 +76,7 @@ class Clerk(Protocol):
         """Appends to the log of a run."""
 
 
-class Desk:
+class FileServer:
     """Reads and writes the run folders of a sweep for nodes that do not see them. Mutable; a Ray actor."""
 
     def __init__(self, folder: str) -> None:
@@ -144,8 +144,8 @@ def files(folder: Path) -> dict[str, int]:
 class Copy:
     """A run folder on this node, and what of it was sent. Mutable."""
 
-    def __init__(self, name: str, folder: Path, desk: Clerk) -> None:
-        self.name, self.folder, self.desk = name, folder, desk
+    def __init__(self, name: str, folder: Path, server: FileAccess) -> None:
+        self.name, self.folder, self.server = name, folder, server
         self.run, self.log = folder / name, folder / f"{name}.log"
         self._sent: dict[str, tuple[int, int]] = {}
         """Size and time of the last change of each file when it was sent."""
@@ -154,12 +154,12 @@ class Copy:
 
     def fetch(self) -> None:
         """Copies the run folder to this node."""
-        for path, size in self.desk.listing(self.name).items():
+        for path, size in self.server.listing(self.name).items():
             target = self.run / path
             target.parent.mkdir(parents=True, exist_ok=True)
             with target.open("wb") as file:
                 while (offset := file.tell()) < size:
-                    part = self.desk.read(self.name, path, offset)
+                    part = self.server.read(self.name, path, offset)
                     if not part:
                         break
                     file.write(part)
@@ -188,7 +188,7 @@ class Copy:
                     self._sent[path] = now
         gone = [path for path in self._sent if path not in found]
         if gone:
-            self.desk.remove(self.name, gone)
+            self.server.remove(self.name, gone)
             for path in gone:
                 del self._sent[path]
 
@@ -199,14 +199,14 @@ class Copy:
             while not is_last:
                 part = file.read(min(CHUNK, size - offset))
                 is_last = offset + len(part) >= size or not part
-                self.desk.write(self.name, path, offset, part, is_last)
+                self.server.write(self.name, path, offset, part, is_last)
                 offset += len(part)
 
     def _send_log(self) -> None:
         with suppress(FileNotFoundError), self.log.open("rb") as file:
             file.seek(self._log_sent)
             while part := file.read(CHUNK):
-                self.desk.append_log(self.name, part)
+                self.server.append_log(self.name, part)
                 self._log_sent += len(part)
 
 
@@ -226,7 +226,7 @@ def order(path: str) -> tuple[int, str]:
     return 2 if Path(path).name.startswith("run_") else 1 if path.startswith("checkpoints/") else 0, path
 
 
-def train(spec: Spec, desk: Clerk) -> int:
+def train(spec: Spec, server: FileAccess) -> int:
     """Trains on this node until the process ends, and returns its exit status.
 
     Raises:
@@ -236,14 +236,14 @@ def train(spec: Spec, desk: Clerk) -> int:
     cluster.check_versions(cluster.versions(PACKAGES), f"the node {platform.node()}", spec.versions)
     if sees(spec.marker, spec.token):
         process = start(spec, spec.words, Path(spec.log), Path(spec.lock))
-        return watch(process, spec, desk, None)
+        return watch(process, spec, server, None)
     folder = Path(tempfile.mkdtemp(prefix="rejeu-sweep-"))
     try:
-        copy = Copy(spec.name, folder, desk)
+        copy = Copy(spec.name, folder, server)
         if spec.words[0] == "resume":
             copy.fetch()
         words = tuple(str(copy.run) if word == spec.run else word for word in spec.words)
-        status = watch(start(spec, words, copy.log, folder / "lock"), spec, desk, copy)
+        status = watch(start(spec, words, copy.log, folder / "lock"), spec, server, copy)
         copy.send()
         return status
     finally:
@@ -265,10 +265,10 @@ def start(spec: Spec, words: Sequence[str], log: Path, lock: Path) -> Process:
     return Process(words, log, lock, environ, folder if folder.is_dir() else None)
 
 
-def watch(process: Process, spec: Spec, desk: Clerk, copy: Copy | None) -> int:
+def watch(process: Process, spec: Spec, server: FileAccess, copy: Copy | None) -> int:
     """Waits for the end of a process and returns its exit status; stops it when asked, and sends new checkpoints.
 
-    If this function is left by an error, such as the loss of the desk, the process stops as well.
+    If this function is left by an error, such as the loss of the server, the process stops as well.
     """
     asked, ask_at = 0.0, time.monotonic() + ASK
     try:
@@ -277,7 +277,7 @@ def watch(process: Process, spec: Spec, desk: Clerk, copy: Copy | None) -> int:
             now = time.monotonic()
             if now >= ask_at:
                 ask_at = now + ASK
-                if not asked and desk.is_stopping(spec.name):
+                if not asked and server.is_stopping(spec.name):
                     asked = now
                     process.stop()
                 if copy is not None:
@@ -289,8 +289,8 @@ def watch(process: Process, spec: Spec, desk: Clerk, copy: Copy | None) -> int:
         process.stop()
 
 
-class RemoteDesk:
-    """A desk that is a Ray actor, called as an ordinary object."""
+class RemoteFileServer:
+    """A server that is a Ray actor, called as an ordinary object."""
 
     def __init__(self, ray: Any, actor: Any) -> None:
         self._ray, self._actor = ray, actor
@@ -319,7 +319,7 @@ def train_task(spec: Spec, actor: Any) -> int:
     """Calls :func:`train` in a Ray task."""
     import ray
 
-    return train(spec, RemoteDesk(ray, actor))
+    return train(spec, RemoteFileServer(ray, actor))
 
 
 def look(marker: str, token: str) -> tuple[dict[str, str], bool]:

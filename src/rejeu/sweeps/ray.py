@@ -15,7 +15,7 @@ from rejeu import cluster, xla
 from rejeu.errors import ClusterError
 from rejeu.io import atomic
 from rejeu.sweeps.folder import HIDDEN, SweepFolder
-from rejeu.sweeps.node import PACKAGES, Desk, Spec, look, train_task
+from rejeu.sweeps.node import PACKAGES, FileServer, Spec, look, train_task
 from rejeu.sweeps.process import LOST
 from rejeu.sweeps.processes import THREADS
 from rejeu.sweeps.resources import Resources
@@ -57,7 +57,7 @@ class RayRun:
 
     def stop(self) -> None:
         """Asks it to stop after the current step, with a checkpoint."""
-        self._launcher.desk.stop.remote(self._name)
+        self._launcher.server.stop.remote(self._name)
         self._cancel_at = time.monotonic() + PATIENCE
 
     def _note(self, error: Exception) -> None:
@@ -96,7 +96,7 @@ class RayLauncher:
                 raise ClusterError(
                     f"no node of the Ray cluster has room for a run with {described(self._resources)}; lower [resources]"
                 )
-            self.desk = self._actor(Desk).remote(str(self._path))
+            self.server = self._actor(FileServer).remote(str(self._path))
             self._task = self.ray.remote(train_task).options(
                 max_retries=0, scheduling_strategy="SPREAD", **requested(self._resources)
             )
@@ -129,8 +129,8 @@ class RayLauncher:
             environ=self._environ,
             versions=self._versions,
         )
-        self.desk.start.remote(run.name)
-        handle = RayRun(self, run.name, self._task.remote(spec, self.desk), log)
+        self.server.start.remote(run.name)
+        handle = RayRun(self, run.name, self._task.remote(spec, self.server), log)
         self._handles.append(handle)
         return handle
 

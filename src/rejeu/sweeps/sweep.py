@@ -24,7 +24,7 @@ class SweepResult:
     path: Path
     """Folder of the sweep."""
     outcomes: tuple[Outcome, ...]
-    """What became of each job."""
+    """The outcome of each job."""
 
     @property
     def runs(self) -> list[Path]:
@@ -117,7 +117,7 @@ def sweep(
     imports: Sequence[str] = (),
     progress: bool = True,
 ) -> SweepResult:
-    """Trains every run of a plan, each in a process and a folder of its own, and returns what became of them.
+    """Trains every run of a plan, each in a process and a folder of its own, and returns their outcomes.
 
     Runs of an existing folder of the same plan that are done are not repeated; those that were interrupted continue exactly
     from their newest checkpoint. Several processes and machines may work on one folder at the same time.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rejeu.reporting import notebook
 from rejeu.reporting.text import counted
 from rejeu.sweeps.coordinator import Coordinator, Outcome, count
-from rejeu.sweeps.folder import Glance, SweepFolder
+from rejeu.sweeps.folder import JobProgress, SweepFolder
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -52,7 +52,7 @@ class Display:
 
     def __init__(self, folder: SweepFolder) -> None:
         self.folder = folder
-        self.finished: dict[str, Glance] = {}
+        self.finished: dict[str, JobProgress] = {}
         self._next = 0.0
         self._n_running = -1
 
@@ -71,10 +71,10 @@ class Display:
         from rich.table import Table
 
         outcomes = coordinator.outcomes()
-        running = {attempt.job.name: self.folder.glance(attempt.job) for attempt in coordinator.running}
+        running = {attempt.job.name: self.folder.progress(attempt.job) for attempt in coordinator.running}
         for one in outcomes:
             if one.state == "done" and one.job.name not in self.finished:
-                self.finished[one.job.name] = self.folder.glance(one.job)
+                self.finished[one.job.name] = self.folder.progress(one.job)
         found = Table(
             box=box.SIMPLE, title=str(self.folder.path), caption=summary(coordinator, outcomes, running, self.finished)
         )
@@ -82,31 +82,31 @@ class Display:
             found.add_column(name, justify="left" if name in ("run", "state") else "right")
         order = {"running": 0, "failed": 1, "stopped": 2, "done": 3, "waiting": 4}
         for one in sorted(outcomes, key=lambda one: order[one.state])[:MAX_ROWS]:
-            glance = running.get(one.job.name) or self.finished.get(one.job.name) or Glance()
+            progress = running.get(one.job.name) or self.finished.get(one.job.name) or JobProgress()
             asked = one.job.options.steps
-            steps = f"{glance.step:,}" + (f" of {asked:,}" if asked else "")
-            found.add_row(one.job.name, one.state, steps, number(glance.mean_return), number(glance.best))
+            steps = f"{progress.step:,}" + (f" of {asked:,}" if asked else "")
+            found.add_row(one.job.name, one.state, steps, number(progress.mean_return), number(progress.best))
         return found
 
 
 def summary(
-    coordinator: Coordinator, outcomes: list[Outcome], running: dict[str, Glance], finished: dict[str, Glance]
+    coordinator: Coordinator, outcomes: list[Outcome], running: dict[str, JobProgress], finished: dict[str, JobProgress]
 ) -> str:
     """Returns one line: the number of jobs in each state, the best result of each environment, the remaining time."""
     states = count(one.state for one in outcomes)
     parts = [f"{number} {state}" for state, number in states.items() if number]
     best: dict[str, tuple[float, str]] = {}
     for one in outcomes:
-        glance = running.get(one.job.name) or finished.get(one.job.name)
-        if glance is not None and math.isfinite(glance.best):
-            best[one.job.env] = max(best.get(one.job.env, (-math.inf, "")), (glance.best, one.job.name))
+        progress = running.get(one.job.name) or finished.get(one.job.name)
+        if progress is not None and math.isfinite(progress.best):
+            best[one.job.env] = max(best.get(one.job.env, (-math.inf, "")), (progress.best, one.job.name))
     parts += [f"best {value:,.2f} ({name})" for value, name in list(best.values())[:3]]
     left = remaining(coordinator, outcomes, running, finished)
     return ", ".join([*parts, f"about {duration(left)} left"] if math.isfinite(left) else parts)
 
 
 def remaining(
-    coordinator: Coordinator, outcomes: list[Outcome], running: dict[str, Glance], finished: dict[str, Glance]
+    coordinator: Coordinator, outcomes: list[Outcome], running: dict[str, JobProgress], finished: dict[str, JobProgress]
 ) -> float:
     """Returns the seconds that the sweep still takes, from the mean time of a step so far; NaN if that is not known.
 

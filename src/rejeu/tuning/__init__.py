@@ -31,13 +31,16 @@ Echo = Callable[[str], object]
 
 @dataclass(frozen=True)
 class Result:
-    """What a study has found so far."""
+    """The results of a study so far; ``print`` shows a summary."""
 
     folder: Path
+    """The study folder."""
     plan: Plan
+    """The settings of the study."""
     trials: tuple[Outcome, ...]
+    """All trials that have begun, by index."""
     best: Outcome | None
-    """The complete trial with the highest value."""
+    """The complete trial with the highest value; None if no trial is complete."""
     final: Final | None
     """The comparison with the default; None before it."""
     complete: bool

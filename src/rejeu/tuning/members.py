@@ -9,7 +9,7 @@
     members/02/copied.json  the last round after which the member copied another
     best.safetensors        the best member at the end
 
-Training is resumed from checkpoints, so a population that is interrupted or killed goes on as it would have.
+Training is resumed from checkpoints, so the result of a population does not depend on interruptions.
 """
 
 from __future__ import annotations

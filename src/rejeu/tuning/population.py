@@ -62,14 +62,14 @@ class Population:
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of one member after a round."""
+    """The decision about one member after a round."""
 
     score: float | None
     """Mean return or success rate of the evaluation at the end of the round; None if the member failed."""
     values: dict[str, Any]
     """Its hyperparameters in that round."""
     parent: Count | None
-    """The member that it copies; None if it goes on."""
+    """The member that it copies; None if it continues."""
     next_values: dict[str, Any]
     """Its hyperparameters in the next round."""
 
@@ -142,7 +142,7 @@ def within(dimension: Any, value: float) -> float:
 def decide(
     scores: Sequence[float | None], values: Sequence[Mapping[str, Any]], space: SearchSpace, rng: np.random.Generator
 ) -> list[Decision]:
-    """Returns what becomes of each member after a round.
+    """Returns the decision about each member after a round.
 
     The worst quarter copies a random one of the best quarter, as do all that failed.
 

@@ -1,4 +1,4 @@
-"""The hyper-parameters that the on-policy algorithms share, and the shape of their network."""
+"""The hyperparameters that the on-policy algorithms share, and the shape of their network."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class ActorCriticConfig(PolicyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyConfig(RolloutConfig):
-    """The hyper-parameters of every on-policy algorithm with a policy and a value."""
+    """The hyperparameters of every on-policy algorithm with a policy and a value."""
 
     gae_lambda: float = 0.95
     """Lambda of generalized advantage estimation, in [0, 1]: 0 bootstraps after one step, 1 sums all rewards to the end

@@ -1,4 +1,4 @@
-"""The hyper-parameters and the state of DDPG, for Box and for Discrete actions."""
+"""The hyperparameters and the state of DDPG, for Box and for Discrete actions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HIDDEN_LAYERS = (400, 300)
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OffPolicyConfig):
-    """Hyper-parameters of DDPG; the defaults are those of Stable-Baselines3."""
+    """Hyperparameters of DDPG; the defaults are those of Stable-Baselines3."""
 
     learning_rate: float | Schedule = 1e-3
     """Step size of both optimizers: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,

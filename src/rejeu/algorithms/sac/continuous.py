@@ -63,7 +63,7 @@ HIDDEN_LAYERS = (256, 256)
 
 @dataclass(frozen=True, kw_only=True)
 class Config(EntropyConfig):
-    """Hyper-parameters of SAC; the defaults are those of the paper and of Stable-Baselines3."""
+    """Hyperparameters of SAC; the defaults are those of the paper and of Stable-Baselines3."""
 
     target_update_interval: int = 1
     """Gradient steps between two updates of the target critics."""

@@ -29,7 +29,7 @@ OPTIMIZER = optimizers.make("adam")
 
 @dataclass(frozen=True, kw_only=True)
 class EntropyConfig(OffPolicyConfig):
-    """The hyper-parameters of algorithms with an entropy bonus and several critics. Abstract."""
+    """The hyperparameters of algorithms with an entropy bonus and several critics. Abstract."""
 
     ent_coef: float | str = "auto"
     """Temperature of the entropy bonus: ``"auto"`` learns it from 1, ``"auto_0.1"`` from 0.1, a number fixes it. A larger

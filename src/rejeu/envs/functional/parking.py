@@ -35,7 +35,7 @@ N_COLUMNS = 14
 SPOT_WIDTH, ROW_DISTANCE = 4.0, 14.0
 """Width of a spot, and distance of a row from the middle of the lot, in m."""
 LEFT_OF_START = 6
-"""The spot at x = -2. In the row towards which the vehicle is headed at the start, highway-env excludes it as a goal."""
+"""The spot at x = -2. In the row toward which the vehicle is headed at the start, highway-env excludes it as a goal."""
 
 WALL_CENTERS = np.array([[0.0, -21.0], [0.0, 21.0], [-35.0, 0.0], [35.0, 0.0]])
 WALL_HALF_SIZES = np.array([[35.0, 0.5], [35.0, 0.5], [0.5, 21.0], [0.5, 21.0]])

@@ -1,4 +1,4 @@
-"""Training on the device, chunk by chunk: what a chunk is asked for, and what the host does between two of them."""
+"""Training on the device, chunk by chunk: the limits of each chunk, and the work of the host between two of them."""
 
 from __future__ import annotations
 

@@ -21,11 +21,11 @@ from rejeu.loops.device.actions import scale
 from rejeu.loops.learner import td_error_of
 
 NO_LIMIT = 2**32 - 1
-"""Stands for no last step; steps are counted in ``uint32``."""
+"""The value for no last step; steps are counted in ``uint32``."""
 
 
 class Limits(NamedTuple):
-    """What a chunk is asked to do."""
+    """The limits of a chunk."""
 
     n_turns: Any
     """Turns to take, ``int32[]``."""
@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a chunk says of its turns."""
+    """The results of a chunk of turns."""
 
     metrics: Metrics
     """Of the newest update, ``float32[]`` each; 0 before the first."""

@@ -1,4 +1,4 @@
-"""What a report says of each run, as texts for the templates and data for the script."""
+"""The content of a report on each run, as texts for the templates and data for the script."""
 
 from __future__ import annotations
 
