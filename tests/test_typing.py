@@ -28,7 +28,8 @@ print(agents[0].q_values(np.zeros(4)).shape)
 sweep = rejeu.sweep({"environments": ["CartPole-v1"], "seeds": 2}, "runs/sweep", workers=2)
 print(sweep.counts(), rejeu.compare(sweep.path).table(), rejeu.write_report(sweep.runs).name)
 study = rejeu.tune("Pendulum-v1", "SAC", trials=2, search={"learning_rate": LogUniform(1e-4, 1e-2)})
-print(study.best, None if study.preset is None else study.preset.hyperparameters)
+noise = rejeu.OrnsteinUhlenbeckActionNoise([0.0], 0.2, repulsive=1e-4), rejeu.NormalActionNoise(mean=[0.0], sigma=0.1)
+print(noise, study.best, None if study.preset is None else study.preset.hyperparameters)
 rejeu.SACC
 agent.lern(3)
 """

@@ -26,6 +26,9 @@ from numpy.typing import ArrayLike
 from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.validation import assign
 
+PerDimension = Any
+"""A number for all action dimensions, or a sequence of one for each; kept as a tuple of floats."""
+
 
 @runtime_checkable
 class NoiseProcess(Protocol):
@@ -134,10 +137,10 @@ class NormalActionNoise(ActionNoise):
     NormalActionNoise(mean=(0.0, 0.0), sigma=(0.2, 0.2))
     """
 
-    mean: tuple[float, ...]
+    mean: PerDimension
     """Mean per action dimension, in the scale of actions in [-1, 1]."""
-    sigma: tuple[float, ...]
-    """Standard deviation per action dimension, at least 0; a single number serves all of them."""
+    sigma: PerDimension
+    """Standard deviation per action dimension, at least 0."""
     dtype: InitVar[Any] = np.float32
     """Accepted for compatibility with Stable-Baselines3; the noise is always float32."""
 
@@ -168,29 +171,28 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
 
     Without the repulsive boundary ``B``, a long excursion of the process holds the action at its bound; with it the
     action is pushed back from there and the process with it. The push goes no further than to the middle, ``u = 0``,
-    without which a large ``u`` would be thrown out on the other side and diverge.
+    because a large ``u`` would otherwise leave on the other side and diverge.
 
     >>> OrnsteinUhlenbeckActionNoise(mean=[0.0], sigma=[0.2], repulsive=1e-4).repulsive
     (0.0001,)
     """
 
-    mean: tuple[float, ...]
-    """What the process returns to, per action dimension."""
-    sigma: tuple[float, ...]
-    """Size of the random kicks per square root of time, at least 0; a single number serves all dimensions."""
+    mean: PerDimension
+    """Mean to which the process returns, per action dimension."""
+    sigma: PerDimension
+    """Standard deviation of the increments per square root of time, at least 0."""
     theta: float = 0.15
     """Rate of return to the mean, per unit of time."""
     dt: float = 1e-2
     """Time between two steps."""
-    initial_noise: tuple[float, ...] = (0.0,)
+    initial_noise: PerDimension = (0.0,)
     """Where the process starts each episode; None starts at 0."""
     dtype: InitVar[Any] = np.float32
     """Accepted for compatibility with Stable-Baselines3; the noise is always float32."""
     _: KW_ONLY
-    drift: tuple[float, ...] = (0.0,)
-    """Steady push on the process per unit of time, after its value is used: it then hovers about
-    ``mean + drift / theta``."""
-    repulsive: tuple[float, ...] = (0.0,)
+    drift: PerDimension = (0.0,)
+    """Constant added to the process per unit of time, after its value is used: its mean is then ``mean + drift / theta``."""
+    repulsive: PerDimension = (0.0,)
     """Strength of the repulsive boundary, at least 0; 0 or None for none. A larger value keeps actions further inside. A
     strength ``s`` for actions in ``[low, high]`` is ``4 s / (high - low)^2`` here: 1e-4 over [-2, 2] is 2.5e-5."""
 
