@@ -146,6 +146,8 @@ class Algorithm(NamedTuple):
 
 TD_ERROR = "td_error"
 """Name among the metrics of an update for the absolute TD error of each transition, ``(batch,)``."""
+GRADIENT_STEPS = "gradient_steps"
+"""Name among the metrics of an update from a rollout for the number of gradient steps that it took; 1 without it."""
 EXPLAINED_VARIANCE = "explained_variance"
 """Name among the metrics for the explained variance of the value. It may be NaN; all other metrics must be finite."""
 

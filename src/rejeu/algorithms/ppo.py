@@ -49,7 +49,7 @@ from rejeu.algorithms.actor_critic import (
     standardized,
 )
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.core import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.validation import coerce, number, whole
@@ -184,7 +184,7 @@ def metrics_of(
         "approx_kl": losses.approx_kl,
         "clip_fraction": losses.clip_fraction,
         "clip_range": jnp.asarray(at(config.clip_range, clock.progress), jnp.float32),
-        "gradient_steps": n_steps.astype(jnp.float32),
+        GRADIENT_STEPS: n_steps.astype(jnp.float32),
         EXPLAINED_VARIANCE: explained_variance(value, target, valid),
         "learning_rate": jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32),
     }

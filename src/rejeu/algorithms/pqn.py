@@ -35,7 +35,7 @@ from rejeu.algorithms.config import with_widths
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy, epsilon_schedule, greedy, taken
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout, clip, descend, value_and_grad
+from rejeu.core import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, clip, descend, value_and_grad
 from rejeu.networks import Network, PolicyConfig, Widths
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
@@ -187,7 +187,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             "loss": loss,
             "q_value": q_value,
             "exploration_rate": jnp.asarray(at(epsilon, clock.progress), jnp.float32),
-            "gradient_steps": n_steps.astype(jnp.float32),
+            GRADIENT_STEPS: n_steps.astype(jnp.float32),
             "learning_rate": jnp.asarray(rate, jnp.float32),
         }
         n_updates = state.n_updates + n_steps

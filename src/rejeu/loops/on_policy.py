@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from rejeu.algorithms.rollout_config import RolloutConfig
-from rejeu.core import PyTree
+from rejeu.core import GRADIENT_STEPS, PyTree
 from rejeu.envs.base import Step
 from rejeu.loops.checks import check_obs, check_state, check_step, checked_reset
 from rejeu.loops.learner import Learner
@@ -87,7 +87,7 @@ def on_policy(
             run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics, n_updates=run.n_updates)
             n_updates: float = config.gradient_steps(rollout.size())
             if config.stops_early:  # NaN of an update that was undone
-                n_updates = float(np.nan_to_num(run.metrics["gradient_steps"], nan=n_updates))
+                n_updates = float(np.nan_to_num(run.metrics[GRADIENT_STEPS], nan=n_updates))
             run.n_updates += int(n_updates)
             begin(run, config)
         timer.lap("update")

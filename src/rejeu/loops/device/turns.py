@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu import spaces
-from rejeu.core import TD_ERROR, Algorithm, Clock, Masked, Metrics, PyTree, Rollout, Transition
+from rejeu.core import GRADIENT_STEPS, TD_ERROR, Algorithm, Clock, Masked, Metrics, PyTree, Rollout, Transition
 from rejeu.envs.functional.masks import MaskInObservation
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
@@ -130,7 +130,7 @@ def learn(
     after, found = algorithm.update(learned.state, batch, clock)
     td_error = td_error_of(found, batch)
     found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
-    n = found["gradient_steps"].astype(jnp.int32) if "gradient_steps" in found else 1
+    n = found[GRADIENT_STEPS].astype(jnp.int32) if GRADIENT_STEPS in found else 1
     if skips:
         after, found = nonfinite.undo(learned.state, after, found)
         is_bad = ~found.pop(nonfinite.FINITE)
