@@ -2,9 +2,9 @@
 
 Every compiled update reports, with its metrics, whether what it left is finite. :class:`NonFiniteMonitor` reads this one
 turn later, when the loop waits for the device anyway. It keeps a copy of a state and the updates since, from which it
-recomputes the state before the first bad update. Large arrays are checked only when the state is copied, on the host: until
-then NaN in one of them shows in the loss of the next update. With ``nonfinite="skip"`` a bad update is undone on the device
-at once (:func:`undo`), and the monitor only counts.
+recomputes the state before the first bad update. Large arrays are checked only in these copies, on the host, a turn after
+a copy was requested: until then NaN in one of them shows in the loss of the next update. With ``nonfinite="skip"`` a bad
+update is undone on the device at once (:func:`undo`), and the monitor only counts.
 """
 
 from __future__ import annotations
@@ -147,8 +147,10 @@ class NonFiniteMonitor:
         """What has changed the state since the copy."""
         self._newest: PackedState | None = None
         """The state after these calls."""
-        self._most = MAX_CALLS
-        """Number of calls after which the state is copied again."""
+        self._next: tuple[int, PackedState | None] | None = None
+        """The number of calls before a newer copy, and that copy, until all of these calls were checked."""
+        self._most: int | None = None
+        """Number of calls after which the state is copied again; None until a batch is known."""
         self._unread: deque[int] = deque()
         """Indices of the calls whose readings have not been checked."""
 
@@ -179,7 +181,7 @@ class NonFiniteMonitor:
         An update also has ``readings``, and ``n_updates``, the total number of gradient steps before it.
         """
         if readings is not None:
-            if len(self._calls) < 2:
+            if self._most is None:
                 n_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(arguments[0]))
                 self._most = min(max(MAX_BYTES // max(n_bytes, 1), 1), MAX_CALLS)
             self._unread.append(len(self._calls))
@@ -192,8 +194,6 @@ class NonFiniteMonitor:
         Raises:
             NonFiniteUpdate: if one of them left NaN or infinity, or if too many in a row were skipped.
         """
-        is_full = self._is_full()
-        n = None if is_full else n
         for _ in range(len(self._unread) if n is None else n):
             place = self._unread.popleft()
             readings = self._calls[place].readings
@@ -203,22 +203,34 @@ class NonFiniteMonitor:
             self.n_skipped += n_bad if self._skips else 0
             if n_bad and (not self._skips or self._in_a_row >= MAX_SKIPPED):
                 raise self._error(place)
-        updates = [i for i, call in enumerate(self._calls) if call.readings is not None] if n is None else []
-        if updates and self._newest is not None and not self._skips and not self._is_finite(self._newest):
-            raise self._error(updates[-1])
-        if is_full:
-            self._begin(self._newest)
+        if n is not None:
+            self._renew()
+        elif self._calls:
+            self._check(len(self._calls), self._newest)
+            if len(self._calls) >= (self._most or 1) or isinstance(self._calls[-1].arguments[0], Rollout):
+                self._begin(self._newest)  # a rollout is a view of a buffer that is soon overwritten
 
-    def _is_full(self) -> bool:
-        """Returns whether the state is to be copied again. A rollout is a view of a buffer that is soon overwritten."""
-        if not self._calls:
-            return False
-        is_rollout = isinstance(self._calls[-1].arguments[0], Rollout)
-        return is_rollout or len(self._calls) >= self._most
+    def _renew(self) -> None:
+        """Copies the state after many calls, and forgets these calls in a later turn, when they and the copy are checked."""
+        if self._next is None:
+            if self._most is not None and len(self._calls) >= self._most:
+                assert self._newest is not None
+                self._next = len(self._calls), None if self._skips else self._copy(self._newest)
+        elif not self._unread or self._unread[0] >= self._next[0]:
+            n, copied = self._next
+            self._check(n, copied)
+            self._copied, self._calls, self._next, self._most = copied, self._calls[n:], None, None
+            self._unread = deque(place - n for place in self._unread)
+
+    def _check(self, n: int, state: PackedState | None) -> None:
+        """Raises the error of the first bad update unless the state after the first ``n`` calls is finite."""
+        updates = [i for i, call in enumerate(self._calls[:n]) if call.readings is not None]
+        if updates and state is not None and not self._skips and not self._is_finite(state):
+            raise self._error(updates[-1])
 
     def _begin(self, state: PackedState | None) -> None:
         """Forgets all calls and copies the state that they led to."""
-        self._calls, self._newest = [], state
+        self._calls, self._newest, self._next, self._most = [], state, None, None
         self._unread.clear()
         self._copied = None if state is None or self._skips else self._copy(state)
 

@@ -1,0 +1,59 @@
+"""The monitor finds the first bad update, however many calls ago the state was copied, and never waits for the newest."""
+
+import numpy as np
+import pytest
+
+from rejeu.core import Clock, Transition
+from rejeu.loops.nonfinite import MAX_CALLS, NonFiniteMonitor, NonFiniteUpdate
+
+CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0))
+
+
+class Reading:
+    """What an update reports. It must not be read while the update is the newest."""
+
+    def __init__(self, n_bad, place, newest):
+        self._n_bad, self.place, self.newest = n_bad, place, newest
+
+    @property
+    def n_bad(self):
+        assert self.place < self.newest[0], "waits for the newest update"
+        return self._n_bad
+
+
+def train(bad, is_reported, n_updates=4 * MAX_CALLS):
+    """Runs a loop whose update number ``bad`` leaves NaN; readings show it, or only a look at the state does."""
+
+    def update(state, batch, clock):
+        number = int(batch.reward[0])
+        return [np.append(state[0], np.nan if number == bad else float(number))[-3:]], None, None
+
+    copies = []
+    copy = lambda state: copies.append(state) or [array.copy() for array in state]  # noqa: E731
+    monitor = NonFiniteMonitor(copy, lambda state: bool(np.isfinite(state[0]).all()), skips=False)
+    state, newest = [np.zeros(3)], [-1]
+    for number in range(n_updates):
+        monitor.follow(state)
+        batch = Transition(None, None, np.array([float(number)]), None, None)
+        n_unread, newest[0] = len(monitor), number
+        before = state
+        state = update(state, batch, CLOCK)[0]
+        state = [np.full(3, np.nan)] if not np.isfinite(before[0]).all() else state
+        is_bad = is_reported and not np.isfinite(state[0]).all()
+        monitor.record(state, update, batch, CLOCK, readings=Reading(int(is_bad), number, newest), n_updates=number)
+        monitor.read(n_unread)
+    return copies
+
+
+@pytest.mark.parametrize("is_reported", [True, False])
+@pytest.mark.parametrize("bad", [0, 5, MAX_CALLS - 1, MAX_CALLS, MAX_CALLS + 1, 3 * MAX_CALLS - 7])
+def test_the_first_bad_update_and_the_state_before_it_are_found(bad, is_reported):
+    with pytest.raises(NonFiniteUpdate) as error:
+        train(bad, is_reported)
+    assert error.value.n_updates == bad == int(error.value.batches.reward[0])
+    expected = [0.0, 0.0, 0.0, *map(float, range(bad))][-3:]
+    np.testing.assert_array_equal(error.value.state[0], expected)
+
+
+def test_the_state_is_copied_once_in_many_updates():
+    assert len(train(bad=None, is_reported=True)) == pytest.approx(4, abs=1)
