@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from rejeu.buffers.row_batch import layout_of
 from rejeu.io.memory import physical_memory
 from rejeu.spaces import Leaf, flat_keys
 
@@ -103,6 +104,8 @@ class Ring:
         self.version = 0
         """Increases when rows are replaced other than by writing new ones."""
         self._keys = flat_keys(obs_structure)
+        self.layout = layout_of(record, len(obs_leaves), obs_structure)
+        """How compiled code takes rows apart; None if it gets the fields."""
 
     def __len__(self) -> int:
         """Number of steps that can be sampled."""

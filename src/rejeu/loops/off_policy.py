@@ -148,12 +148,8 @@ def due(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> int:
         return 0
     taken = min(taken, run.step - run.learn_from)
     run.steps_since_update += taken
-    if isinstance(config.train_freq, int):
-        run.owed += taken
-        every = config.train_freq
-    else:
-        run.owed += ended
-        every = config.train_freq[0]
+    new, every = (taken, config.train_freq) if isinstance(config.train_freq, int) else (ended, config.train_freq[0])
+    run.owed += new
     times, run.owed = divmod(run.owed, every)
     if not times or not run.replay.size():
         return 0
