@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import optax
+from gymnasium import spaces
 
 from rejeu import normalization, schedules
 from rejeu.algorithms import optimizers, search
@@ -24,7 +25,7 @@ from rejeu.exploration import noise as action_noises
 from rejeu.networks import PolicyConfig, Widths, reads_image, settled
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
-from rejeu.spaces import Leaf
+from rejeu.spaces import Leaf, leaves
 from rejeu.validation import C, assign, build, choice, coerce, flag, nested, number, whole
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
@@ -181,16 +182,26 @@ def is_own(value: Any) -> bool:
     return callable(value) or isinstance(value, optax.GradientTransformation | action_noises.NoiseProcess)
 
 
-def with_widths(config: C, leaves: tuple[Leaf, ...]) -> C:
+def with_widths(config: C, obs_leaves: tuple[Leaf, ...]) -> C:
     """Returns a configuration whose ``policy_kwargs`` give the widths of hidden layers that were left to the default.
 
-    These depend on the observation, whose ``leaves`` are given.
+    These depend on the observation, whose leaves are given.
     """
     kind: Any = type(config)
-    widths = kind.hidden_layers_on_images if reads_image(leaves) else kind.hidden_layers
+    widths = kind.hidden_layers_on_images if reads_image(obs_leaves) else kind.hidden_layers
     shape = config.policy_kwargs  # type: ignore[attr-defined]
     said = settled(vars(shape), widths)
     return dataclasses.replace(config, policy_kwargs=dataclasses.replace(shape, **said)) if said else config  # type: ignore
+
+
+def network_inputs(config: Any, observation_space: spaces.Space) -> tuple[tuple[Leaf, ...], Any]:
+    """Returns what networks are made of: the leaves of observations, and the ``policy_kwargs`` with their widths.
+
+    Raises:
+        TypeError: if the observation space holds something that is not an array.
+    """
+    obs_leaves = leaves(observation_space)
+    return obs_leaves, with_widths(config, obs_leaves).policy_kwargs
 
 
 def to_json(config: Any) -> dict[str, Any]:

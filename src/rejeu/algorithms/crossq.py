@@ -28,21 +28,22 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.sac import temperature
-from rejeu.algorithms.sac.continuous import LOG_STD_RANGE
+from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, exploit, explore
 from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of, temperature_step
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
 from rejeu.distributions import TanhNormal
-from rejeu.networks import PolicyConfig, Widths
+from rejeu.networks import PolicyConfig, Widths, action_values, values_by_critics
 from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
-from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
 from rejeu.validation import coerce, whole
 
 ACTOR_LAYERS = (256, 256)
@@ -111,38 +112,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is not an array.
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
-    target_entropy = config.entropy_target(-float(action_dim))
+    obs_leaves, target_entropy = leaves(observation_space), config.entropy_target(-float(action_dim))
     optimizer = optimizers.make(config.optimizer, b1=ADAM_B1)
 
-    def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalizedNetwork:
-        warm_up = config.renorm_warmup_steps
-        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, widths, shape.activation_fn, warm_up)
-
     def init(key: Array) -> State:
-        actor_key, critics_key, update_key = jax.random.split(key, 3)
-        actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(ACTOR_LAYERS))
-        widths = shape.critic_widths(CRITIC_LAYERS)
-        critics = ensemble(lambda k: network(k, action_dim, 1, widths), critics_key, config.n_critics)
-        log_alpha, alpha_optimizer = temperature.initial(config)
-        return State(
-            actor=actor,
-            critics=critics,
-            log_alpha=log_alpha,
-            actor_optimizer=optimizer.init(actor),
-            critics_optimizer=optimizer.init(critics),
-            alpha_optimizer=alpha_optimizer,
-            actor_loss=jnp.float32(0.0),
-            entropy=jnp.float32(0.0),
-            key=update_key,
-            n_updates=jnp.int32(0),
-        )
-
-    def explore(actor: RenormalizedNetwork, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return distribution(actor(obs)).sample(key)
-
-    def exploit(actor: RenormalizedNetwork, obs: PyTree) -> Array:
-        return distribution(actor(obs)).mode()
+        return initial_state(key, obs_leaves, action_dim, config, optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
@@ -183,10 +157,40 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             critic_loss, state.actor_loss, alpha, state.entropy, values, target, target_entropy, config
         )
 
-    def values(state: State, obs: PyTree, action: Array) -> Array:
-        return jax.vmap(lambda critic: critic(obs, action)[:, 0])(state.critics)
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values_by_critics)
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+
+def initial_state(
+    key: Array,
+    obs_leaves: tuple[Leaf, ...],
+    action_dim: int,
+    config: Config,
+    optimizer: optax.GradientTransformation,
+) -> State:
+    """Returns the state before the first update."""
+    actor_key, critics_key, update_key = jax.random.split(key, 3)
+    shape = config.policy_kwargs
+
+    def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalizedNetwork:
+        warm_up = config.renorm_warmup_steps
+        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, widths, shape.activation_fn, warm_up)
+
+    actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(ACTOR_LAYERS))
+    widths = shape.critic_widths(CRITIC_LAYERS)
+    critics = ensemble(lambda k: network(k, action_dim, 1, widths), critics_key, config.n_critics)
+    log_alpha, alpha_optimizer = temperature.initial(config)
+    return State(
+        actor=actor,
+        critics=critics,
+        log_alpha=log_alpha,
+        actor_optimizer=optimizer.init(actor),
+        critics_optimizer=optimizer.init(critics),
+        alpha_optimizer=alpha_optimizer,
+        actor_loss=jnp.float32(0.0),
+        entropy=jnp.float32(0.0),
+        key=update_key,
+        n_updates=jnp.int32(0),
+    )
 
 
 def check_shape(shape: PolicyConfig) -> None:
@@ -261,5 +265,5 @@ def actor_loss(
     """
     outputs, trained = actor.train(obs)
     action, log_prob = distribution(outputs).sample_and_log_prob(key)
-    value = jnp.min(jax.vmap(lambda critic: critic(obs, action)[:, 0])(critics), axis=0)
+    value = jnp.min(action_values(critics, obs, action), axis=0)
     return jnp.mean(alpha * log_prob - value), (log_prob, trained)

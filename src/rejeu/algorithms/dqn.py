@@ -31,7 +31,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.config import OffPolicyConfig, with_widths
+from rejeu.algorithms.config import OffPolicyConfig, network_inputs
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import (
     AVERAGED,
@@ -52,7 +52,7 @@ from rejeu.core import (
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso
 from rejeu.schedules import Exponential, Linear, Schedule, at
-from rejeu.spaces import Leaf, check_discrete_action, leaves
+from rejeu.spaces import Leaf, check_discrete_action
 from rejeu.validation import choice, coerce, flag, number, whole
 
 HIDDEN_LAYERS = (64, 64)
@@ -132,10 +132,11 @@ class Config(QLearningConfig):
 
 
 class State(eqx.Module):
-    """Everything that DQN learns; every leaf is an array."""
+    """Everything that DQN or QR-DQN learns; every leaf is an array."""
 
-    network: Network | Dueling
-    target_network: Network | Dueling = eqx.field(metadata=AVERAGED)
+    network: Any
+    """Maps observations to the values of all actions: a :class:`Network`, :class:`Dueling` or ``QuantileNetwork``."""
+    target_network: Any = eqx.field(metadata=AVERAGED)
     optimizer: PyTree
     step: Array
     """Environment steps at the newest gradient step, ``uint32[]``: determines the next update of the target."""
@@ -150,21 +151,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         ValueError: if the action space is not Discrete.
         TypeError: if the observation space holds something that is not an array.
     """
-    n_actions = check_discrete_action(action_space, "DQN")
-    obs_leaves = leaves(observation_space)
-    shape = with_widths(config, obs_leaves).policy_kwargs
-    widths = shape.critic_widths(HIDDEN_LAYERS)
+    n_actions = check_discrete_action(action_space, config.name)
+    obs_leaves, shape = network_inputs(config, observation_space)
     optimizer, epsilon = optimizers.make(config.optimizer), config.epsilon
 
     def init(key: Array) -> State:
-        network = (Dueling if config.dueling else Network)(key, obs_leaves, n_actions, widths, shape)
-        return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0))
-
-    def explore(network: Network | Dueling, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key)
-
-    def exploit(network: Network | Dueling, obs: PyTree) -> Array:
-        return greedy(network(obs))
+        network = Dueling if config.dueling else Network
+        return initial_state(network(key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape), optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         moves = moves_due(state.step, clock.step, config.target_update_interval)
@@ -177,16 +170,51 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         rate = at(config.learning_rate, clock.progress)
         network, optimizer_state = descend(state.network, gradients, state.optimizer, optimizer, rate)
         step = jnp.asarray(clock.step, jnp.uint32)
-        metrics = {
-            "loss": loss,
-            "q_value": jnp.mean(td_error + target),
-            "exploration_rate": jnp.asarray(at(epsilon, clock.progress), jnp.float32),
-            TD_ERROR: jnp.abs(td_error),
-        }
+        metrics = metrics_of(loss, jnp.mean(td_error + target), epsilon, clock) | {TD_ERROR: jnp.abs(td_error)}
         return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
 
-    values = lambda state, obs, action: state.network(obs)[None]  # noqa: E731
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, action_values=values)
+    return epsilon_greedy_algorithm(init, update, epsilon)
+
+
+def initial_state(network: Any, optimizer: optax.GradientTransformation) -> State:
+    """Returns the state before the first update."""
+    return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0))
+
+
+def epsilon_greedy_algorithm(
+    init: Callable[[Array], Any],
+    update: Callable[..., Any],
+    epsilon: Schedule,
+    state_value: Callable[..., Array] | None = None,
+) -> Algorithm:
+    """Returns the algorithm that explores by :func:`epsilon_greedy` and exploits by :func:`greedy` actions.
+
+    Args:
+        init: of :class:`Algorithm`, as are the other functions. The state has a field ``network``, which maps observations
+            to the values of all actions.
+        update: learns from a batch or a rollout.
+        epsilon: the probability of a random action as a function of the progress.
+        state_value: the values of observations, or None.
+    """
+
+    def explore(network: Any, obs: PyTree, key: Array, clock: Clock) -> Array:
+        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key)
+
+    def exploit(network: Any, obs: PyTree) -> Array:
+        return greedy(network(obs))
+
+    def values(state: Any, obs: PyTree, action: None) -> Array:
+        return state.network(obs)[None]
+
+    return Algorithm(
+        init, lambda state: state.network, explore, exploit, update, action_values=values, state_value=state_value
+    )
+
+
+def metrics_of(loss: Array, q_value: Array, epsilon: Schedule, clock: Clock) -> Metrics:
+    """Returns the metrics of an update: loss, mean value of the actions taken, and probability of a random action."""
+    exploration_rate = jnp.asarray(at(epsilon, clock.progress), jnp.float32)
+    return {"loss": loss, "q_value": q_value, "exploration_rate": exploration_rate}
 
 
 class Dueling(eqx.Module):

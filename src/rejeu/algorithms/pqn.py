@@ -31,15 +31,15 @@ from jax import Array
 
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic import flat, masked_mean, minibatches
-from rejeu.algorithms.config import with_widths
-from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy, epsilon_schedule, greedy, taken
+from rejeu.algorithms.config import network_inputs
+from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy_algorithm, epsilon_schedule, metrics_of, taken
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, clip, descend, value_and_grad
 from rejeu.networks import Network, PolicyConfig, Widths
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
-from rejeu.spaces import check_discrete_action, leaves
+from rejeu.spaces import check_discrete_action
 from rejeu.validation import assign, coerce, number, whole
 
 HIDDEN_LAYERS = (128, 128)
@@ -151,21 +151,14 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         ValueError: if the action space is not Discrete.
         TypeError: if the observation space holds something that is not an array.
     """
-    n_actions = check_discrete_action(action_space, "PQN")
-    obs_leaves = leaves(observation_space)
-    shape = with_widths(config, obs_leaves).policy_kwargs
+    n_actions = check_discrete_action(action_space, config.name)
+    obs_leaves, shape = network_inputs(config, observation_space)
     optimizer, epsilon = optimizers.make(config.optimizer), epsilon_schedule(config)
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
         network = Network(network_key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
-
-    def explore(network: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key)
-
-    def exploit(network: Network, obs: PyTree) -> Array:
-        return greedy(network(obs))
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.q_lambda)
@@ -183,10 +176,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         begin = (state.network, state.optimizer, jnp.zeros(2, jnp.float32))
         network, optimizer_state, sums = jax.lax.fori_loop(0, n_steps, step, begin)
         loss, q_value = sums / jnp.maximum(n_steps, 1).astype(jnp.float32)
-        metrics = {
-            "loss": loss,
-            "q_value": q_value,
-            "exploration_rate": jnp.asarray(at(epsilon, clock.progress), jnp.float32),
+        metrics = metrics_of(loss, q_value, epsilon, clock) | {
             GRADIENT_STEPS: n_steps.astype(jnp.float32),
             "learning_rate": jnp.asarray(rate, jnp.float32),
         }
@@ -196,10 +186,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def value(carry: PyTree, network: Network, obs: PyTree, ended: Array) -> Array:
         return jnp.max(network(obs), axis=-1)
 
-    values = lambda state, obs, action: state.network(obs)[None]  # noqa: E731
-    return Algorithm(
-        init, lambda state: state.network, explore, exploit, update, action_values=values, state_value=value
-    )
+    return epsilon_greedy_algorithm(init, update, epsilon, state_value=value)
 
 
 def samples(network: Network, rollout: Rollout, q_lambda: float) -> Samples:

@@ -26,33 +26,24 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.config import with_widths
+from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.dqn import (
     HIDDEN_LAYERS,
     QLearningConfig,
-    epsilon_greedy,
+    State,
+    epsilon_greedy_algorithm,
     greedy,
+    initial_state,
+    metrics_of,
     moved_target,
     moves_due,
     taken,
 )
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import (
-    AVERAGED,
-    TD_ERROR,
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    clip,
-    copy,
-    descend,
-    weighted_mean,
-)
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, clip, descend, weighted_mean
 from rejeu.networks import Network
 from rejeu.schedules import Schedule, at
-from rejeu.spaces import check_discrete_action, leaves
+from rejeu.spaces import check_discrete_action
 from rejeu.validation import coerce, whole
 
 
@@ -79,41 +70,20 @@ class Config(QLearningConfig):
         coerce(self, "n_quantiles", whole, least=1)
 
 
-class State(eqx.Module):
-    """Everything that QR-DQN learns; every leaf is an array."""
-
-    network: QuantileNetwork
-    target_network: QuantileNetwork = eqx.field(metadata=AVERAGED)
-    optimizer: PyTree
-    step: Array
-    """Environment steps at the newest gradient step, ``uint32[]``: determines the next update of the target."""
-    n_updates: Array
-    """Gradient steps taken, ``int32[]``."""
-
-
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
-    """Returns QR-DQN for these spaces.
+    """Returns QR-DQN for these spaces; its state is DQN's, with :class:`QuantileNetwork`.
 
     Raises:
         ValueError: if the action space is not Discrete.
         TypeError: if the observation space holds something that is not an array.
     """
-    n_actions, n_quantiles = check_discrete_action(action_space, "QRDQN"), config.n_quantiles
-    obs_leaves = leaves(observation_space)
-    shape = with_widths(config, obs_leaves).policy_kwargs
-    widths = shape.critic_widths(HIDDEN_LAYERS)
+    n_actions, n_quantiles = check_discrete_action(action_space, config.name), config.n_quantiles
+    obs_leaves, shape = network_inputs(config, observation_space)
     optimizer, epsilon = optimizers.make(config.optimizer, eps=0.01 / config.batch_size), config.epsilon
 
     def init(key: Array) -> State:
-        outputs = Network(key, obs_leaves, n_actions * n_quantiles, widths, shape)
-        network = QuantileNetwork(outputs, n_quantiles)
-        return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0))
-
-    def explore(network: QuantileNetwork, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key)
-
-    def exploit(network: QuantileNetwork, obs: PyTree) -> Array:
-        return greedy(network(obs))
+        outputs = Network(key, obs_leaves, n_actions * n_quantiles, shape.critic_widths(HIDDEN_LAYERS), shape)
+        return initial_state(QuantileNetwork(outputs, n_quantiles), optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         moves = moves_due(state.step, clock.step, config.target_update_interval)
@@ -124,16 +94,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         rate = at(config.learning_rate, clock.progress)
         network, optimizer_state = descend(state.network, gradients, state.optimizer, optimizer, rate)
         step = jnp.asarray(clock.step, jnp.uint32)
-        metrics = {
-            "loss": loss,
-            "q_value": jnp.mean(current),
-            "exploration_rate": jnp.asarray(at(epsilon, clock.progress), jnp.float32),
-            TD_ERROR: jnp.abs(jnp.mean(current, axis=-1) - jnp.mean(target, axis=-1)),
-        }
+        metrics = metrics_of(loss, jnp.mean(current), epsilon, clock)
+        metrics[TD_ERROR] = jnp.abs(jnp.mean(current, axis=-1) - jnp.mean(target, axis=-1))
         return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
 
-    values = lambda state, obs, action: state.network(obs)[None]  # noqa: E731
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, action_values=values)
+    return epsilon_greedy_algorithm(init, update, epsilon)
 
 
 class QuantileNetwork(eqx.Module):

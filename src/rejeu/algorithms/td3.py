@@ -24,11 +24,10 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.config import OffPolicyConfig, with_widths
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.ddpg.continuous import actor_loss, explore, policy
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, metrics_of
-from rejeu.algorithms.search import SearchSpace
+from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, DeterministicPolicyConfig, metrics_of
 from rejeu.core import (
     AVERAGED,
     Algorithm,
@@ -45,20 +44,17 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.networks import Network, QNetwork, Widths, action_values
+from rejeu.networks import Network, QNetwork, action_values, values_by_critics
 from rejeu.prng import nth
-from rejeu.schedules import Schedule, at
-from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.schedules import at
+from rejeu.spaces import action_dimension, check_box_action
 from rejeu.validation import coerce, number, whole
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OffPolicyConfig):
+class Config(DeterministicPolicyConfig):
     """Hyperparameters of TD3; the defaults are those of Stable-Baselines3."""
 
-    learning_rate: float | Schedule = 1e-3
-    """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_1e-3"`` or a function of the progress from 0 to 1."""
     policy_delay: int = 2
     """Gradient steps of the critics per step of the actor and update of the targets."""
     target_policy_noise: float = 0.2
@@ -69,12 +65,9 @@ class Config(OffPolicyConfig):
     """Number of critics; the target is the minimum of their values."""
 
     name: ClassVar[str] = "TD3"
-    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, **search.ACTION_NOISE}
-    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
-    hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
 
     def __post_init__(self) -> None:
-        OffPolicyConfig.__post_init__(self)
+        DeterministicPolicyConfig.__post_init__(self)
         coerce(self, ("policy_delay", "n_critics"), whole, least=1)
         coerce(self, ("target_policy_noise", "target_noise_clip"), number, least=0)
 
@@ -105,8 +98,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is not an array.
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves = leaves(observation_space)
-    shape, optimizer = with_widths(config, obs_leaves).policy_kwargs, optimizers.make(config.optimizer)
+    obs_leaves, shape = network_inputs(config, observation_space)
+    optimizer = optimizers.make(config.optimizer)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
@@ -153,8 +146,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         metrics = metrics_of(loss, state.actor_loss, values, jnp.mean(jnp.abs(values - target[None]), axis=0))
         return state, metrics
 
-    values = lambda state, obs, action: action_values(state.critics, obs, action)  # noqa: E731
-    return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values)
+    return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values_by_critics)
 
 
 def smoothed_action(target_actor: Network, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:

@@ -27,6 +27,7 @@ from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
+    Config as SACConfig,
     State,
     exploit,
     explore,
@@ -34,7 +35,7 @@ from rejeu.algorithms.sac.continuous import (
     policy,
     temperature_and_targets,
 )
-from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of
+from rejeu.algorithms.sac.temperature import metrics_of
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network, QNetwork
@@ -45,22 +46,20 @@ from rejeu.validation import coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(EntropyConfig):
-    """Hyperparameters of TQC; the defaults are those of Stable-Baselines3 Contrib."""
+class Config(SACConfig):
+    """Hyperparameters of TQC: those of SAC, and of the quantiles. The defaults are those of Stable-Baselines3 Contrib."""
 
     n_quantiles: int = 25
     """Quantiles that each critic predicts. A larger number describes the return more finely at a higher cost."""
     top_quantiles_to_drop_per_net: int = 2
     """Number of the largest quantiles per critic that the target drops. A larger number is more pessimistic."""
-    target_update_interval: int = 1
-    """Gradient steps between two updates of the target critics."""
 
     name: ClassVar[str] = "TQC"
     search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, "top_quantiles_to_drop_per_net": Integers(0, 5)}
 
     def __post_init__(self) -> None:
-        EntropyConfig.__post_init__(self)
-        coerce(self, ("n_quantiles", "target_update_interval"), whole, least=1)
+        SACConfig.__post_init__(self)
+        coerce(self, "n_quantiles", whole, least=1)
         coerce(self, "top_quantiles_to_drop_per_net", whole, least=0)
         if self.top_quantiles_to_drop_per_net >= self.n_quantiles:
             raise ValueError(

@@ -22,7 +22,7 @@ from rejeu.networks.encoder import (
     reads_image,
 )
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
-from rejeu.networks.network import Network, QNetwork, action_values
+from rejeu.networks.network import Network, QNetwork, action_values, values_by_critics
 from rejeu.networks.own import OwnModule, own_module
 from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled, split_net_arch
 from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_head, make_torso
@@ -64,4 +64,5 @@ __all__ = [
     "reads_image",
     "settled",
     "split_net_arch",
+    "values_by_critics",
 ]

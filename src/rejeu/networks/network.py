@@ -66,6 +66,11 @@ class QNetwork(eqx.Module):
         return self.head(self.torso(jnp.concatenate([features, action], axis=-1)))
 
 
-def action_values(critics: QNetwork, obs: PyTree, action: Array) -> Array:
+def action_values(critics: Any, obs: PyTree, action: Array) -> Array:
     """Returns the value that each of the stacked critics gives, ``(n_critics, batch)``."""
     return jax.vmap(lambda critic: critic(obs, action)[:, 0])(critics)
+
+
+def values_by_critics(state: Any, obs: PyTree, action: Array) -> Array:
+    """Returns the same of the critics in the state of an algorithm; for ``Algorithm.action_values``."""
+    return action_values(state.critics, obs, action)

@@ -13,11 +13,11 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig, OnPolicyConfig, check_value_rate
-from rejeu.algorithms.config import with_widths
+from rejeu.algorithms.config import network_inputs
 from rejeu.core import Masked, PyTree
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
 from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
-from rejeu.spaces import Leaf, check_action, leaves
+from rejeu.spaces import Leaf, check_action
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
@@ -65,9 +65,9 @@ def checked(
         ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
     check_action(action_space, config.name)
-    obs_leaves = leaves(observation_space)
+    obs_leaves, network_shape = network_inputs(config, observation_space)
     check_value_rate(config, obs_leaves)
-    return obs_leaves, action_kind(action_space), with_widths(config, obs_leaves).policy_kwargs
+    return obs_leaves, action_kind(action_space), network_shape
 
 
 Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.config import with_widths
+from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
 from rejeu.core import (
     Algorithm,
@@ -37,14 +37,14 @@ from rejeu.core import (
 )
 from rejeu.networks import Network, QNetwork
 from rejeu.schedules import at
-from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.spaces import action_dimension, check_box_action
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
     """Returns DDPG for Box actions."""
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves = leaves(observation_space)
-    shape, optimizer = with_widths(config, obs_leaves).policy_kwargs, optimizers.make(config.optimizer)
+    obs_leaves, shape = network_inputs(config, observation_space)
+    optimizer = optimizers.make(config.optimizer)
 
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)

@@ -20,7 +20,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.config import with_widths
+from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
 from rejeu.algorithms.sac.discrete import exploit, explore
 from rejeu.core import (
@@ -35,7 +35,6 @@ from rejeu.core import (
 )
 from rejeu.networks import Network
 from rejeu.schedules import at
-from rejeu.spaces import leaves
 
 ENTROPY_COEFFICIENT = 0.01
 """Weight of the actor's entropy in nats, in the unit of rewards."""
@@ -43,8 +42,8 @@ ENTROPY_COEFFICIENT = 0.01
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
     """Returns DDPG for Discrete actions."""
-    obs_leaves, n_actions = leaves(observation_space), int(action_space.n)
-    shape, optimizer = with_widths(config, obs_leaves).policy_kwargs, optimizers.make(config.optimizer)
+    obs_leaves, shape = network_inputs(config, observation_space)
+    n_actions, optimizer = int(action_space.n), optimizers.make(config.optimizer)
 
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)

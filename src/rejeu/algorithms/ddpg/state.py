@@ -23,22 +23,29 @@ HIDDEN_LAYERS = (400, 300)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OffPolicyConfig):
-    """Hyperparameters of DDPG; the defaults are those of Stable-Baselines3."""
+class DeterministicPolicyConfig(OffPolicyConfig):
+    """The hyperparameters that DDPG and TD3 share. Abstract."""
 
     learning_rate: float | Schedule = 1e-3
-    """Step size of both optimizers: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
     ``"lin_1e-3"`` or a function of the progress from 0 to 1."""
+
+    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
+    hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
+    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, **search.ACTION_NOISE}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(DeterministicPolicyConfig):
+    """Hyperparameters of DDPG; the defaults are those of Stable-Baselines3."""
+
     target_update_interval: int = 1
     """Gradient steps between two updates of both target networks. A larger interval is more stable and slower."""
 
     name: ClassVar[str] = "DDPG"
-    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, **search.ACTION_NOISE}
-    hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
-    hidden_layers_on_images: ClassVar[Widths] = OffPolicyConfig.hidden_layers
 
     def __post_init__(self) -> None:
-        OffPolicyConfig.__post_init__(self)
+        DeterministicPolicyConfig.__post_init__(self)
         coerce(self, "target_update_interval", whole, least=1)
 
 

@@ -47,7 +47,7 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import TanhNormal
-from rejeu.networks import Network, QNetwork, action_values
+from rejeu.networks import Network, QNetwork, action_values, values_by_critics
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
@@ -122,8 +122,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target, target_entropy, config
         )
 
-    values = lambda state, obs, action: action_values(state.critics, obs, action)  # noqa: E731
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values_by_critics)
 
 
 def initial_state(
