@@ -31,6 +31,28 @@ def softmax(logits: np.ndarray) -> np.ndarray:
     return powers / powers.sum(axis=1, keepdims=True)
 
 
+def ensemble(networks: Any) -> list[Layers]:
+    """Copies the weights of each member of an ensemble."""
+    return [layers(networks, i) for i in range(networks.head.bias.shape[0])]
+
+
+def action_value(critic: Layers, obs: Any, action: Any) -> np.ndarray:
+    """Returns the values of observations with actions, ``(batch,)``."""
+    return forward(critic, np.concatenate([np.float64(obs), np.float64(action)], axis=1))[:, 0]
+
+
+def squashed_sample(outputs: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns ``tanh(mean + std * noise)`` and its log-density; ``outputs`` are the means and the ``log std``.
+
+    The density is the Gaussian's minus ``log |da/du|`` with ``da/du = 1 - a^2``.
+    """
+    mean, log_std = np.split(outputs, 2, axis=1)
+    log_std = np.clip(log_std, -20.0, 2.0)
+    action = np.tanh(mean + np.exp(log_std) * noise)
+    gaussian = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
+    return action, (gaussian - np.log(1.0 - action**2)).sum(axis=1)
+
+
 def gradient(network: Layers, loss: Callable[[], float], width: float = 1e-6) -> Layers:
     """Returns the gradient of ``loss()``, a function of ``network``, by central differences."""
     slopes = [[np.zeros_like(array) for array in layer] for layer in network]

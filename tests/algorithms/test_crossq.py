@@ -13,14 +13,13 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import crossq
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core import TD_ERROR
+from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.algorithms.test_tqc import Halfway
 from tests.networks.test_batch_renorm import NumpyRenorm, numpy_torso
+from tests.numpy_networks import squashed_sample
 
-OBS_DIM, ACTION_DIM, BATCH, N_CRITICS = 3, 2, 6, 2
-OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
-ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+BATCH, N_CRITICS = 6, 2
 SMALL = {"learning_rate": 1e-2, "policy_kwargs": {"net_arch": [5, 4]}}
 
 
@@ -38,12 +37,8 @@ critics_loss, joint_values, actor_loss = (
 
 
 def random_batch(seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
-    return Transition(
-        f32(BATCH, OBS_DIM), np.tanh(f32(BATCH, ACTION_DIM)), f32(BATCH), 1 + f32(BATCH, OBS_DIM), discount
-    )
+    batch = box_batch(seed, BATCH)
+    return batch._replace(next_obs=1 + batch.next_obs)
 
 
 # An independent CrossQ in float64.
@@ -61,12 +56,7 @@ def one_of(critics, index):
 
 
 def numpy_action(outputs, key):
-    """Action and log-density of mean + std * noise squashed by tanh: Gaussian minus log|da/du| with da/du = 1 - a^2."""
-    noise = np.float64(jax.random.normal(key, (BATCH, ACTION_DIM), jnp.float32))
-    mean, log_std = np.split(outputs, 2, axis=1)
-    action = np.tanh(mean + np.exp(log_std) * noise)
-    gaussian = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
-    return action, (gaussian - np.log(1.0 - action**2)).sum(axis=1)
+    return squashed_sample(outputs, noise_of(key, BATCH))
 
 
 def numpy_joint_values(critics, batch, next_action):

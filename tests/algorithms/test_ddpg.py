@@ -10,14 +10,21 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import ddpg
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core import TD_ERROR
+from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_DIM, OBS_SPACE, box_batch
 from tests.environments import Sampled
-from tests.numpy_networks import Adam, assert_equal_layers, follow, forward, gradient, largest_difference, layers
+from tests.numpy_networks import (
+    Adam,
+    action_value as value,
+    assert_equal_layers,
+    follow,
+    forward,
+    gradient,
+    largest_difference,
+    layers,
+)
 
-OBS_DIM, ACTION_DIM, BATCH = 3, 2, 6
-OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
-ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+BATCH = 6
 RATE, TAU = 1e-2, 0.25
 
 td_target, critic_loss, actor_loss = map(jax.jit, (ddpg.td_target, ddpg.critic_loss, ddpg.actor_loss))
@@ -40,10 +47,7 @@ def learner():
 
 
 def random_batch(seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
-    return Transition(f32(BATCH, OBS_DIM), np.tanh(f32(BATCH, ACTION_DIM)), f32(BATCH), f32(BATCH, OBS_DIM), discount)
+    return box_batch(seed, BATCH)
 
 
 # An independent DDPG in float64.
@@ -51,10 +55,6 @@ def random_batch(seed=0):
 
 def act(actor, obs):
     return np.tanh(forward(actor, obs))
-
-
-def value(critic, obs, action):
-    return forward(critic, np.concatenate([np.float64(obs), np.float64(action)], axis=1))[:, 0]
 
 
 def numpy_target(target_actor, target_critic, batch):
@@ -229,14 +229,6 @@ def test_the_learning_rate_follows_its_schedule():
 
 
 # What it starts from.
-
-
-def test_targets_start_equal_to_the_networks_and_share_no_memory_with_them():
-    state = make().init(jax.random.PRNGKey(1))
-    pointers = lambda tree: {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}  # noqa: E731
-    for online, target in ((state.actor, state.target_actor), (state.critic, state.target_critic)):
-        jax.tree.map(np.testing.assert_array_equal, online, target)
-        assert not pointers(online) & pointers(target)
 
 
 def test_the_defaults_are_those_of_stable_baselines3():

@@ -1,26 +1,21 @@
-"""DDPG on Discrete actions against float64 NumPy: expectations over actions, whole updates, and what is drawn."""
+"""DDPG on Discrete actions against float64 NumPy: expectations over actions, and whole updates."""
 
 from __future__ import annotations
 
-import equinox as eqx
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
 
 import rejeu
 from rejeu.algorithms import ddpg
 from rejeu.algorithms.ddpg import discrete as ddpg_discrete
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core import TD_ERROR
+from tests.algorithms.batches import CLOCK, DISCRETE as ACTION_SPACE, OBS_SPACE, discrete_batch
 from tests.environments import Sampled
 from tests.numpy_networks import Adam, assert_equal_layers, follow, forward, layers, softmax
 
-OBS_DIM, N_ACTIONS, BATCH = 3, 4, 8
-OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
-ACTION_SPACE = gym.spaces.Discrete(N_ACTIONS, start=5)
-CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+BATCH = 8
 RATE, TAU, ENTROPY_COEFFICIENT = 1e-2, 0.25, 0.01
 ROWS = np.arange(BATCH)
 
@@ -46,11 +41,7 @@ def learner():
 
 
 def random_batch(seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
-    action = rng.permutation(np.arange(BATCH) % N_ACTIONS).astype(np.int32)
-    return Transition(f32(BATCH, OBS_DIM), action, f32(BATCH), f32(BATCH, OBS_DIM), discount)
+    return discrete_batch(seed, BATCH)
 
 
 # An independent version in float64.
@@ -179,87 +170,12 @@ def test_the_metrics_name_losses_values_entropy_and_errors(learner):
     assert float(metrics["entropy"]) == pytest.approx(entropy.mean(), abs=1e-5)
 
 
-def test_targets_start_equal_to_the_networks_and_share_no_memory_with_them():
-    state = make().init(jax.random.PRNGKey(1))
-    pointers = lambda tree: {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}  # noqa: E731
-    for online, target in ((state.actor, state.target_actor), (state.critic, state.target_critic)):
-        jax.tree.map(np.testing.assert_array_equal, online, target)
-        assert not pointers(online) & pointers(target)
-
-
-# Actions.
-
-
-def bold(actor):
-    """The actor with its last layer eight times as large, so that its probabilities are far from equal."""
-    return eqx.tree_at(lambda a: (a.head.weight, a.head.bias), actor, (8 * actor.head.weight, 8 * actor.head.bias))
-
-
-def test_training_actions_are_drawn_from_the_policys_probabilities_row_by_row(learner):
-    """20,000 draws at each of two observations, by Pearson's chi-square."""
-    algorithm, actor, n = make(), bold(learner[1].actor), 20_000
-    obs = np.float32([[2.0, -1.0, 0.5], [0.0, 0.0, 5.0]])
-    probabilities = softmax(forward(layers(actor), obs))
-    assert probabilities.max() > 0.5 > 0.05 > probabilities.min()
-    assert np.abs(probabilities[0] - probabilities[1]).max() > 0.2
-    draw = jax.jit(lambda actor, obs, key: algorithm.explore(actor, obs, key, CLOCK))
-    action = np.asarray(draw(actor, np.repeat(obs, n, axis=0), jax.random.PRNGKey(0)))
-    assert action.dtype == np.int32
-    for drawn, expected in zip(action.reshape(2, n), probabilities, strict=True):
-        counts = np.bincount(drawn, minlength=N_ACTIONS)
-        assert stats.chisquare(counts, n * expected).pvalue > 1e-3
-
-
-def test_the_deterministic_action_is_the_most_probable(learner):
-    algorithm, actor = make(), bold(learner[1].actor)
-    obs = 3.0 * np.random.default_rng(0).normal(size=(50, OBS_DIM)).astype(np.float32)
-    probabilities = softmax(forward(layers(actor), obs))
-    given = np.asarray(algorithm.exploit(actor, obs))
-    assert given.dtype == np.int32
-    assert len(set(given.tolist())) > 1
-    np.testing.assert_array_equal(given, probabilities.argmax(axis=1))
-
-
-class Echo(Sampled):
-    """Rewards every action by its own number, and refuses those that are not in its space."""
-
-    def __init__(self):
-        super().__init__(OBS_SPACE, ACTION_SPACE)
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        self.reward = float(action)
-        return super().step(action)
-
-
-def agent_on(env, **settings):
-    return rejeu.DDPG("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [5, 4]}, **settings)
-
-
-@pytest.mark.parametrize("learning_starts", [0, 40])
-def test_actions_are_counted_from_the_start_of_the_space_outside_and_from_0_inside(learning_starts):
-    """Those that the policy draws as well as the random ones before learning starts."""
-    agent = agent_on(Echo(), learning_starts=learning_starts, train_freq=1000).learn(40)
-    batch = agent.replay_buffer.sample(np.random.default_rng(0), (500,))
-    assert set(batch.action.tolist()) == {0, 1, 2, 3}
-    np.testing.assert_array_equal(batch.reward, batch.action + 5)
-
-
-def test_predictions_are_the_spaces_own_numbers():
-    agent = agent_on(Echo())
-    parameters = agent.get_parameters()
-    parameters["actor.head.weight"][:] = 0.0
-    for best in range(N_ACTIONS):
-        parameters["actor.head.bias"][:] = np.eye(N_ACTIONS)[best]
-        agent.set_parameters(parameters)
-        assert agent.predict(np.zeros(OBS_DIM), deterministic=True)[0] == 5 + best
-    drawn, _ = agent.predict(np.zeros((200, OBS_DIM)))
-    assert set(drawn.tolist()) == {5, 6, 7, 8}
+# What is refused.
 
 
 def test_noise_on_actions_is_refused_with_what_to_use():
     with pytest.raises(
         ValueError, match=r"NormalActionNoise adds to continuous .* use action_noise=ParameterNoise"
     ) as e:
-        agent_on(Echo(), action_noise=rejeu.NormalActionNoise([0.0], [0.1]))
+        rejeu.DDPG("MlpPolicy", Sampled(OBS_SPACE, ACTION_SPACE), action_noise=rejeu.NormalActionNoise([0.0], [0.1]))
     assert "\n" not in str(e.value)

@@ -296,12 +296,6 @@ def test_target_takes_the_network_from_before_the_gradient_step():
     assert (after.network.head.weight != state.network.head.weight).any()
 
 
-def test_target_network_shares_no_memory_with_the_network():
-    _, state = make()
-    pointers = lambda tree: {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}  # noqa: E731
-    assert not pointers(state.network) & pointers(state.target_network)
-
-
 # Whole updates, against Stable-Baselines3 (tests/golden/record_dqn.py).
 
 

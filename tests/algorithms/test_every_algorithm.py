@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gymnasium as gym
+import jax
 import numpy as np
 import pytest
 
@@ -119,6 +120,24 @@ def test_targets_start_as_copies_and_move_by_themselves(kind):
     for target, online in followed.items():
         assert moved[online] > 1e-3
         assert 0 < moved[target] < 3 * LEARNING["tau"] * moved[online]
+
+
+@every_algorithm
+def test_critics_start_different_and_targets_share_no_memory_with_the_networks(kind):
+    """Equal targets in the same memory would be overwritten when the state is donated to an update."""
+    env, algorithm = env_of(kind), kind.agent.algorithm
+    config = algorithm.Config(policy_kwargs={"net_arch": [4]})
+    state = algorithm.make(config, env.observation_space, env.action_space).init(jax.random.PRNGKey(1))
+    pointers = lambda tree: {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}  # noqa: E731
+    targets = [name for name in vars(state) if name.startswith("target_")]
+    assert bool(targets) == kind.has_targets
+    for name in targets:
+        online, target = getattr(state, name.removeprefix("target_")), getattr(state, name)
+        jax.tree.map(np.testing.assert_array_equal, online, target)
+        assert not pointers(online) & pointers(target)
+    if hasattr(state, "critics"):
+        first, second = np.asarray(state.critics.head.weight)
+        assert (first != second).any()
 
 
 class Precise(Wanderer):

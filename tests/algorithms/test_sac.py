@@ -6,7 +6,6 @@ import functools
 from pathlib import Path
 
 import equinox as eqx
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,15 +13,14 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import sac
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core import TD_ERROR, Transition
 from rejeu.io.checkpoint import tree_to_arrays
+from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_DIM, OBS_SPACE, box_batch, noise_of
 from tests.environments import Sampled
+from tests.numpy_networks import action_value, ensemble, forward, layers, squashed_sample
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "sac_sb3.npz"
-OBS_DIM, ACTION_DIM, BATCH = 3, 2, 8
-OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
-ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+BATCH = 8
 
 
 @functools.cache
@@ -33,48 +31,22 @@ def make(**settings):
 
 
 def random_batch(seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
-    return Transition(f32(BATCH, OBS_DIM), np.tanh(f32(BATCH, ACTION_DIM)), f32(BATCH), f32(BATCH, OBS_DIM), discount)
+    return box_batch(seed, BATCH)
 
 
-# An independent SAC in float64, from plain arrays. Layers are lists of (weight, bias).
-
-
-def layers(network, index=...):
-    """The network's weights as float64 pairs; ``index`` picks one of an ensemble."""
-    parts = [*network.torso.layers, network.head]
-    return [(np.float64(part.weight)[index], np.float64(part.bias)[index]) for part in parts]
-
-
-def forward(weights, x):
-    for weight, bias in weights[:-1]:
-        x = np.maximum(x @ weight + bias, 0.0)
-    return x @ weights[-1][0] + weights[-1][1]
+# An independent SAC in float64, from plain arrays.
 
 
 def numpy_sample(actor, obs, noise):
-    """Action and log-density of mean + std * noise squashed by tanh: Gaussian minus log|da/du| with da/du = 1 - a^2."""
-    mean, log_std = np.split(forward(layers(actor), np.float64(obs)), 2, axis=1)
-    log_std = np.clip(log_std, -20.0, 2.0)
-    action = np.tanh(mean + np.exp(log_std) * noise)
-    gaussian = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
-    return action, (gaussian - np.log(1.0 - action**2)).sum(axis=1)
+    return squashed_sample(forward(layers(actor), obs), noise)
 
 
 def numpy_values(critics, obs, action):
-    both = np.concatenate([np.float64(obs), np.float64(action)], axis=1)
-    return np.stack([forward(layers(critics, i), both)[:, 0] for i in range(2)])
-
-
-def noise_of(key):
-    """The standard normal numbers that JAX draws for this key."""
-    return np.float64(jax.random.normal(key, (BATCH, ACTION_DIM), jnp.float32))
+    return np.stack([action_value(critic, obs, action) for critic in ensemble(critics)])
 
 
 def numpy_target(state, batch, alpha, key):
-    action, log_prob = numpy_sample(state.actor, batch.next_obs, noise_of(key))
+    action, log_prob = numpy_sample(state.actor, batch.next_obs, noise_of(key, BATCH))
     value = numpy_values(state.target_critics, batch.next_obs, action).min(axis=0)
     return batch.reward + batch.discount * (value - alpha * log_prob)
 
@@ -121,7 +93,7 @@ def test_actor_loss_equals_numpy():
     _, state = make()
     batch, key = random_batch(), jax.random.PRNGKey(7)
     loss, log_prob = sac.actor_loss(state.actor, state.critics, jnp.float32(0.3), batch.obs, key)
-    action, expected_log_prob = numpy_sample(state.actor, batch.obs, noise_of(key))
+    action, expected_log_prob = numpy_sample(state.actor, batch.obs, noise_of(key, BATCH))
     value = numpy_values(state.critics, batch.obs, action).min(axis=0)
     np.testing.assert_allclose(log_prob, expected_log_prob, atol=1e-5)
     assert float(loss) == pytest.approx(np.mean(0.3 * expected_log_prob - value), abs=1e-5)
@@ -146,7 +118,7 @@ def test_actor_gradient_equals_finite_differences():
     """Central differences of the float64 NumPy loss, for every number of the actor."""
     _, state = make()
     batch, key, alpha, eps = random_batch(), jax.random.PRNGKey(7), 0.3, 1e-6
-    noise = noise_of(key)
+    noise = noise_of(key, BATCH)
     gradient = jax.grad(sac.actor_loss, has_aux=True)(state.actor, state.critics, jnp.float32(alpha), batch.obs, key)[0]
     flat, tree = jax.tree.flatten(jax.tree.map(np.float64, state.actor))
 
@@ -175,7 +147,7 @@ def test_an_update_uses_the_mathematics_above_in_the_documented_order():
     after, metrics = algorithm.update(state, batch, CLOCK)
     values = numpy_values(state.critics, batch.obs, batch.action)
     target = numpy_target(state, batch, 0.3, target_key)
-    action, log_prob = numpy_sample(state.actor, batch.obs, noise_of(actor_key))
+    action, log_prob = numpy_sample(state.actor, batch.obs, noise_of(actor_key, BATCH))
     value = numpy_values(after.critics, batch.obs, action).min(axis=0)
     expected = {
         "critic_loss": 0.5 * ((values - target) ** 2).mean(axis=1).sum(),
@@ -325,19 +297,6 @@ def test_targets_move_only_every_target_update_interval():
         state, _ = update(state, random_batch(), CLOCK)
         moved.append(bool((state.target_critics.head.weight != before).any()))
     assert moved == [False, False, True, False, False, True]
-
-
-def test_critics_start_different_and_targets_start_equal_to_them():
-    _, state = make()
-    first, second = np.asarray(state.critics.head.weight)
-    assert (first != second).any()
-    jax.tree.map(np.testing.assert_array_equal, state.critics, state.target_critics)
-
-
-def test_target_critics_share_no_memory_with_the_critics():
-    _, state = make()
-    pointers = lambda tree: {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}  # noqa: E731
-    assert not pointers(state.critics) & pointers(state.target_critics)
 
 
 def test_the_learning_rate_follows_its_schedule():

@@ -10,13 +10,20 @@ import numpy as np
 import pytest
 
 from rejeu.algorithms import td3
-from rejeu.core import TD_ERROR, Clock, Transition
-from tests.numpy_networks import Adam, assert_equal_layers, follow, forward, largest_difference, layers
+from rejeu.core import TD_ERROR
+from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_DIM, OBS_SPACE, box_batch, noise_of
+from tests.numpy_networks import (
+    Adam,
+    action_value as value,
+    assert_equal_layers,
+    ensemble,
+    follow,
+    forward,
+    largest_difference,
+    layers,
+)
 
-OBS_DIM, ACTION_DIM, BATCH, N_CRITICS = 3, 2, 6, 3
-OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
-ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+BATCH, N_CRITICS = 6, 3
 RATE, TAU, DELAY, SIGMA, CLIP = 1e-2, 0.25, 2, 0.6, 0.5
 
 smoothed_action = jax.jit(td3.smoothed_action, static_argnums=(3, 4))
@@ -52,10 +59,7 @@ def learner():
 
 
 def random_batch(seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
-    return Transition(f32(BATCH, OBS_DIM), np.tanh(f32(BATCH, ACTION_DIM)), f32(BATCH), f32(BATCH, OBS_DIM), discount)
+    return box_batch(seed, BATCH)
 
 
 # An independent TD3 in float64.
@@ -63,19 +67,6 @@ def random_batch(seed=0):
 
 def act(actor, obs):
     return np.tanh(forward(actor, obs))
-
-
-def value(critic, obs, action):
-    return forward(critic, np.concatenate([np.float64(obs), np.float64(action)], axis=1))[:, 0]
-
-
-def ensemble(critics):
-    return [layers(critics, i) for i in range(N_CRITICS)]
-
-
-def noise_of(key):
-    """The standard normal numbers that JAX draws for this key."""
-    return np.float64(jax.random.normal(key, (BATCH, ACTION_DIM), jnp.float32))
 
 
 def numpy_smoothed_action(target_actor, next_obs, noise):
@@ -99,7 +90,7 @@ class ByHand:
         self.key, self.n = state.key, 0
 
     def update(self, batch):
-        noise = noise_of(jax.random.fold_in(self.key, self.n))
+        noise = noise_of(jax.random.fold_in(self.key, self.n), BATCH)
         target = numpy_target(self.target_actor, self.target_critics, batch, noise)
         for critic, adam in zip(self.critics, self.critic_adams, strict=True):
             adam.descend(lambda critic=critic: np.mean((value(critic, batch.obs, batch.action) - target) ** 2))
@@ -119,7 +110,7 @@ def test_the_targets_action_has_clipped_noise_and_is_clipped_itself(learner):
     _, state = learner
     batch, key = random_batch(), jax.random.PRNGKey(5)
     given = smoothed_action(state.target_actor, batch.next_obs, key, SIGMA, CLIP)
-    noise, plain = noise_of(key), act(layers(state.target_actor), batch.next_obs)
+    noise, plain = noise_of(key, BATCH), act(layers(state.target_actor), batch.next_obs)
     assert (np.abs(SIGMA * noise) > CLIP).any(), "some noise is clipped"
     assert (np.abs(plain + np.clip(SIGMA * noise, -CLIP, CLIP)) > 1.0).any(), "some action is clipped"
     np.testing.assert_allclose(
@@ -254,7 +245,7 @@ def test_the_metrics_are_of_the_networks_before_the_update(learner):
     update, state = learner
     batch = random_batch()
     _, metrics = update(state, batch, CLOCK)
-    noise = noise_of(jax.random.fold_in(state.key, 0))
+    noise = noise_of(jax.random.fold_in(state.key, 0), BATCH)
     target = numpy_target(layers(state.target_actor), ensemble(state.target_critics), batch, noise)
     values = np.array([value(critic, batch.obs, batch.action) for critic in ensemble(state.critics)])
     errors = values - target
@@ -272,16 +263,6 @@ def test_each_update_draws_other_noise(learner):
 
 
 # What it starts from.
-
-
-def test_critics_start_different_and_targets_equal_to_the_networks_without_shared_memory():
-    state = make().init(jax.random.PRNGKey(1))
-    heads = np.asarray(state.critics.head.weight)
-    assert all((heads[i] != heads[j]).any() for i in range(N_CRITICS) for j in range(i))
-    pointers = lambda tree: {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}  # noqa: E731
-    for online, target in ((state.actor, state.target_actor), (state.critics, state.target_critics)):
-        jax.tree.map(np.testing.assert_array_equal, online, target)
-        assert not pointers(online) & pointers(target)
 
 
 def test_the_defaults_are_those_of_stable_baselines3():

@@ -14,13 +14,12 @@ import pytest
 import rejeu
 from rejeu.algorithms import tqc
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core import TD_ERROR
+from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
+from tests.numpy_networks import ensemble, forward, layers, squashed_sample
 from tests.tiers import exhaustive
 
-OBS_DIM, ACTION_DIM, BATCH, N_CRITICS, N_QUANTILES = 3, 2, 6, 2, 5
-OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
-ACTION_SPACE = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
+BATCH, N_CRITICS, N_QUANTILES = 6, 2, 5
 
 
 @functools.cache
@@ -38,10 +37,7 @@ td_target, critics_loss, actor_loss = (
 
 
 def random_batch(seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    discount = np.where(np.arange(BATCH) % 3 == 0, 0.0, 0.9).astype(np.float32)
-    return Transition(f32(BATCH, OBS_DIM), np.tanh(f32(BATCH, ACTION_DIM)), f32(BATCH), f32(BATCH, OBS_DIM), discount)
+    return box_batch(seed, BATCH)
 
 
 # An independent TQC in float64 and loops.
@@ -59,26 +55,13 @@ def brute_force_loss(quantiles, samples, kappa=1.0):
     return total / (len(quantiles) * len(samples))
 
 
-def forward(network, x, index=...):
-    parts = [*network.torso.layers, network.head]
-    for i, part in enumerate(parts):
-        x = x @ np.float64(part.weight)[index] + np.float64(part.bias)[index]
-        x = np.maximum(x, 0.0) if i < len(parts) - 1 else x
-    return x
-
-
 def numpy_quantiles(critics, obs, action):
     x = np.concatenate([np.float64(obs), np.float64(action)], axis=1)
-    return np.stack([forward(critics, x, i) for i in range(N_CRITICS)])
+    return np.stack([forward(critic, x) for critic in ensemble(critics)])
 
 
 def numpy_sample(actor, obs, key):
-    """Action and log-density of mean + std * noise squashed by tanh: Gaussian minus log|da/du| with da/du = 1 - a^2."""
-    noise = np.float64(jax.random.normal(key, (BATCH, ACTION_DIM), jnp.float32))
-    mean, log_std = np.split(forward(actor, np.float64(obs)), 2, axis=1)
-    action = np.tanh(mean + np.exp(log_std) * noise)
-    gaussian = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
-    return action, (gaussian - np.log(1.0 - action**2)).sum(axis=1)
+    return squashed_sample(forward(layers(actor), obs), noise_of(key, BATCH))
 
 
 def numpy_target(state, batch, alpha, key, dropped):
