@@ -224,6 +224,8 @@ class Spy(Counter):
         self.action_space = gym.spaces.Discrete(3)
 
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [4], "lstm_hidden_size": SIZE}, "n_steps": 6, "n_epochs": 2, "seed": 0}
 
 

@@ -23,6 +23,8 @@ from rejeu.spaces import leaves, structure
 SIZE = (2, 3)
 
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {
     "buffer_size": 40,
     "learning_starts": 1000,
