@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -57,7 +59,6 @@ warm = rejeu.load(folder / "sac.safetensors")  # imports what building and compi
 agent = record_files.replay_agent()
 env = DummyVecEnv([lambda: Counter((5,))])
 VecNormalize.load(folder / "vec_normalize.safetensors", env)
-target = folder / sys.argv[2]
 events, watching = [], False
 WATCHED = {"pickle.find_class", "marshal.loads", "exec", "compile", "import", "os.system", "subprocess.Popen", "os.exec"}
 WATCHED |= {"os.posix_spawn", "os.fork", "ctypes.dlopen", "socket.connect", "code.__new__", "function.__new__"}
@@ -69,39 +70,51 @@ def hook(event, arguments):
         events.append([event, getattr(what, "co_filename", None) or str(what)])
 
 
-sys.addaudithook(hook)
-before = set(sys.modules)
-watching = True
-outcome = "read"
-try:
-    if sys.argv[3] == "agent":
-        loaded = rejeu.load(target)
-    elif sys.argv[3] == "replay":
-        agent.load_replay_buffer(target)
-    elif sys.argv[3] == "vec_normalize":
-        VecNormalize.load(target, env)
-    else:
-        import pickle
+def watched(name, read):
+    global events, watching
+    events, before = [], set(sys.modules)
+    watching, outcome = True, "read"
+    try:
+        read(folder / name)
+    except rejeu.CheckpointError:
+        outcome = "refused"
+    watching = False
+    return {"outcome": outcome, "events": events, "modules": sorted(set(sys.modules) - before)}
 
-        pickle.loads(target.read_bytes())
-except rejeu.CheckpointError:
-    outcome = "refused"
-watching = False
-print(json.dumps({"outcome": outcome, "events": events, "modules": sorted(set(sys.modules) - before)}))
+
+def unpickled(path):
+    import pickle
+
+    pickle.loads(path.read_bytes())
+
+
+sys.addaudithook(hook)
+seen = {
+    "agent": watched("sac.safetensors", rejeu.load),
+    "replay": watched("replay.safetensors", agent.load_replay_buffer),
+    "vec_normalize": watched("vec_normalize.safetensors", lambda path: VecNormalize.load(path, env)),
+    "pickle": watched("evil.pkl", unpickled),
+}
+print(json.dumps(seen))
 """
 
 
-def watched(folder: Path, name: str, kind: str) -> dict:
-    """Reads a file in a process that notes what is run, compiled, imported or started meanwhile."""
-    environment_is_ours = [sys.executable, "-c", LOAD, str(folder), name, kind]
-    result = subprocess.run(environment_is_ours, capture_output=True, text=True, check=True, cwd=ROOT)
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> dict:
+    """What was run, compiled, imported or started while a process read each kind of file, and a pickle at last."""
+    folder = tmp_path_factory.mktemp("files")
+    for path in FOLDERS[-1].glob("*.safetensors"):
+        shutil.copy(path, folder)
+    (folder / "evil.pkl").write_bytes(pickle.dumps(print))
+    result = subprocess.run(
+        [sys.executable, "-c", LOAD, str(folder)], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     return json.loads(result.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize(("name", "kind"), [("sac", "agent"), ("replay", "replay"), ("vec_normalize", "vec_normalize")])
-def test_reading_a_file_runs_and_imports_nothing(name, kind):
-    seen = watched(FOLDERS[-1], f"{name}.safetensors", kind)
-    assert seen == {"outcome": "read", "events": ours(seen["events"]), "modules": []}
+@pytest.mark.parametrize("kind", ["agent", "replay", "vec_normalize"])
+def test_reading_a_file_runs_and_imports_nothing(seen, kind):
+    assert seen[kind] == {"outcome": "read", "events": ours(seen[kind]["events"]), "modules": []}
 
 
 def ours(events: list) -> list:
@@ -113,13 +126,6 @@ def is_generated(name: str) -> bool:
     return name.startswith("<string>") or name in ("<stdin>",)
 
 
-def test_the_watch_sees_a_pickle_that_runs_code(tmp_path):
+def test_the_watch_sees_a_pickle_that_runs_code(seen):
     """Else the test above could not fail."""
-    import pickle
-    import shutil
-
-    for path in FOLDERS[-1].glob("*.safetensors"):
-        shutil.copy(path, tmp_path)
-    (tmp_path / "evil.pkl").write_bytes(pickle.dumps(print))
-    seen = watched(tmp_path, "evil.pkl", "pickle")
-    assert ["pickle.find_class", "builtins"] in seen["events"]
+    assert ["pickle.find_class", "builtins"] in seen["pickle"]["events"]
