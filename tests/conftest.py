@@ -121,5 +121,8 @@ def compiled_functions_are_dropped() -> Iterator[None]:
     """Drops compiled functions before they exceed about 3 GB. Each one uses a few memory maps."""
     yield
     if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 15_000:
+        from tests.sharing import forget_learners
+
+        forget_learners()
         jax.clear_caches()
         gc.collect()

@@ -38,6 +38,11 @@ def shared_learners() -> Iterator[None]:
         yield
 
 
+def forget_learners() -> None:
+    """Lets later agents compile their functions anew."""
+    _learners.clear()
+
+
 def _build_or_share(agent: Agent, observation_space: gym.Space, action_space: gym.Space) -> None:
     key = _key(agent, observation_space, action_space)
     if key not in _learners:
