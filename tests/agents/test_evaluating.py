@@ -108,6 +108,8 @@ def test_an_on_policy_agent_may_be_evaluated_in_its_own_environment_while_it_lea
         np.testing.assert_array_equal(batch.next_obs[:, 0, 1], batch.obs[:, 0, 1] + 1)
 
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 LEARNERS = {
     "DQN, EnvPool": lambda: rejeu.DQN(
         "MlpPolicy", make_vector("CartPole-v1", 2, "envpool", seed=0), learning_starts=8, batch_size=4, seed=0

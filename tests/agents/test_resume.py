@@ -31,6 +31,7 @@ from tests.sharing import shared_learners
 from tests.tiers import only
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 3}
+RECURRENT = {"policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 8}, "n_steps": 16, "batch_size": 16, "seed": 3}
 OFF = {**SMALL, "learning_starts": 20, "batch_size": 8, "buffer_size": 90}
 BALL = "rejeu/Ball-v0"  # steps in this process, whatever else is installed
 NOISES = {
@@ -76,7 +77,7 @@ CASES = {
     "PPO, gSDE": ("PPO", vector("Pendulum-v1"), {**SMALL, "n_steps": 16, "batch_size": 16, "use_sde": True}),
     "A2C": ("A2C", vector("MountainCar-v0"), {**SMALL, "n_steps": 5}),
     "PQN": ("PQN", vector("CartPole-v1"), {**SMALL, "n_steps": 16, "batch_size": 16}),
-    "RecurrentPPO": ("RecurrentPPO", vector("rejeu/CartPoleNoVelocity-v0"), {**SMALL, "n_steps": 16, "batch_size": 16}),
+    "RecurrentPPO": ("RecurrentPPO", vector("rejeu/CartPoleNoVelocity-v0"), RECURRENT),
 }
 
 DEFAULT_CASES = {
@@ -618,11 +619,13 @@ def test_an_environment_that_a_file_names_is_not_imported(tmp_path):
     assert "antigravity" not in sys.modules
 
 
-@pytest.mark.parametrize("name", ["PPO", "RecurrentPPO"])
-def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "settings"), [("PPO", {**SMALL, "n_steps": 16, "batch_size": 16}), ("RecurrentPPO", RECURRENT)]
+)
+def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, settings, tmp_path):
     """Two environments, 16 steps each a rollout: 13 more steps end within a turn, and are fewer than a minibatch."""
     make_env = vector("rejeu/CartPoleNoVelocity-v0", 2)
-    make = lambda: rejeu.AGENTS[name]("MlpPolicy", make_env(), n_steps=16, batch_size=16, **SMALL)  # noqa: E731
+    make = lambda: rejeu.AGENTS[name]("MlpPolicy", make_env(), **settings)  # noqa: E731
     with shared_learners():
         whole = make().learn(45).learn(50, reset_num_timesteps=False)
         cut_off = make().learn(45, Checkpoint(tmp_path))

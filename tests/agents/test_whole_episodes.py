@@ -12,6 +12,8 @@ from rejeu.algorithms.actor_critic import samples
 from rejeu.envs.make import InProcess, make_vector
 from tests.environments import Counter
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "gamma": 0.9, "seed": 0}
 LENGTHS = ((2, 5, 3), (4,), (7, 1))
 

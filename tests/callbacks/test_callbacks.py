@@ -29,6 +29,8 @@ from rejeu.reporting.logging import Logger
 from tests.environments import Counter
 from tests.helpers import small_sac
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "buffer_size": 1000, "learning_starts": 10_000}
 
 

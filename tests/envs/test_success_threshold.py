@@ -16,6 +16,8 @@ from rejeu.envs.make import InProcess, make_vector
 from tests.environments import Counter, Reach
 from tests.tiers import exhaustive
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "n_steps": 6, "seed": 0}
 
 

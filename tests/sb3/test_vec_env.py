@@ -33,6 +33,8 @@ from tests.environments import Reach
 from tests.golden.vec_env_script import Walk
 from tests.reporting.test_video import Lamp
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "seed": 0}
 
 
