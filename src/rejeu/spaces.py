@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
+POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
+"""Names of policies; each is for some observations."""
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 MAX_NUMBERS = 2**20
 """Upper limit on the numbers and choices of a space in a file, unless the file is large enough to hold networks for more: a
@@ -147,6 +149,18 @@ def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) 
 
     arrays, tree = jax.tree.flatten(plain(space, observation))
     return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
+
+
+def check_policy(policy: str, space: spaces.Space) -> None:
+    """Raises ``ValueError`` if there is no such policy, or if it does not fit the observations of ``space``."""
+    if policy not in POLICIES:
+        raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
+    if policy == "MlpPolicy" and isinstance(space, spaces.Dict):
+        raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
+    if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict | spaces.Tuple):
+        raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
+    if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in leaves(space)):
+        raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
 
 
 def check_goal_space(space: spaces.Space) -> None:

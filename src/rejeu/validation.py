@@ -8,6 +8,7 @@ import difflib
 import inspect
 import itertools
 import math
+import numbers
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
@@ -42,6 +43,17 @@ def number(key: str, value: Any, least: float = -math.inf, above: float = -math.
         bounds += [f"at most {most}"] * (most < math.inf)
         raise ValueError(f"{key}={value!r} must be a finite number" + (", " + " and ".join(bounds) if bounds else ""))
     return float(value)
+
+
+def whole_seed(seed: Any) -> int:
+    """Returns a seed as an ``int``.
+
+    Raises:
+        ValueError: if it is not an integer in [0, 2^32).
+    """
+    if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or not 0 <= int(seed) < 2**32:
+        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
+    return int(seed)
 
 
 def is_finite(value: float) -> bool:
@@ -115,11 +127,15 @@ def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
     Raises:
         TypeError: for a name that is no field, suggesting the nearest that is.
     """
-    names = field_names(kind)
-    for key in given:
-        if key not in names:
-            raise TypeError(unknown_name(key, names, f"{context}{getattr(kind, 'name', '') or kind.__name__}"))
+    check_names(given, field_names(kind), f"{context}{getattr(kind, 'name', '') or kind.__name__}")
     return kind(**given)
+
+
+def check_names(given: Iterable[str], known: Sequence[str], owner: str) -> None:
+    """Raises ``TypeError`` for a name that ``owner`` does not know, suggesting the nearest that it does."""
+    for key in given:
+        if key not in known:
+            raise TypeError(unknown_name(key, known, owner))
 
 
 def with_value(mapping: Mapping[str, Any], path: Sequence[str], value: Any, name: str) -> dict[str, Any]:

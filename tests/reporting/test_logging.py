@@ -165,9 +165,9 @@ class Fake:
 
 def learn(monkeypatch, fake, steps=60):
     """Trains with this tracker in the place of W&B; returns the agent and the warnings."""
-    monkeypatch.setattr(rejeu.agents.training, "open_log", lambda *arguments: fake)
+    monkeypatch.setattr(rejeu.agents.outputs, "open_log", lambda *arguments: fake)
     monkeypatch.setattr(
-        rejeu.agents.training,
+        rejeu.agents.outputs,
         "guarded",
         lambda sink, failed, closes=False: trackers.Background(sink, failed, closes),
     )

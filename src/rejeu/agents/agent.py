@@ -10,9 +10,8 @@ import jax
 import numpy as np
 
 from rejeu import devices, spaces
-from rejeu.agents import model_files, policy, resume, training
+from rejeu.agents import model_files, outputs, policy, resume, training
 from rejeu.agents.base import BaseAgent
-from rejeu.agents.record import record
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
 from rejeu.envs.adapters import vec_env_view
@@ -94,7 +93,7 @@ class Agent(BaseAgent):
 
     def statistics(self) -> dict[str, float]:
         """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
-        return training.statistics_row(self)
+        return outputs.statistics_row(self)
 
     def predict(
         self,
@@ -173,7 +172,7 @@ class Agent(BaseAgent):
             MissingExtra: if plotly or jinja2 is not installed.
         """
         path = Path(path)
-        return write_page([record(self, path, [*evaluations])], path)
+        return write_page([outputs.record(self, path, [*evaluations])], path)
 
     def save(self, path: str | Path) -> Path:
         """Writes the model to one safetensors file, without the replay buffer, and returns its path.

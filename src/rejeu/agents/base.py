@@ -36,10 +36,10 @@ from rejeu.normalization import normalized
 from rejeu.reporting.history import History
 from rejeu.reporting.logging import Logger, check_logs
 from rejeu.reporting.text import counted, html_table
+from rejeu.validation import number, whole, whole_seed
 
 BEST_WINDOW = 20
 """Default number of training episodes over whose mean return the best weights are chosen."""
-POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
 AGENT_ARGUMENTS = {
     "policy": "``MlpPolicy``, ``MultiInputPolicy`` (Dict observations) or ``CnnPolicy`` (images). All three build what "
     "the observation space needs; a name that does not fit the space is an error.",
@@ -99,17 +99,71 @@ class BaseAgent(ABC):
     """Whether its policy takes masks of the allowed actions."""
     algorithm: ClassVar[Any]
     """What has ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
-    is_learning: bool = False
-    """Whether ``learn`` is running."""
-    report_folder: Path | None = None
-    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
-    last_saved: Path | None = None
-    """The newest file that :meth:`save` wrote."""
+    device: str
+    """Where it computes: ``"auto"``, ``"cpu"`` or ``"gpu"``."""
     on_device: bool | None = None
     """Whether ``learn`` trains in one program on the device: True requires it, False uses the loop of the host. None uses the
     device where the environments are JAX environments and the settings allow it; see ``docs/device.md``."""
     stops: Stops | None = None
     """During a ``learn`` on the device: where the program returns to the host. None with the loop of the host."""
+    run: Run
+    """What every step changes: environments, buffer, counters, and the state of the algorithm."""
+    run_id: str
+    """Identifies the run in its checkpoints."""
+    is_learning: bool = False
+    """Whether ``learn`` is running."""
+    training_call: TrainingCall | None = None
+    """The current or last call of ``learn``: its limits and progress."""
+    interrupted: bool = False
+    """Whether Ctrl-C or SIGTERM ended the last ``learn``."""
+    interrupted_by: int | None = None
+    """The number of that signal."""
+    reset_step: int = 0
+    """Total environment steps when the last ``learn`` with ``reset_num_timesteps=True`` started."""
+    reset_episode: int = 0
+    """Total finished episodes at that time."""
+    reset_seconds: float = 0.0
+    """Total training time at that time, in seconds."""
+    history: History
+    """Every episode of training."""
+    ep_info_buffer: deque[dict[str, float]]
+    """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
+    ep_success_buffer: deque[float]
+    """Whether the last episodes succeeded, of those for which that is known."""
+    steps_per_second: float = math.nan
+    """Environment steps per second in the current or last ``learn``."""
+    verbose: int = 0
+    """Whether a table of statistics is printed while it learns."""
+    log: tuple[str, ...] = ()
+    """Names of the logs to which rows of statistics are written."""
+    tensorboard_log: str | Path | None = None
+    """Folder of the folders of these logs; None for ``logs``."""
+    logger: Logger
+    """Accepts further numbers for the rows of statistics."""
+    best: Best | None = None
+    """The best weights so far, by mean training return or by evaluation."""
+    callbacks: Sequence[Stateful] = ()
+    """The callbacks of the current or last ``learn`` whose state a checkpoint contains."""
+    saved_callbacks: list[tuple[str, Any]] | None = None
+    """Class names and states of callbacks in a resumed checkpoint, until ``learn`` restores them."""
+    resumed: Resumed | None = None
+    """Where :meth:`resume` continued the run; None for a new or loaded agent."""
+    run_folders: dict[Path, RunFolder]
+    """Folders that contain its checkpoints, by path."""
+    failed_writes: FailedWrites
+    """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
+    last_saved: Path | None = None
+    """The newest file that :meth:`save` wrote."""
+    report_folder: Path | None = None
+    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
+    made_from_id: bool = False
+    """Whether the environments were made from an id."""
+    trained_on: tuple[str, Mapping[str, Any]] | None = None
+    """Id and keyword arguments of the environments a loaded agent was trained on, if its file contains them."""
+    n_predictions: int = 0
+    """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
+    carry_shapes: Any = None
+    """Shapes of a recurrent policy's state for one episode; computed when they are first needed."""
 
     def __init__(
         self,
@@ -127,24 +181,13 @@ class BaseAgent(ABC):
         **hyperparameters: Any,
     ) -> None:
         known = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
-        for key in hyperparameters:
-            if key not in known:
-                raise TypeError(validation.unknown_name(key, known, self.name))
-        self.configure(
-            policy,
-            self.algorithm.Config(**hyperparameters),
-            int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed),
-            verbose,
-            check_logs("log", log),
-            tensorboard_log,
-            validation.whole("stats_window_size", stats_window_size, least=1),
-            None if success_threshold is None else validation.number("success_threshold", success_threshold),
-            validation.whole("best_window", best_window, least=1),
-            device,
-        )
+        validation.check_names(hyperparameters, known, self.name)
+        config = self.algorithm.Config(**hyperparameters)
+        self.configure(policy, config, seed, stats_window_size, success_threshold, best_window, device)
+        self.set_outputs(verbose, log, tensorboard_log)
         self.made_from_id = isinstance(env, str)
         vector = self.make_envs(env, 1, seed=self.seed)
-        check_policy(policy, vector.observation_space)
+        spaces.check_policy(policy, vector.observation_space)
         self.build(vector.observation_space, vector.action_space)
         xla.start_device(self.n_threads(vector.n_envs))
         self.start_run(vector)
@@ -153,67 +196,32 @@ class BaseAgent(ABC):
         self,
         policy: str,
         config: Any,
-        seed: int,
-        verbose: int,
-        log: tuple[str, ...],
-        tensorboard_log: str | Path | None,
-        stats_window_size: int,
-        success_threshold: float | None,
-        best_window: int,
+        seed: int | None = None,
+        stats_window_size: int = 100,
+        success_threshold: float | None = None,
+        best_window: int = BEST_WINDOW,
         device: str = "auto",
     ) -> None:
-        """Sets the attributes that do not depend on the environment."""
+        """Sets what does not depend on the environment; raises ``ValueError`` for an invalid value."""
         contract.check_config(config)
-        self.policy, self.config, self.seed, self.verbose = policy, config, seed, verbose
-        self.log = log if tensorboard_log is None else tuple(dict.fromkeys((*log, "tensorboard")))
-        self.tensorboard_log = tensorboard_log
-        self.stats_window_size, self.success_threshold = stats_window_size, success_threshold
-        self.best_window = best_window
-        self.device = devices.named(device)
-        """Where it computes: ``"auto"``, ``"cpu"`` or ``"gpu"``."""
-        self.history = History()
-        self.ep_info_buffer: deque[dict[str, float]] = deque(maxlen=stats_window_size)
-        """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
-        self.ep_success_buffer: deque[float] = deque(maxlen=stats_window_size)
-        self.interrupted = False
-        """Whether Ctrl-C or SIGTERM ended the last ``learn``."""
-        self.interrupted_by: int | None = None
-        """The number of that signal."""
-        self.logger = Logger()
-        """Accepts further numbers for the rows of statistics."""
-        self.failed_writes = FailedWrites()
-        """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
-        self.best: Best | None = None
-        """The best weights so far, by mean training return or by evaluation."""
-        self.steps_per_second = math.nan
-        """Environment steps per second in the current or last ``learn``."""
-        self.resumed: Resumed | None = None
-        """Where :meth:`resume` continued the run; None for a new or loaded agent."""
-        self.run_id = secrets.token_hex(8)
-        """Identifies the run in its checkpoints."""
-        self.training_call: TrainingCall | None = None
-        """The current or last call of ``learn``: its limits and progress."""
-        self.callbacks: list[Stateful] = []
-        """The callbacks of the current or last ``learn`` whose state a checkpoint contains."""
-        self.saved_callbacks: list[tuple[str, Any]] | None = None
-        """Class names and states of callbacks in a resumed checkpoint, until ``learn`` restores them."""
-        self.run_folders: dict[Path, RunFolder] = {}
-        """Folders that contain its checkpoints, by path."""
-        self.reset_step = 0
-        """Total environment steps when the last ``learn`` with ``reset_num_timesteps=True`` started."""
-        self.reset_episode = 0
-        """Total finished episodes at that time."""
-        self.reset_seconds = 0.0
-        """Total training time at that time, in seconds."""
-        self.n_predictions = 0
-        """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
-        self.carry_shapes: Any = None
-        """Shapes of a recurrent policy's state for one episode; computed when they are first needed."""
-        self.trained_on: tuple[str, Mapping[str, Any]] | None = None
-        """Id and keyword arguments of the environments a loaded agent was trained on, if its file contains them."""
-        self.made_from_id = False
-        """Whether the environments were made from an id."""
+        self.policy, self.config = policy, config
+        self.seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed)
+        self.stats_window_size = whole("stats_window_size", stats_window_size, least=1)
+        self.success_threshold = None if success_threshold is None else number("success_threshold", success_threshold)
+        self.best_window = whole("best_window", best_window, least=1)
+        self.device, self.run_id = devices.named(device), secrets.token_hex(8)
+        self.history, self.logger, self.failed_writes = History(), Logger(), FailedWrites()
+        self.ep_info_buffer = deque(maxlen=self.stats_window_size)
+        self.ep_success_buffer = deque(maxlen=self.stats_window_size)
+        self.run_folders = {}
         xla.enable_cache()
+
+    def set_outputs(
+        self, verbose: int = 0, log: str | Sequence[str] = (), tensorboard_log: str | Path | None = None
+    ) -> None:
+        """Sets where rows of statistics go; raises ``ValueError`` for an unknown log."""
+        logs = check_logs("log", log) if tensorboard_log is None else (*check_logs("log", log), "tensorboard")
+        self.verbose, self.log, self.tensorboard_log = verbose, tuple(dict.fromkeys(logs)), tensorboard_log
 
     def build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
         """Makes the algorithm for these spaces, and its learner."""
@@ -250,7 +258,7 @@ class BaseAgent(ABC):
         """
         buffer, learn_from = (None, 0) if env is None else (self.make_buffer(env), self.first_learning_step(0))
         with devices.chosen(self.device):
-            self.run: Run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
+            self.run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
 
     @abstractmethod
     def make_envs(
@@ -415,27 +423,3 @@ class Signature:
             for key, default in validation.field_defaults(config).items()
         ]
         return inspect.Signature([*list(self.common.parameters.values())[1:-1], *hyperparameters])
-
-
-def whole_seed(seed: Any) -> int:
-    """Returns a seed as an ``int``.
-
-    Raises:
-        ValueError: if it is not an integer in [0, 2^32).
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1")
-    return int(seed)
-
-
-def check_policy(policy: str, space: gym.Space) -> None:
-    """Raises ``ValueError`` if there is no such policy, or if it does not fit the observations of ``space``."""
-    if policy not in POLICIES:
-        raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
-    is_dict = isinstance(space, gym.spaces.Dict)
-    if policy == "MlpPolicy" and is_dict:
-        raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
-    if policy == "MultiInputPolicy" and not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
-    if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in spaces.leaves(space)):
-        raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")

@@ -12,27 +12,28 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from rejeu import devices, spaces, validation, xla
-from rejeu.agents.base import AGENT_ARGUMENTS, BEST_WINDOW, BaseAgent, check_policy, whole_seed
+from rejeu import devices, spaces, xla
+from rejeu.agents.base import AGENT_ARGUMENTS, BEST_WINDOW, BaseAgent
 from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError, MissingObjectError
 from rejeu.io import checkpoint
-from rejeu.io.records import Positive, Seed, convert
+from rejeu.io.records import WRONG, Positive, Seed, brief, convert
 from rejeu.networks import settled
-from rejeu.reporting.logging import check_logs
 
 if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv
 
+ARGUMENTS = ("policy", "seed", "stats_window_size", "success_threshold", "best_window")
+"""Arguments of an agent that its model file holds."""
+OUTPUTS = ("verbose", "log", "tensorboard_log")
+"""Arguments that say where rows of statistics go."""
 SIZES = ("n_critics", "n_quantiles")
 """Hyperparameters outside ``policy_kwargs`` that set the size of networks."""
 MAX_LAYERS = 256
 """Upper limit on the layers of any kind in the networks of a file: each takes time to build, even if it is empty."""
 SMALL_WIDTH = 2**16
 """Widths up to this one are accepted whatever the size of the file."""
-WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
-"""Exceptions that invalid values of a file can cause."""
 
 Count32 = Annotated[int, Meta(ge=0, lt=2**32)]
 
@@ -106,7 +107,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         config = configs.rebuild(kind, said, configs.own_changes(said, changes))
         largest = max(spaces.MAX_NUMBERS, room)
         observation_space = spaces.rebuild(saved.observation_space, largest)
-        check_policy(saved.policy, observation_space)
+        spaces.check_policy(saved.policy, observation_space)
         action_space = spaces.rebuild(saved.action_space, largest)
     except MissingObjectError:
         raise
@@ -114,12 +115,6 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
     check_sizes(config, room)
     return Saved(saved, configs.rebuild(kind, said, changes) if changes else config, observation_space, action_space)
-
-
-def brief(error: BaseException) -> str:
-    """Returns the message of an error on one line, shortened."""
-    text = " ".join((str(error) or type(error).__name__).split())
-    return text if len(text) <= 400 else text[:397] + "..."
 
 
 def check_space(description: Any, own: gym.Space, kind: str) -> None:
@@ -292,23 +287,11 @@ def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
     Raises:
         ValueError: if ``given`` is invalid.
     """
-    policy, seed, stats_window_size, success_threshold, best_window = (
-        given.get(key, getattr(saved.header, key))
-        for key in ("policy", "seed", "stats_window_size", "success_threshold", "best_window")
-    )
-    check_policy(policy, saved.observation_space)
-    agent.configure(
-        policy,
-        saved.config,
-        whole_seed(seed),
-        given.get("verbose", 0),
-        check_logs("log", given.get("log", ())),
-        given.get("tensorboard_log"),
-        validation.whole("stats_window_size", stats_window_size, 1),
-        None if success_threshold is None else validation.number("success_threshold", success_threshold),
-        validation.whole("best_window", best_window, 1),
-        given.get("device", "auto"),
-    )
+    outputs = {key: given[key] for key in OUTPUTS if key in given}
+    others = {key: value for key, value in given.items() if key not in OUTPUTS}
+    agent.configure(config=saved.config, **{key: getattr(saved.header, key) for key in ARGUMENTS} | others)
+    agent.set_outputs(**outputs)
+    spaces.check_policy(agent.policy, saved.observation_space)
 
 
 def _restore_counters(agent: BaseAgent, saved: AgentHeader) -> None:

@@ -25,6 +25,7 @@ from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
+from rejeu.io.records import brief
 from rejeu.loops.device import loops as device_loops
 from rejeu.loops.first_of_n import first_of_n
 from rejeu.loops.off_policy import begin_episodes, off_policy
@@ -78,7 +79,7 @@ class OffPolicyAgent(Agent):
         except CheckpointError:
             raise
         except ValueError as error:
-            raise CheckpointError(f"{path}: {model_files.brief(error)}") from None
+            raise CheckpointError(f"{path}: {brief(error)}") from None
         self.run.learn_from = self.config.learning_starts
         self.run.td_errors = []  # of transitions that are gone
         self.abandon_episodes()

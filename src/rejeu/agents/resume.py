@@ -16,7 +16,7 @@ from jax import Array
 
 from rejeu import devices, spaces, xla
 from rejeu.agents import model_files
-from rejeu.agents.base import BaseAgent, Best, Resumed, whole_seed
+from rejeu.agents.base import BaseAgent, Best, Resumed
 from rejeu.agents.run_files import (
     PER_ENV,
     SCALARS,
@@ -37,12 +37,12 @@ from rejeu.envs.base import DivergedError
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, json_arrays
-from rejeu.io.records import MAX_ENVS, convert
+from rejeu.io.records import MAX_ENVS, WRONG, brief, convert
 from rejeu.loops.checks import is_finite
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Run
 from rejeu.loops.training_call import TrainingCall
-from rejeu.validation import number
+from rejeu.validation import number, whole_seed
 
 A = TypeVar("A", bound=BaseAgent)
 
@@ -95,7 +95,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         counted = " or ".join(str(buffer[name].size) for name in PER_BUFFER if name in buffer)
         if counted != str(header.n_envs):
             raise ValueError(f"it is of {header.n_envs} environments, and its replay buffer of {counted or 'none'}")
-    except model_files.WRONG as error:
+    except WRONG as error:
         raise refusal(path, error) from error
 
     def make_env(agent: BaseAgent) -> VectorEnv:
@@ -112,7 +112,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
             agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:
             raise CheckpointError(
-                f"{path}: the environments of the run cannot be made again ({model_files.brief(error)}); give them: "
+                f"{path}: the environments of the run cannot be made again ({brief(error)}); give them: "
                 "resume(folder, env=...)"
             ) from error
         return vector
@@ -131,7 +131,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         agent.run_id, agent.made_from_id = header.run_id, env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
-    except model_files.WRONG as error:
+    except WRONG as error:
         raise refusal(path, error) from error
     if parts:
         ring = agent.run.replay.ring
@@ -199,7 +199,7 @@ def refusal(path: Path, error: BaseException) -> CheckpointError:
     """Returns the error for a checkpoint whose values raised ``error``."""
     if isinstance(error, CheckpointError) and str(path.parent) in str(error):
         return error
-    return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {model_files.brief(error)}")
+    return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {brief(error)}")
 
 
 def check_owed(agent: BaseAgent) -> None:

@@ -17,9 +17,9 @@ import jax
 from rejeu import devices, xla
 from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
-from rejeu.agents.base import whole_seed
 from rejeu.agents.device import require_memory
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.callbacks import calling
 from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.envs.functional.protocol import FunctionalEnv
@@ -33,7 +33,7 @@ from rejeu.loops.device.variants import Variants
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Sink
-from rejeu.validation import whole
+from rejeu.validation import whole, whole_seed
 
 A = TypeVar("A", bound=Agent)
 IN_REPLAY = ("gamma",)
@@ -113,7 +113,7 @@ def train_seeds(
         first.made_from_id = isinstance(env, str)
         agents += [first, *(sibling(first, vector(seed), seed) for seed in numbers[1:])]
     calls = [training.start_call(agent, total_timesteps, None, minutes, log_interval, True) for agent in agents]
-    callbacks = [training.listed(None if callback is None else callback(agent)) for agent in agents]
+    callbacks = [calling.listed(None if callback is None else callback(agent)) for agent in agents]
     learn_together(agents, calls, callbacks, progress_bar=progress_bar, differing=tuple(lists))
     return agents
 
@@ -166,14 +166,12 @@ def sibling(agent: A, env: Any, seed: int) -> A:
         agent.policy,
         agent.config,
         seed,
-        agent.verbose,
-        agent.log,
-        agent.tensorboard_log,
         agent.stats_window_size,
         agent.success_threshold,
         agent.best_window,
         agent.device,
     )
+    other.set_outputs(agent.verbose, agent.log, agent.tensorboard_log)
     other.made_from_id = agent.made_from_id
     other.observation_space, other.action_space = agent.observation_space, agent.action_space
     other.obs_leaves, other.learner = agent.obs_leaves, agent.learner
@@ -206,9 +204,9 @@ def learn_together(
     """
     first = agents[0]
     check_differing(first, differing)
-    ordered = [training.in_order(one) for one in callbacks]
+    ordered = [calling.in_order(one) for one in callbacks]
     if progress_bar:
-        ordered[0] = [*ordered[0], ProgressBar(calls[0].n_steps, calls[0].seconds)]
+        ordered[0] = [*ordered[0], ProgressBar.of(calls[0])]
     stops = common_stops(agents, calls, ordered)
     variants = variants_of(first) if differing else None
     hyper = [{name: float(getattr(agent.config, name)) for name in differing} for agent in agents]

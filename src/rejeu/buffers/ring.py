@@ -62,12 +62,8 @@ class Ring:
             MemoryError: if the machine cannot hold the rows, with the numbers.
             ValueError: if ``frame_stack`` is given and no observation leaf is such a stack.
         """
-        self.n_envs, self.obs_leaves, self.obs_structure, self.frame_stack = (
-            n_envs,
-            obs_leaves,
-            obs_structure,
-            frame_stack,
-        )
+        self.n_envs, self.frame_stack = n_envs, frame_stack
+        self.obs_leaves, self.obs_structure = obs_leaves, obs_structure
         self.rows = max(capacity // n_envs, 2, 0 if frame_stack is None else frame_stack + 1)
         self.stacked = stacked_leaves(obs_leaves, frame_stack)
         kept = {*counters, *(() if frame_stack is None else ("since_start",))}

@@ -6,12 +6,13 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 from rejeu.callbacks.base import TrainedAgent, TrainingCallback
 from rejeu.callbacks.due import step_before
 from rejeu.loops.run import Progress
 from rejeu.loops.timing import time_shares
+from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting import notebook
 
 if TYPE_CHECKING:
@@ -85,6 +86,11 @@ class ProgressBar(TrainingCallback):
         self._latest: tuple[TrainedAgent, int] | None = None
         self._shown_step = -1
         self._marks: deque[_Mark] = deque()
+
+    @classmethod
+    def of(cls, call: TrainingCall, taken: int = 0) -> Self:
+        """Returns the bar of a call of ``learn``, of which ``taken`` steps were taken before it was resumed."""
+        return cls(call.n_steps, call.seconds, taken=taken, spent=call.spent)
 
     def before_training(self, agent: TrainedAgent) -> None:
         """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""

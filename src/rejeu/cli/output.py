@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from rejeu import xla
 from rejeu.agents import Agent
 from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.cli.environment import Environment
@@ -22,6 +24,17 @@ from rejeu.reporting.logging import Sink
 from rejeu.reporting.text import counted, quoted
 
 echo = partial(print, flush=True)
+
+
+class Stopwatch:
+    """Measures wall time and compilation time since it was made."""
+
+    def __init__(self) -> None:
+        self._began, self._compiled = time.perf_counter(), xla.seconds()
+
+    def seconds(self) -> tuple[float, float]:
+        """Returns wall time, and how much of it was compilation."""
+        return time.perf_counter() - self._began, xla.seconds() - self._compiled
 
 
 def header(config: RunConfig, environment: Environment, backend: str, folder: RunFolder) -> str:

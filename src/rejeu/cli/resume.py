@@ -13,9 +13,9 @@ from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
 from rejeu.cli import jsonout, pbt, run_folder, settings, sweep, tune
 from rejeu.cli.commands import Resume
-from rejeu.cli.output import echo
+from rejeu.cli.output import Stopwatch, echo
 from rejeu.cli.run_folder import RunConfig, RunFolder
-from rejeu.cli.session import Limits, Session, Stopwatch, has_reached_goal, make_evaluation_env
+from rejeu.cli.session import Limits, Session, has_reached_goal, make_evaluation_env
 from rejeu.envs.make import WorkerOptions
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require

@@ -1,4 +1,4 @@
-"""What ``rejeu train`` and ``rejeu resume`` share: training in a run folder, and what is written there."""
+"""What ``rejeu train`` and ``rejeu resume`` share: a session of training in a run folder."""
 
 from __future__ import annotations
 
@@ -6,35 +6,24 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 
-from rejeu import errors, xla
-from rejeu.agents import Agent, load
-from rejeu.agents.training import restore_callbacks, run_name, tracker_id
-from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
-from rejeu.cli import run_folder
+from rejeu.agents import Agent
+from rejeu.agents.outputs import run_name, tracker_id
+from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo, calling
+from rejeu.cli import results
 from rejeu.cli.environment import Environment
-from rejeu.cli.output import as_dict, echo, noted_in, reporter, summary
+from rejeu.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.envs.make import VectorEnv
 from rejeu.interrupt import Interrupt, leaving
 from rejeu.loops.run import Progress
-from rejeu.reporting import plots
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
-from rejeu.reporting.report import write_report
 from rejeu.reporting.text import quoted
 from rejeu.reporting.trackers import Background
-from rejeu.reporting.video import record_video
-
-VIDEO_EPISODES = 3
-VIDEO_STEPS = 600
-"""Most steps of a video: a poor policy's episodes are long, and highway-env renders some 70 frames a second."""
 
 
 class Limits(NamedTuple):
@@ -48,17 +37,6 @@ class Limits(NamedTuple):
     """Pause after this many further environment steps, without changing the goal."""
     pause_minutes: float | None = None
     """Pause after this many further minutes, without changing the goal."""
-
-
-class Stopwatch:
-    """Measures wall time and compilation time since it was made."""
-
-    def __init__(self) -> None:
-        self._began, self._compiled = time.perf_counter(), xla.seconds()
-
-    def seconds(self) -> tuple[float, float]:
-        """Returns wall time, and how much of it was compilation."""
-        return time.perf_counter() - self._began, xla.seconds() - self._compiled
 
 
 class Learning(NamedTuple):
@@ -111,7 +89,7 @@ class Session(NamedTuple):
         """
         with self.training(stop) as learning:
             if self.is_over:
-                restore_callbacks(self.agent, learning.callbacks)
+                calling.restore(self.agent, learning.callbacks)
             else:
                 self.agent.learn(
                     self.limits.steps,
@@ -131,20 +109,20 @@ class Session(NamedTuple):
 
     def finish(self, learning: Learning, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
         """Evaluates, plots and records a video after training; prints a summary, and returns what :meth:`run` does."""
-        agent, folder, evaluate = self.agent, self.folder, learning.evaluate
+        agent, folder, environment, evaluate = self.agent, self.folder, self.environment, learning.evaluate
         is_complete = not stop.requested and has_reached_goal(agent)
         try:
             agent.failed_writes.retry()
             if is_complete:
                 with leaving(f"interrupted after training; the models are saved in {folder.path}"):
                     evaluate_now(evaluate, agent)
-                    self.plot_curve(evaluate)
+                    results.plot_curve(agent, folder, environment, evaluate)
                     if self.has_video:
-                        self.record_video(learning.outputs)
+                        results.record_video(agent, folder, environment, self.config.seed, learning.outputs)
             else:
-                self.plot_curve(evaluate)
-                options = self.environment.options()
-                echo(f"no video of a run that was stopped; rejeu record {quoted(folder.path)}{options} makes one")
+                results.plot_curve(agent, folder, environment, evaluate)
+                again = f"rejeu record {quoted(folder.path)}{environment.options()}"
+                echo(f"no video of a run that was stopped; {again} makes one")
         except Exception:
             self.write_report()
             raise
@@ -152,7 +130,7 @@ class Session(NamedTuple):
             learning.close()
         self.write_report()
         seconds = stopwatch.seconds()
-        echo(summary(agent, folder, self.environment, evaluate, stop.signal, is_complete, *seconds))
+        echo(summary(agent, folder, environment, evaluate, stop.signal, is_complete, *seconds))
         if failed := agent.failed_writes.summary():
             print(f"warning: {failed}", file=sys.stderr)
         result = as_dict(agent, folder, evaluate, stop.signal, is_complete, *seconds)
@@ -171,10 +149,7 @@ class Session(NamedTuple):
 
     @contextmanager
     def training(self, stop: Interrupt) -> Iterator[Learning]:
-        """Context in which the agent learns, with what ``learn`` is to be given; on exit models and tables are written.
-
-        They are written also after an error of the environment or of the numbers. After an error the outputs are closed.
-        """
+        """Context in which the agent learns, with what ``learn`` is to be given; models and tables are written at its end."""
         agent, folder = self.agent, self.folder
         outputs = self.outputs()
         agent.report_folder = folder.path
@@ -182,33 +157,13 @@ class Session(NamedTuple):
         episodes = EpisodeTable(lambda: agent.history, folder.episodes)
         learning = Learning(evaluate, callbacks, outputs, [*outputs, RetryingSink(episodes, agent.failed_writes)])
         try:
-            with noted_in(folder.warnings):
-                try:
-                    yield learning
-                    save(agent, folder.agent)
-                    if not evaluate.results:
-                        save(agent, folder.best)
-                except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
-                    save(agent, folder.agent)
-                    raise
-                finally:
-                    self.write_arrivals()
-                    write = lambda: agent.history.write_csv(folder.episodes)  # noqa: E731
-                    agent.failed_writes.attempt(f"table {folder.episodes}", write)
-        except Exception:
-            self.write_report()
+            with noted_in(folder.warnings), results.saved_at_exit(agent, folder, evaluate):
+                yield learning
+        except BaseException as error:
+            if isinstance(error, Exception):
+                self.write_report()
             learning.close()
             raise
-        except BaseException:
-            learning.close()
-            raise
-
-    def write_arrivals(self) -> None:
-        """Writes the order in which the results of environments were taken, if they did not wait for each other."""
-        agent, folder = self.agent, self.folder
-        if agent.env is not None and (arrivals := agent.env.arrivals) is not None:
-            write = partial(run_folder.write_arrivals, folder, arrivals)
-            agent.failed_writes.attempt(f"order of arrival {folder.arrivals}", write)
 
     def callbacks(self, stop: Interrupt) -> tuple[Evaluate, list[Any]]:
         """Returns the callback that evaluates, and all callbacks of the run."""
@@ -227,38 +182,15 @@ class Session(NamedTuple):
         callbacks: list[Any] = [evaluate, finish]
         if config.video_every is not None:
             render = self.environment.rendering
-            callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
+            callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=results.VIDEO_STEPS))
         if config.checkpoint_minutes is not None:
             callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
         return evaluate, callbacks
 
-    def plot_curve(self, evaluate: Evaluate) -> None:
-        """Plots the learning curve, or prints why not."""
-        title = f"{self.environment.env_id}, {self.config.algorithm}"
-        try:
-            plots.learning_curve(self.agent.history, self.folder.curve, evaluations=evaluate.results, title=title)
-        except (ImportError, OSError) as error:
-            echo(f"no curve: {' '.join(str(error).split())}")
-
-    def record_video(self, outputs: list[RetryingSink | Background]) -> None:
-        """Records a video of the best model and adds it to the outputs, or prints why not."""
-        folder, render = self.folder, self.environment.rendering
-        try:
-            record_video(load(folder.best), folder.video, render, VIDEO_EPISODES, VIDEO_STEPS, self.config.seed)
-        except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
-            echo(f"no video: {' '.join(str(error).split())}")
-            return
-        for output in outputs:
-            output.write_video(self.agent.num_timesteps, folder.video)
-
     def write_report(self) -> None:
-        """Writes the page about the run, or prints why not."""
-        if not self.has_report:
-            return
-        try:
-            write_report(self.folder.path, self.folder.report)
-        except (ImportError, OSError) as error:
-            echo(f"no report: {' '.join(str(error).split())}")
+        """Writes the page about the run, unless the run is to have none."""
+        if self.has_report:
+            results.write_report(self.folder)
 
 
 def make_evaluation_env(config: RunConfig, environment: Environment) -> VectorEnv:
@@ -266,11 +198,6 @@ def make_evaluation_env(config: RunConfig, environment: Environment) -> VectorEn
     seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
     backend = config.backend if config.backend in ("envpool", "jax") else "gymnasium"
     return environment.vector(min(config.evaluate_episodes, 16), backend, seed)
-
-
-def save(agent: Agent, path: Path) -> None:
-    """Saves a model, or warns and tries again at the end of the command."""
-    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
 
 
 def evaluate_now(evaluate: Evaluate, agent: Agent) -> None:

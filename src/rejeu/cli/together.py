@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import Any
 
 from rejeu import devices
 from rejeu.agents import training
 from rejeu.agents.device import reason_against, require_memory
-from rejeu.agents.together import learn_together, start_device
+from rejeu.agents.together import learn_together, sibling, start_device
 from rejeu.cli import run_folder, seeds, sweep
 from rejeu.cli.commands import Train
 from rejeu.cli.importing import find_id
-from rejeu.cli.output import echo, header
+from rejeu.cli.output import Stopwatch, echo, header
 from rejeu.cli.run_folder import RunFolder
-from rejeu.cli.session import Session, Stopwatch
+from rejeu.cli.session import Session, make_evaluation_env
 from rejeu.envs.functional.registry import is_functional
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.text import quoted
@@ -23,7 +24,7 @@ from rejeu.sweeps.folder import Sweep, SweepFolder, open_folder
 from rejeu.sweeps.jobs import Code, again
 from rejeu.sweeps.processes import threads_of
 
-Begin = Callable[[Train, int, Session | None, ExitStack], Session]
+Begin = Callable[[Train, int, ExitStack], Session]
 """Makes the session of a seed; see :func:`rejeu.cli.train.begin`."""
 
 
@@ -45,14 +46,14 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
     path = seeds.choose_folder(arguments)
     start_device(len(jobs))
     with ExitStack() as stack:
-        first = begin(arguments, jobs[0].seed, None, stack)
+        first = begin(arguments, jobs[0].seed, stack)
         if reason := reason_against(first.agent, ()):
             echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
             return seeds.train_all(arguments)
         require_memory(first.agent, len(jobs))
         code = Code(env=arguments.env, wrappers=arguments.wrapper, imports=arguments.imports)
         folder = open_folder(path, Sweep(jobs=jobs, threads=threads_of(1)), None, code)
-        sessions = [first, *(begin(arguments, job.seed, first, stack) for job in jobs[1:])]
+        sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
         sessions = [named(session, folder, job) for session, job in zip(sessions, jobs, strict=True)]
         echo(
             header(
@@ -81,6 +82,14 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
         )
         return 128 + stop.signal, result
     return max(statuses), result
+
+
+def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
+    """Returns the session of another seed, whose agent shares the compiled functions of the first; ``stack`` closes it."""
+    config = dataclasses.replace(first.config, seed=seed)
+    env = stack.enter_context(closing(first.environment.vector(config.n_envs, config.backend, seed)))
+    evaluation_env = stack.enter_context(closing(make_evaluation_env(config, first.environment)))
+    return first._replace(agent=sibling(first.agent, env, seed), config=config, evaluation_env=evaluation_env)
 
 
 def named(session: Session, folder: SweepFolder, job: Any) -> Session:

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
-import warnings
 from contextlib import ExitStack, closing
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
-from rejeu import devices, presets, validation
-from rejeu.agents import AGENTS, agent_of_file, find_agent
-from rejeu.agents.together import sibling
-from rejeu.algorithms import config as configs
-from rejeu.cli import environment, jsonout, run_folder, seeds, settings, together
+from rejeu import devices
+from rejeu.agents import AGENTS, find_agent
+from rejeu.cli import choices, environment, jsonout, run_folder, seeds, together
 from rejeu.cli.commands import Train
-from rejeu.cli.environment import Environment
-from rejeu.cli.output import echo, header
-from rejeu.cli.run_folder import RunConfig, RunFolder
-from rejeu.cli.session import Limits, Session, Stopwatch, make_evaluation_env
-from rejeu.envs.make import VectorEnv, WorkerOptions
-from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
+from rejeu.cli.output import Stopwatch, echo, header
+from rejeu.cli.run_folder import RunFolder
+from rejeu.cli.session import Limits, Session, make_evaluation_env
 from rejeu.interrupt import Interrupt
-from rejeu.io.records import shown
-from rejeu.presets import Preset
-from rejeu.reporting.logging import check_logs, require
-from rejeu.reporting.video import ffmpeg
 
 
 def run(arguments: Train) -> int:
@@ -47,7 +34,7 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
     run_folder.check_free(arguments.out)
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with ExitStack() as stack:
-        session, stop = begin(arguments, seed, None, stack), stack.enter_context(Interrupt())
+        session, stop = begin(arguments, seed, stack), stack.enter_context(Interrupt())
         folder = run_folder.create(arguments.out, session.config.env, session.config.algorithm, seed)
         session = session._replace(folder=folder)
         run_folder.write_config(folder, session.config)
@@ -55,36 +42,17 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
         return session.run(stop, stopwatch)
 
 
-def begin(arguments: Train, seed: int, first: Session | None, stack: ExitStack) -> Session:
-    """Returns the session of a new run, for which there is no folder yet.
-
-    Args:
-        arguments: the command line.
-        seed: of the run.
-        first: another run of the same command line, whose compiled functions the agent shares; None for none.
-        stack: closes the environments.
-    """
-    logs = check_logs("--log", chain.from_iterable(arguments.log))
-    require(logs)
-    if arguments.video_every is not None:
-        ffmpeg()
+def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
+    """Returns the session of a new run, for which there is no folder yet; ``stack`` closes its environments."""
+    logs = choices.installed_logs(arguments)
     algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
-    made = environment.from_arguments(arguments.env, arguments) if first is None else first.environment
-    preset = find_preset(arguments, made, algorithm)
-    env = stack.enter_context(closing(make_env(arguments, made, preset, seed)))
-    if first is None:
-        config = make_config(arguments, made, preset, algorithm or choose_algorithm(preset, env), env, seed, logs)
-        agent = AGENTS[config.algorithm](
-            config.policy,
-            env,
-            seed=seed,
-            success_threshold=config.success_threshold,
-            device=config.device,
-            **config.hyperparameters,
-        )
-    else:
-        config = dataclasses.replace(first.config, seed=seed)
-        agent = sibling(first.agent, env, seed)
+    made = environment.from_arguments(arguments.env, arguments)
+    preset = choices.find_preset(arguments, made, algorithm)
+    env = stack.enter_context(closing(choices.make_env(arguments, made, preset, seed)))
+    algorithm = algorithm or choices.choose_algorithm(preset, env)
+    config = choices.make_config(arguments, made, preset, algorithm, env, seed, logs)
+    general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
+    agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
     return Session(
         agent,
         config,
@@ -95,118 +63,5 @@ def begin(arguments: Train, seed: int, first: Session | None, stack: ExitStack) 
         is_new=True,
         has_report=not arguments.no_report,
         has_video=not arguments.no_video,
-        backend=describe_backend(env, made, preset),
-    )
-
-
-def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:
-    """Returns the preset of ``--preset``, else that of the environment, None if there is none.
-
-    Raises:
-        ValueError: if the file's preset is for another algorithm than ``--algo`` says, or one that is not known.
-    """
-    if arguments.preset is None:
-        return presets.find(made.env_id, algorithm)
-    preset = presets.read(arguments.preset)
-    agent_of_file(preset.algorithm, arguments.preset)
-    if algorithm not in (None, preset.algorithm):
-        raise ValueError(
-            f"--algo {algorithm} differs from the algorithm of --preset {arguments.preset}, which is {preset.algorithm}; "
-            "leave out one of them"
-        )
-    if preset.env_id != made.env_id:
-        warnings.warn(f"--preset {arguments.preset} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
-    return preset
-
-
-def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
-    """Returns the training environments."""
-    n_envs = arguments.envs or (preset.n_envs if preset else 1)
-    backend = default_backend(made, preset)
-    if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
-        backend = "gymnasium"
-    backend = arguments.backend or backend
-    ray = (
-        {"address": arguments.ray, "num_cpus": arguments.env_cpus}
-        if backend == "ray" or arguments.ray is not None
-        else None
-    )
-    order = None if arguments.arrivals is None else run_folder.read_arrivals(arguments.arrivals)
-    return made.vector(
-        n_envs,
-        backend,
-        seed,
-        WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order, ray=ray),
-    )
-
-
-def default_backend(made: Environment, preset: Preset | None) -> str:
-    """Returns the backend of a preset, and ``"auto"`` without one."""
-    return preset.backend if preset and made.is_plain else "auto"
-
-
-def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -> str:
-    """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
-    if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
-        return env.backend
-    return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
-
-
-def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
-    """Returns the preset's algorithm, or the default for the environment's action space.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    if preset is not None:
-        return preset.algorithm
-    kind = type(env.action_space).__name__
-    if kind not in presets.ALGORITHM_FOR:
-        known = ", ".join(f"{name} takes {space}" for space, name in presets.ALGORITHM_FOR.items())
-        raise ValueError(f"{env.env_id} has the actions {env.action_space}, which no algorithm here takes; {known}")
-    return presets.ALGORITHM_FOR[kind]
-
-
-def make_config(
-    arguments: Train,
-    made: Environment,
-    preset: Preset | None,
-    algorithm: str,
-    env: VectorEnv,
-    seed: int,
-    logs: tuple[str, ...],
-) -> RunConfig:
-    """Returns the configuration of the run: the arguments, then the preset, then the defaults.
-
-    Raises:
-        TypeError: for an unknown hyperparameter, with the nearest known one.
-        ValueError: for an invalid value.
-    """
-    base = presets.default(made.env_id, algorithm) if preset is None else preset
-    hyperparameters = settings.apply(chain.from_iterable(arguments.assignments), base.hyperparameters)
-    config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
-    nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
-    return RunConfig(
-        env=made.env_id,
-        env_argument=made.typed,
-        env_kwargs=dict(made.kwargs),
-        wrappers=made.wrapper_names,
-        imports=made.modules,
-        algorithm=algorithm,
-        preset=preset is not None,
-        hyperparameters=configs.to_json(config),
-        policy="MultiInputPolicy" if nested else "MlpPolicy",
-        seed=seed,
-        n_envs=env.n_envs,
-        backend=env.backend,
-        wait_for=env.wait_for,
-        device=devices.named(arguments.device, "--device"),
-        steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
-        minutes=arguments.minutes,
-        success_threshold=arguments.success_threshold,
-        video_every=arguments.video_every,
-        evaluate_every=arguments.evaluate_every or base.evaluate_every,
-        evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
-        checkpoint_minutes=arguments.checkpoint_minutes or None,
-        log=logs,
+        backend=choices.describe_backend(env, made, preset),
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, InitVar, asdict, dataclass
@@ -28,6 +29,8 @@ from rejeu.validation import assign
 
 PerDimension = Any
 """A number for all action dimensions, or a sequence of one for each; kept as a tuple of floats."""
+DETERMINISTIC = ("DDPG", "TD3")
+"""Algorithms whose policy for continuous actions does not explore by itself."""
 
 
 @runtime_checkable
@@ -347,6 +350,19 @@ def check_fits(noise: Noise | None, action_space: spaces.Space) -> None:
         raise ValueError(
             f"action_noise has {len(noise.mean)} dimensions and the actions have {math.prod(action_space.shape)}; "
             f"try {type(noise).__name__}(mean=[0.0] * {math.prod(action_space.shape)}, sigma={noise.sigma[0]})"
+        )
+
+
+def warn_without_noise(agent: Any) -> None:
+    """Warns at the start of a run if an agent's policy is deterministic and it has no exploration noise."""
+    is_deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
+    if is_deterministic and agent.make_noise() is None and agent.run.step == 0:
+        warnings.warn(
+            f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
+            f"learning_starts={agent.config.learning_starts} it explores nothing new; set action_noise=0.1 (--set "
+            "action_noise=0.1), 'ou(0.2)' or ParameterNoise()",
+            UserWarning,
+            stacklevel=4,
         )
 
 

@@ -33,6 +33,10 @@ Duration = Annotated[float, Meta(gt=0, le=1e300)]
 """Seconds or minutes, more than none."""
 
 
+WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
+"""Exceptions that invalid values of a file can cause where they are used."""
+
+
 class Malformed(ValueError):
     """A file does not follow its format; the message says where."""
 
@@ -107,6 +111,12 @@ def shown(value: Any, length: int = 100) -> str:
     text = str(value)
     text = text if text.isprintable() else ascii(text)[1:-1]
     return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def brief(error: BaseException) -> str:
+    """Returns the message of an error on one line, shortened."""
+    text = " ".join((str(error) or type(error).__name__).split())
+    return text if len(text) <= 400 else text[:397] + "..."
 
 
 def _received(value: Any, place: str) -> str:

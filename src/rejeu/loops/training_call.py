@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.io.records import Count, Duration, Positive, Seconds, convert
+from rejeu.validation import number, whole
 
 
 @dataclass
@@ -91,6 +92,21 @@ class TrainingCall:
 
 
 SAVED = [field.name for field in dataclasses.fields(TrainingCall) if field.name not in ("spent", "began")]
+
+
+def checked_limits(
+    total_timesteps: int | None, episodes: int | None, minutes: float | None
+) -> tuple[int | None, int | None, float | None]:
+    """Returns the limits of a ``learn``, as users give them, as numbers of steps, episodes and seconds.
+
+    Raises:
+        ValueError: if one is not a positive number.
+    """
+    return (
+        None if total_timesteps is None else whole("total_timesteps", total_timesteps, least=1),
+        None if episodes is None else whole("episodes", episodes, least=1),
+        None if minutes is None else 60 * number("minutes", minutes, above=0),
+    )
 
 
 def share(before: float, taken: Any, limit: float | None) -> Any:

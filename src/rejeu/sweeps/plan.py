@@ -449,7 +449,7 @@ def check_hyperparameters(
     agent = kind.__new__(kind)
 
     def build() -> None:
-        agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, 0, 0, (), None, 100, None, 20)
+        agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, seed=0)
         agent.build(found.observation, found.action)
         if getattr(config, "hindsight", None) is not None:
             spaces.check_goal_space(found.observation)

@@ -1,0 +1,145 @@
+"""What ``rejeu train`` chooses: the command line decides, then the preset of the environment, then the defaults."""
+
+from __future__ import annotations
+
+import warnings
+from itertools import chain
+
+from gymnasium import spaces
+
+from rejeu import devices, presets, validation
+from rejeu.agents import AGENTS, agent_of_file
+from rejeu.algorithms import config as configs
+from rejeu.cli import run_folder, settings
+from rejeu.cli.commands import Train
+from rejeu.cli.environment import Environment
+from rejeu.cli.run_folder import RunConfig
+from rejeu.envs.make import VectorEnv, WorkerOptions
+from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
+from rejeu.io.records import shown
+from rejeu.presets import Preset
+from rejeu.reporting.logging import check_logs, require
+from rejeu.reporting.video import ffmpeg
+
+
+def installed_logs(arguments: Train) -> tuple[str, ...]:
+    """Returns the logs of ``--log``.
+
+    Raises:
+        ValueError: for an unknown one.
+        MissingExtra: if what they or ``--video-every`` need is not installed, before anything is trained.
+    """
+    logs = check_logs("--log", chain.from_iterable(arguments.log))
+    require(logs)
+    if arguments.video_every is not None:
+        ffmpeg()
+    return logs
+
+
+def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:
+    """Returns the preset of ``--preset``, else that of the environment, None if there is none.
+
+    Raises:
+        ValueError: if the file's preset is for another algorithm than ``--algo`` says, or one that is not known.
+    """
+    if arguments.preset is None:
+        return presets.find(made.env_id, algorithm)
+    preset = presets.read(arguments.preset)
+    agent_of_file(preset.algorithm, arguments.preset)
+    if algorithm not in (None, preset.algorithm):
+        raise ValueError(
+            f"--algo {algorithm} differs from the algorithm of --preset {arguments.preset}, which is {preset.algorithm}; "
+            "leave out one of them"
+        )
+    if preset.env_id != made.env_id:
+        warnings.warn(f"--preset {arguments.preset} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
+    return preset
+
+
+def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
+    """Returns the training environments."""
+    n_envs = arguments.envs or (preset.n_envs if preset else 1)
+    backend = default_backend(made, preset)
+    if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
+        backend = "gymnasium"
+    backend = arguments.backend or backend
+    order = None if arguments.arrivals is None else run_folder.read_arrivals(arguments.arrivals)
+    ray = None
+    if backend == "ray" or arguments.ray is not None:
+        ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus}
+    workers = WorkerOptions(
+        restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order, ray=ray
+    )
+    return made.vector(n_envs, backend, seed, workers)
+
+
+def default_backend(made: Environment, preset: Preset | None) -> str:
+    """Returns the backend of a preset, and ``"auto"`` without one."""
+    return preset.backend if preset and made.is_plain else "auto"
+
+
+def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -> str:
+    """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
+    if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
+        return env.backend
+    return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
+
+
+def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
+    """Returns the preset's algorithm, or the default for the environment's action space.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if preset is not None:
+        return preset.algorithm
+    kind = type(env.action_space).__name__
+    if kind not in presets.ALGORITHM_FOR:
+        known = ", ".join(f"{name} takes {space}" for space, name in presets.ALGORITHM_FOR.items())
+        raise ValueError(f"{env.env_id} has the actions {env.action_space}, which no algorithm here takes; {known}")
+    return presets.ALGORITHM_FOR[kind]
+
+
+def make_config(
+    arguments: Train,
+    made: Environment,
+    preset: Preset | None,
+    algorithm: str,
+    env: VectorEnv,
+    seed: int,
+    logs: tuple[str, ...],
+) -> RunConfig:
+    """Returns the configuration of the run: the arguments, then the preset, then the defaults.
+
+    Raises:
+        TypeError: for an unknown hyperparameter, with the nearest known one.
+        ValueError: for an invalid value.
+    """
+    base = presets.default(made.env_id, algorithm) if preset is None else preset
+    hyperparameters = settings.apply(chain.from_iterable(arguments.assignments), base.hyperparameters)
+    config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
+    nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
+    return RunConfig(
+        env=made.env_id,
+        env_argument=made.typed,
+        env_kwargs=dict(made.kwargs),
+        wrappers=made.wrapper_names,
+        imports=made.modules,
+        algorithm=algorithm,
+        preset=preset is not None,
+        hyperparameters=configs.to_json(config),
+        policy="MultiInputPolicy" if nested else "MlpPolicy",
+        seed=seed,
+        n_envs=env.n_envs,
+        backend=env.backend,
+        wait_for=env.wait_for,
+        device=devices.named(arguments.device, "--device"),
+        steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
+        minutes=arguments.minutes,
+        success_threshold=arguments.success_threshold,
+        video_every=arguments.video_every,
+        evaluate_every=arguments.evaluate_every or base.evaluate_every,
+        evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
+        checkpoint_minutes=arguments.checkpoint_minutes or None,
+        log=logs,
+    )
