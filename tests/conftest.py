@@ -50,7 +50,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Collects garbage less often, and not among what was imported. It took a sixth of the time: JAX keeps many objects."""
+    """Collects garbage less often, and not among what was imported, because JAX keeps many objects."""
     gc.freeze()
     gc.set_threshold(50_000, 10, 10)
 
