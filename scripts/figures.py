@@ -382,7 +382,7 @@ def lunar_lander() -> str:
 
 
 def size() -> str:
-    """The structure of the package before and after its restructuring, from ``scripts/structure.py --json``."""
+    """The structure of the package before its restructuring and now, from ``scripts/structure.py --json``."""
     before, after = load("structure/before.json"), load("structure/after.json")
     names = {
         "lines": "lines in `src`",
@@ -408,7 +408,7 @@ def size() -> str:
     for package in packages:
         lines = (data["lines_by_package"].get(package) for data in (before, after))
         rows.append((f"lines in {package}", *("" if n is None else f"{n:,}" for n in lines)))
-    return table(("", "before", "after"), rows)
+    return table(("", "before", "now"), rows)
 
 
 BLOCKS: dict[str, Callable[..., str]] = {
