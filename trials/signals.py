@@ -135,6 +135,8 @@ def main() -> None:
     parser.add_argument("--signals", type=int, default=48)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the runs would inherit that it is ignored, as under nohup
     rng = random.Random(arguments.seed)
     lengths = []
     for number in range(2):  # the first run fills the compilation cache

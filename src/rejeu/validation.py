@@ -25,9 +25,8 @@ def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     """
     good = isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value) and value == int(value)
     if not good or not least <= value <= most:
-        raise ValueError(
-            f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * (most < 2**63 - 1)
-        )
+        named = most < 2**62 or (good and value > most)  # a limit that nobody reaches is named to those who exceed it
+        raise ValueError(f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * named)
     return int(value)
 
 

@@ -66,6 +66,7 @@ class Ring:
         self.obs_leaves, self.obs_structure = obs_leaves, obs_structure
         self.rows = max(capacity // n_envs, 2, 0 if frame_stack is None else frame_stack + 1)
         self.stacked = stacked_leaves(obs_leaves, frame_stack)
+        self._names = [f"obs.{i}" for i in range(len(obs_leaves))]
         kept = {*counters, *(() if frame_stack is None else ("since_start",))}
         self.counters = tuple(name for name in COUNTERS if name in kept)
         """Which of ``COUNTERS`` are kept."""
@@ -201,11 +202,8 @@ class Ring:
         """
         records = self.records.take(index)
         frames: Any = None if self.frame_stack is None else self._frames(index, records["since_start"])
-        obs = [
-            leaf.take(frames, axis=0) if stacked else records[f"obs.{i}"]
-            for i, (leaf, stacked) in enumerate(zip(self.obs, self.stacked, strict=True))
-        ]
-        return records, obs
+        kinds = zip(self.obs, self.stacked, self._names, strict=True)
+        return records, [leaf.take(frames, axis=0) if stacked else records[name] for leaf, stacked, name in kinds]
 
     def read_leaf(self, leaf: int, index: np.ndarray) -> np.ndarray:
         """Returns one observation leaf, which is no stack, of the rows at positions ``index``; see :meth:`read`."""
