@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import rejeu
-from rejeu import interrupt
+from rejeu import cli, interrupt
 from rejeu.interrupt import Interrupt
 from tests.cli.test_cli import TINY
 
@@ -168,3 +168,18 @@ def test_a_film_made_while_training_is_completed_after_a_signal(tmp_path):
         path = rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
     assert training.requested
     assert [*tmp_path.iterdir()] == [path]
+
+
+def test_a_command_that_a_signal_ended_ignores_further_ones(monkeypatch):
+    """While Python shuts down it restores the default handlers, so a second signal would change the exit status."""
+    monkeypatch.setattr(interrupt, "is_command", lambda: True)
+    monkeypatch.setattr(cli, "run_command", lambda argv: argv[0])
+    before = {number: signal.getsignal(number) for number in interrupt.NAMES}
+    try:
+        for status in (0, 2):
+            assert cli.main([status]) == status
+            assert all(signal.getsignal(number) is not signal.SIG_IGN for number in before)
+        assert cli.main([143]) == 143
+        assert all(signal.getsignal(number) is signal.SIG_IGN for number in before)
+    finally:
+        interrupt.restore(before)

@@ -23,7 +23,7 @@ HANGUP: int | None = getattr(signal, "SIGHUP", None)
 """The signal of a closed terminal; None on Windows."""
 NAMES: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 NAMES |= {} if HANGUP is None else {HANGUP: "SIGHUP"}
-Handler = Callable[[int, FrameType | None], Any]
+Handler = Callable[[int, FrameType | None], Any] | signal.Handlers
 
 unfinished: set[Path] = set()
 """Temporary files, which :func:`leave` removes."""
@@ -134,6 +134,15 @@ def leave(number: int, text: str = "interrupted") -> NoReturn:
     with suppress(OSError):  # the reader may have closed the pipe
         os.write(2, show_cursor + f"rejeu: {text}\n".encode(errors="replace"))
     os._exit(128 + number)
+
+
+def ignore() -> None:
+    """Ignores further signals in the command ``rejeu``, which a signal has ended; otherwise does nothing.
+
+    While Python shuts down it restores the default handlers, with which a second signal would change the exit status.
+    """
+    if is_command():
+        install(signal.SIG_IGN)
 
 
 def is_command() -> bool:

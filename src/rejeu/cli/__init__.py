@@ -54,7 +54,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     with interrupt.leaving(), supervised.by_parent(), warnings.catch_warnings():
         warnings.showwarning = show_warning
-        return run_command(argv)
+        status = run_command(argv)
+    if status in (128 + number for number in interrupt.NAMES):
+        interrupt.ignore()
+    return status
 
 
 def run_command(argv: Sequence[str]) -> int:
