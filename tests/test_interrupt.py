@@ -126,6 +126,21 @@ def test_importing_the_package_elsewhere_leaves_signals_alone():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize(
+    ("program", "is_command"),
+    [
+        ("/usr/bin/rejeu", True),
+        ("Scripts/rejeu.exe", True),
+        (str(SOURCE.parent / "__main__.py"), True),  # python -m rejeu, once it runs
+        ("train.py", False),
+        ("other/__main__.py", False),
+    ],
+)
+def test_the_command_is_known_by_the_program_that_runs(program, is_command, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [program, "list"])
+    assert interrupt.is_command() == is_command
+
+
 def test_a_signal_after_training_ends_the_command_with_its_status_and_keeps_the_models(tmp_path):
     script = """if True:
         import os, signal, sys

@@ -151,7 +151,8 @@ def is_command() -> bool:
         return False
     if sys.argv[0] == "-m":  # Python has not found the module yet; its name is the word before the arguments
         return sys.orig_argv[-len(sys.argv)].removeprefix("-m") == "rejeu"
-    return Path(sys.argv[0]).name.lower() in ("rejeu", "rejeu.exe", "rejeu-script.py")
+    path = Path(sys.argv[0])
+    return path.name.lower() in ("rejeu", "rejeu.exe", "rejeu-script.py") or path.parts[-2:] == ("rejeu", "__main__.py")
 
 
 def guard_imports() -> None:
