@@ -24,6 +24,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from provenance import provenance
+
 RESULT = Path(__file__).parent / "results" / "resume.json"
 STEPS = 1200
 OFF_POLICY = {"learning_starts": 100, "batch_size": 32, "buffer_size": 700}
@@ -216,9 +218,8 @@ def main() -> None:
             continue
         results.append(try_case(*case, cut))
         print(json.dumps(results[-1]), flush=True)
-    content: dict[str, Any] = {"command": "python trials/resume.py", "steps": STEPS, "cases": results}
+    content: dict[str, Any] = {**provenance({str(arguments.sb3_python): "PATH"}), "steps": STEPS, "cases": results}
     if arguments.sb3_python:
-        content["command"] += " --sb3-python SB3_PYTHON"
         done = subprocess.run(
             [arguments.sb3_python, __file__, "--sb3", "--seed", str(arguments.seed)],
             capture_output=True, text=True, check=False,
