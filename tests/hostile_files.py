@@ -473,7 +473,8 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
 
     arrays = take_apart(content).arrays
     for kind in ("observation_space", "action_space"):
-        for i, value in enumerate((None, [], {}, 3, "x", {"Box": {}}, {"Box": None}, {"Text": 3}, *LARGE_SPACES)):
+        values = (None, [], {}, 3, "x", {"Box": {}}, {"Box": None}, {"Text": 3}, {"Dict": {}}, {"Tuple": []})
+        for i, value in enumerate((*values, *LARGE_SPACES)):
             yield of(f"{kind} {i}", lambda h, a, k=kind, v=value: h.update({k: v}))
         yield of(f"{kind} gone", lambda h, a, k=kind: h.pop(k))
         yield of(f"{kind} of another", lambda h, a, k=kind: h.update({k: {"MultiBinary": {"shape": [7]}}}))

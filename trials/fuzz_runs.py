@@ -255,7 +255,7 @@ def share_compiled() -> None:
         key = json.dumps([self.name, configs.to_json(self.config), described])
         if key in kept:
             self.observation_space, self.action_space = observation_space, action_space
-            self._obs_leaves, self.learner = spaces.leaves(observation_space), copy.copy(kept[key])
+            self.obs_leaves, self.learner = spaces.leaves(observation_space), copy.copy(kept[key])
             return
         if len(kept) > 200:
             kept.clear()

@@ -78,7 +78,7 @@ class OffPolicyAgent(Agent):
             self.run.replay.restore(arrays)
         except CheckpointError:
             raise
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: {brief(error)}") from None
         self.run.learn_from = self.config.learning_starts
         self.run.td_errors = []  # of transitions that are gone
