@@ -176,7 +176,7 @@ class Runs:
             try:
                 self.learn_on(agent)
             except CheckpointError as error:
-                if "remembered" in str(error):  # callbacks validate their own state once they are given
+                if "the saved state of" in str(error):  # callbacks validate their own state once they are given
                     raise
                 raise AssertionError(f"it was resumed, but: {error}") from error
             except (NonFiniteError, BadEnvironmentError):
