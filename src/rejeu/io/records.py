@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections import Counter
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -71,6 +72,20 @@ def parse_json(text: str | bytes) -> Any:
         raise Malformed("it is nested too deeply") from None
     except ValueError as error:
         raise Malformed(f"it is not valid JSON: {str(error)[:80]}") from None
+
+
+def read_json(path: Path, most: int) -> Any:
+    """Returns the value of a JSON file of at most ``most`` bytes.
+
+    Raises:
+        Malformed: if the file is longer, or no valid document.
+        OSError: if it cannot be read.
+    """
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise Malformed(f"it has more than {most:,} bytes")
+    return parse_json(data)
 
 
 def convert(value: Any, kind: type[T]) -> T:

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import EnvCount, Malformed, Positive, convert, parse_json, shown
+from rejeu.io.records import EnvCount, Malformed, Positive, convert, read_json, shown
 from rejeu.presets.preset import Preset
 
 MAX_BYTES = 2**20
@@ -62,11 +62,7 @@ def read(path: str | Path) -> Preset:
     if not path.is_file():
         raise FileNotFoundError(f"there is no preset file {path}; rejeu tune writes one as preset.json")
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
-        content = convert(parse_json(data), Content)
+        content = convert(read_json(path, MAX_BYTES), Content)
         return Preset(**{one.name: getattr(content, one.name) for one in dataclasses.fields(Content)})
     except (Malformed, CheckpointError) as error:
         raise CheckpointError(f"{path} is no preset: {shown(error, 1000)}") from None

@@ -34,6 +34,7 @@ from rejeu.agents.run_files import run_files, step_of
 from rejeu.errors import RunInUseError
 from rejeu.interrupt import Interrupt
 from rejeu.io import atomic
+from rejeu.io.records import read_json
 from rejeu.reporting.runs import EVALUATIONS
 from rejeu.reporting.tables import read_table
 from rejeu.sweeps.process import Process, last_line
@@ -115,7 +116,7 @@ class Members:
         """Copies checkpoints between members as decided; what was copied before an interruption is not copied again."""
         for member, decision in enumerate(self.decisions(number)):
             marker = self.run(member).with_name("copied.json")
-            if decision.parent is None or (marker.is_file() and populations.parse(marker) == number):
+            if decision.parent is None or (marker.is_file() and read_json(marker, populations.MAX_BYTES) == number):
                 continue
             source, target = (self.run(one) / "checkpoints" for one in (decision.parent, member))
             copied = target.with_name("checkpoints.copied")

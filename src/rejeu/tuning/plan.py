@@ -18,7 +18,7 @@ from rejeu.algorithms import config as configs
 from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import EnvCount, Malformed, Positive, Seed, convert, parse_json, shown
+from rejeu.io.records import EnvCount, Positive, Seed, convert, read_json, shown
 from rejeu.presets import Preset
 from rejeu.tuning import space as spaces
 
@@ -286,11 +286,7 @@ def read(path: Path) -> Plan:
     if not path.is_file():
         raise FileNotFoundError(f"{path.parent} is no study folder: it holds no {path.name}")
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
-        plan = convert(parse_json(data), Plan)
+        plan = convert(read_json(path, MAX_BYTES), Plan)
         check(plan, path)
         return plan
     except (ValueError, TypeError) as error:

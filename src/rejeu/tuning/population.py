@@ -21,7 +21,7 @@ from msgspec import Meta
 from rejeu.algorithms.search import FIXED_AT_START, Choice, Dimension, NearOne, SearchSpace, Uniform
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import Count, Malformed, convert, parse_json, shown
+from rejeu.io.records import Count, Malformed, convert, read_json, shown
 from rejeu.tuning import plan as plans, space as spaces
 from rejeu.tuning.plan import Plan
 
@@ -182,7 +182,7 @@ def read(path: Path) -> Population:
     if not path.is_file():
         raise FileNotFoundError(f"{path.parent} is no folder of rejeu pbt: it holds no {path.name}")
     try:
-        found = convert(parse(path), Population)
+        found = convert(read_json(path, MAX_BYTES), Population)
         plans.check(found.plan, path)
         return found
     except (ValueError, TypeError) as error:
@@ -196,7 +196,7 @@ def read_decisions(path: Path, population: Population) -> list[Decision]:
         CheckpointError: if it is damaged.
     """
     try:
-        found = convert(parse(path), list[Decision])
+        found = convert(read_json(path, MAX_BYTES), list[Decision])
         space = population.plan.search_space
         if len(found) != population.members:
             raise Malformed(f"it has {len(found)} members instead of {population.members}")
@@ -209,15 +209,6 @@ def read_decisions(path: Path, population: Population) -> list[Decision]:
         return found
     except (ValueError, TypeError) as error:
         raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
-
-
-def parse(path: Path) -> Any:
-    """Returns the JSON value of a file of limited size."""
-    with path.open("rb") as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
-    return parse_json(data)
 
 
 def hyperparameters(population: Population, values: Mapping[str, Any]) -> dict[str, Any]:
