@@ -23,9 +23,9 @@ from statistics import median
 from gymnasium.vector.utils import batch_space
 
 import rejeu
-from rejeu.cli.run_folder import versions
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import auto_backend
+from rejeu.runs.config import versions
 from rejeu.xla import cores
 
 RESULT = Path(__file__).parent / "results" / "backends.json"

@@ -22,7 +22,7 @@ import rejeu
 from rejeu import presets, validation
 from rejeu.algorithms import config as configs
 from rejeu.envs import make_vector
-from rejeu.reporting.plots import style
+from rejeu.reporting.plots import drawing as style
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, PICTURES = ROOT / "benchmarks" / "results", ROOT / "docs" / "images" / "curves"

@@ -79,10 +79,7 @@ SCALED = ("ppo", "parking", "parking, 1 update in 16 steps")
 
 
 def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
-    """Returns one measurement; ``kind`` is ``device``, ``host`` (the peer) or ``host jax`` (the host's loop in JAX).
-
-    Several seeds on the host are those of ``train_seeds``, whose environments are Gymnasium's.
-    """
+    """Returns one measurement; ``kind`` is ``device``, ``host`` (the peer) or ``host jax`` (the host's loop in JAX)."""
     import jax
 
     import rejeu
@@ -110,7 +107,7 @@ def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> di
         train_seeds(
             algorithm,
             policy,
-            case.peer if kind == "host" else case.env,
+            case.env,
             10**9,
             seeds=n_seeds,
             n_envs=n_envs,
@@ -154,9 +151,6 @@ def plan(cases: list[str], seeds: list[int], envs: list[int]) -> list[tuple[str,
         case = CASES[name]
         found += [(name, kind, case.n_envs, 1) for kind in ("device", "host", "host jax")]
         found += [(name, "device", case.n_envs, n) for n in seeds if n > 1 and name in SEEDED]
-        found += [
-            (name, "host", case.n_envs, n) for n in seeds if 1 < n <= 8 and name in SEEDED and case.algorithm != "PPO"
-        ]
         found += [(name, "device", n, 1) for n in envs if n != case.n_envs and name in SCALED]
     return found
 

@@ -30,8 +30,8 @@ import numpy as np
 import rejeu
 from benchmarks.remote import commit
 from rejeu import presets
-from rejeu.cli.run_folder import versions
 from rejeu.reporting import statistics
+from rejeu.runs.config import versions
 from rejeu.xla import cores
 
 RESULT = Path(__file__).parent / "results" / "first_of_n.json"

@@ -27,11 +27,11 @@ import gymnasium as gym
 import jax
 import jax.numpy as jnp
 
-from rejeu.cli.run_folder import versions
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.functional import FunctionalEnv, make
 from rejeu.envs.functional.vector import VectorState, reset_all, reset_done, step_all
 from rejeu.envs.make import make_vector
+from rejeu.runs.config import versions
 from rejeu.xla import cores
 
 RESULT = Path(__file__).parent / "results" / "functional.json"

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import rejeu  # noqa: E402
-from rejeu.reporting.plots import style  # noqa: E402
+from rejeu.reporting.plots import drawing as style  # noqa: E402
 from tests.bit_flipping import BitFlipping  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "bit_flipping.json"

@@ -42,7 +42,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     )
     callback = None
     if arguments.best:
-        test_env = make_vector(preset.env_id, 10, backend, seed + 2_000_000, **arguments.env)
+        test_env = make_vector(preset.env_id, 10, backend, 2_000_000 + 100 * seed, **arguments.env)
         callback = Evaluate(test_env, preset.evaluate_every, preset.evaluate_episodes)
     if arguments.minutes:
         agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60, callback=callback)
@@ -60,7 +60,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         )
     if arguments.best:
         agent.restore_best()
-    evaluation_env = make_vector(preset.env_id, 10, backend, seed + 1_000_000, **arguments.env)
+    evaluation_env = make_vector(preset.env_id, 10, backend, 1_000_000 + 100 * seed, **arguments.env)
     evaluation = agent.evaluate(arguments.episodes, env=evaluation_env)
     return {
         "seed": seed,

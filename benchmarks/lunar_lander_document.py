@@ -74,7 +74,7 @@ def child(variant: str, seed: int) -> None:
     agent = rejeu.PPO("MlpPolicy", env, seed=seed, **settings).learn(**budget)
     seconds = time.perf_counter() - began
     last = [episode["r"] for episode in agent.ep_info_buffer][-LAST:]
-    evaluation = agent.evaluate(100, env=rejeu.make_vector(ENV, 10, "envpool", seed=seed + 1_000_000))
+    evaluation = agent.evaluate(100, env=rejeu.make_vector(ENV, 10, "envpool", seed=1_000_000 + 100 * seed))
     print(
         json.dumps(
             {

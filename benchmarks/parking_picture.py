@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import rejeu
 from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env
-from rejeu.reporting.video import rgb_frame
+from rejeu.envs.rendering import rgb_frame
 
 MOMENTS = 4
 

@@ -31,7 +31,7 @@ import rejeu
 from rejeu import presets, xla
 from rejeu.algorithms import config as configs
 from rejeu.callbacks import Evaluate
-from rejeu.cli.run_folder import versions
+from rejeu.runs.config import versions
 
 RESULT = Path(__file__).parent / "results" / "parking_transfer.json"
 TRAINED = "jax/Parking-v0"

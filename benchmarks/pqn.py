@@ -63,7 +63,7 @@ def child(seed: int, every: int, episodes: int, target: float) -> dict[str, Any]
 
     import rejeu
     from rejeu import presets, xla
-    from rejeu.cli.run_folder import versions
+    from rejeu.runs.config import versions
 
     preset = presets.find(ENV, "PQN")
     assert preset is not None

@@ -28,7 +28,7 @@ import numpy as np
 
 import rejeu
 from rejeu import cluster
-from rejeu.cli.run_folder import versions
+from rejeu.runs.config import versions
 from rejeu.xla import cores
 
 ROOT = Path(__file__).parents[1]

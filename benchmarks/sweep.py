@@ -28,7 +28,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rejeu.sweeps.processes import environment
+from rejeu.experiments.process import environment
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "sweep.json"

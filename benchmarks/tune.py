@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import rejeu
-from rejeu.tuning import study as studies
-from rejeu.tuning.study import Outcome, StudyFolder
+from rejeu.experiments import study as studies
+from rejeu.experiments.study import Outcome, StudyFolder
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "tune.json"

@@ -13,6 +13,7 @@ from typing import Any
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
+from sphinx.search.en import SearchEnglish
 from sphinx.util import logging
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -24,6 +25,7 @@ import source_links  # noqa: E402
 import rejeu  # noqa: E402
 
 project, author, release = "rejeu", "the rejeu authors", rejeu.__version__
+copyright = f"2026, {author}"  # noqa: A001
 html_title = f"rejeu {release}"
 extensions = [
     "myst_nb",
@@ -59,6 +61,12 @@ html_theme_options = {"source_repository": source_links.base(), "source_branch":
 linkcheck_ignore = [re.escape(source_links.base()) + "/(blob|tree)/.*"]  # resolved from the files here
 
 logger = logging.getLogger(__name__)
+
+
+class English(SearchEnglish):
+    """The search of the site, which finds HER too: "her" is a stop word of English."""
+
+    stopwords = SearchEnglish.stopwords - {"her"}
 
 
 def contents(index: str) -> str:
@@ -145,7 +153,8 @@ def restore_attribute(app: Sphinx, what: str, name: str, found: Any, options: An
 
 
 def setup(app: Sphinx) -> None:
-    """Connects the functions above."""
+    """Connects what is defined above."""
+    app.add_search_language(English)
     app.connect("autodoc-process-docstring", keep_attribute, priority=400)
     app.connect("autodoc-process-docstring", restore_attribute, priority=600)  # Napoleon has 500
     app.connect("source-read", read_page)

@@ -21,7 +21,7 @@ from jax import Array
 import rejeu
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.core import AVERAGED, TD_ERROR, PyTree, copy, descend, ensemble, polyak, weighted_mean
+from rejeu.core import AVERAGED, TD_ERROR, PyTree, copy, descend, ensemble, minimize, polyak, weighted_mean
 from rejeu.distributions import Normal
 from rejeu.networks import Network, QNetwork, action_values
 from rejeu.presets import Preset
@@ -65,7 +65,8 @@ class State(eqx.Module):
 
 def make(config: Config, observation_space, action_space) -> rejeu.Algorithm:
     size = action_dimension(check_box_action(action_space, "AWAC"))
-    inputs, shape, optimizer = leaves(observation_space), config.policy_kwargs, optimizers.make(config.optimizer)
+    inputs, shape = leaves(observation_space), config.policy_kwargs
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)  # and limits the norm of gradients
 
     def init(key: Array) -> State:
         actor_key, q_key, update_key = jax.random.split(key, 3)
@@ -78,15 +79,14 @@ def make(config: Config, observation_space, action_space) -> rejeu.Algorithm:
         target_key, actor_key = jax.random.split(jax.random.fold_in(state.key, state.n_updates))
         rate = at(config.learning_rate, clock.progress)
         target = td_target(state.actor, state.target_critics, batch, target_key)
-        grad = jax.value_and_grad(critics_loss, has_aux=True)
-        (critic_loss, values), gradients = grad(state.critics, batch, target)
-        critics, critics_optimizer = descend(state.critics, gradients, state.critics_optimizer, optimizer, rate)
+        critics, critics_optimizer, critic_loss, values = minimize(
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+        )
         loss, gradients = jax.value_and_grad(actor_loss)(state.actor, critics, batch, config.beta, actor_key)
         actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
-        target_critics = polyak(state.target_critics, critics, config.tau)
         td_error = jnp.mean(jnp.abs(values - target[None]), axis=0)
         metrics = {"critic_loss": critic_loss, "actor_loss": loss, "q_value": jnp.mean(values), TD_ERROR: td_error}
-        learned = actor, critics, target_critics, actor_optimizer, critics_optimizer
+        learned = actor, critics, polyak(state.target_critics, critics, config.tau), actor_optimizer, critics_optimizer
         return State(*learned, state.key, state.n_updates + 1), metrics
 
     return rejeu.Algorithm(init, lambda state: state.actor, Policy.sample, lambda actor, obs: actor(obs).mode(), update)

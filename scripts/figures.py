@@ -15,6 +15,7 @@ import json
 import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,21 +27,32 @@ from gymnasium import spaces
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
-from benchmarks import tables  # noqa: E402
 from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
 from benchmarks.bench.text import table, times  # noqa: E402
 from rejeu import presets, validation  # noqa: E402
 from rejeu.agents import AGENTS  # noqa: E402
+from rejeu.algorithms import ppo  # noqa: E402
+from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
+from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
+from rejeu.algorithms.rollout_config import RolloutConfig  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
 from rejeu.presets.result import Result  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
-TRIALS = ROOT / "trials" / "results"
 PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *(page for name in ("benchmarks", "docs", "trials") for page in sorted((ROOT / name).rglob("*.md"))),
+]
 BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 CURVE_WINDOW = 20
 """Episodes over which ``benchmarks/curves.py`` averages."""
+SHARED = (
+    (ppo.Config, "ppo.md#hyperparameters"),
+    (OffPolicyConfig, "../hyperparameters.md#off-policy-algorithms"),
+    (RolloutConfig, "../hyperparameters.md#on-policy-algorithms"),
+)
+"""Configurations from which others are derived, and where their hyperparameters are explained."""
 JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
 
@@ -63,8 +75,10 @@ def result_of(data: dict[str, Any]) -> Result:
     words = shlex.split(data["command"])
     runs = data["runs"]
     env_id, algorithm = (words[2], words[3]) if words[0] == "python" else (words[2], "SAC")
+    twin, env_id = env_id, presets.TWINS.get(env_id, env_id)
     options = {word: words[i + 1] for i, word in enumerate(words[:-1]) if word.startswith("--")}
     settings = ["best weights"] if "--best" in words else []
+    settings += [f"in {twin}"] if twin != env_id else []
     settings += [f"sigma={v:g}" for k, v in json.loads(options.get("--env", "{}")).items() if k == "sigma"]
     is_success = env_id in JUDGED_BY_SUCCESS
     values = [run["success_rate" if is_success else "mean_return"] for run in runs]
@@ -113,10 +127,9 @@ def results(*algorithms: str) -> str:
                     published(result),
                     str(result.seeds),
                     time_of(result),
-                    f"`{result.command}`",
                 )
             )
-    header = ("environment", "trained for", "result", "published", "seeds", "time for each seed", "command")
+    header = ("environment", "trained for", "result", "published", "seeds", "time for each seed")
     return table(header, rows)
 
 
@@ -127,20 +140,50 @@ def curve(algorithm: str) -> str:
     return (
         f"The last {CURVE_WINDOW} training episodes of the {len(last)} seeds have a mean return of "
         f"{sum(last) / len(last):.1f} ({min(last):.1f} to\n{max(last):.1f}) on {data['env'].removeprefix('rejeu/')} after "
-        f"{data['steps'][-1]:,} steps (`{data['command']}`)."
+        f"{data['steps'][-1]:,} steps."
     )
 
 
 def hyperparameters(algorithm: str) -> str:
-    """Every hyperparameter of an algorithm with its default and meaning, those of its own class first."""
+    """The hyperparameters of an algorithm with defaults and meanings, and the defaults of those that it shares with others."""
     config = AGENTS[algorithm].algorithm.Config
-    docs, defaults = validation.field_docs(config), validation.field_defaults(config)
-    names = dict.fromkeys(name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()))
-    rows = []
-    for name in (name for name in names if name in defaults):
-        default = "" if dataclasses.is_dataclass(defaults[name]) else f"`{defaults[name]!r}`"
-        rows.append((f"`{name}`", default, docs[name].replace("``", "`").replace("|", "\\|")))
+    base, link = next((base, link) for base, link in SHARED if issubclass(config, base) and config is not base)
+    docs, known, defaults = (
+        validation.field_docs(config),
+        validation.field_docs(base),
+        validation.field_defaults(config),
+    )
+    shared = [name for name in docs if docs[name] == known.get(name)]
+    values = {name: shown(defaults[name]) for name in shared}
+    listed = ", ".join(f"`{name}={value}`" if value else f"`{name}`" for name, value in values.items())
+    where = "of PPO" if base is ppo.Config else f"of all {link.partition('#')[2].replace('-algorithms', ' algorithms')}"
+    rest = textwrap.fill(f"Those [{where}]({link}), with the defaults {listed}.", 135, break_on_hyphens=False)
+    names = [name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()) if name in docs]
+    own = [name for name in dict.fromkeys(names) if name not in shared]
+    return f"{meanings(own, docs, defaults)}\n\n{rest}" if own else rest
+
+
+def shared_hyperparameters(kind: str) -> str:
+    """The hyperparameters that all off-policy or all on-policy algorithms have."""
+    config = {"off-policy": OffPolicyConfig, "on-policy": OnPolicyConfig}[kind]
+    docs = validation.field_docs(config)
+    return meanings(list(docs), docs, None)
+
+
+def meanings(names: list[str], docs: dict[str, str], defaults: dict[str, Any] | None) -> str:
+    """A table of hyperparameters, with their defaults if there are any."""
+    cells = {name: docs[name].replace("``", "`").replace("|", "\\|") for name in names}
+    if defaults is None:
+        return table(("hyperparameter", "meaning"), [(f"`{name}`", text) for name, text in cells.items()])
+    rows = [
+        (f"`{name}`", f"`{shown(defaults[name])}`" * bool(shown(defaults[name])), text) for name, text in cells.items()
+    ]
     return table(("hyperparameter", "default", "meaning"), rows)
+
+
+def shown(default: Any) -> str:
+    """A default value; nothing for the settings of networks, which are a configuration of their own."""
+    return "" if dataclasses.is_dataclass(default) else repr(default)
 
 
 def supported(algorithm: str) -> str:
@@ -278,67 +321,6 @@ def speed() -> str:
     return table(("training steps per second", "vs. Stable-Baselines3", "vs. SBX"), rows)
 
 
-def backends() -> str:
-    """Steps per second of each backend."""
-    names = ("envpool", "gymnasium", "gymnasium-async")
-    rows = []
-    for entry in load("backends.json")["results"]:
-        rates = [entry["steps_per_second"].get(name) for name in names]
-        rows.append(
-            (f"`{entry['env']}`", str(entry["n_envs"]), *("" if rate is None else f"{rate:,.0f}" for rate in rates))
-        )
-    return table(("environment", "`n_envs`", *(f"`{name}`" for name in names)), rows)
-
-
-def functional_equality() -> str:
-    """Largest differences between the environments in JAX and those that they reproduce."""
-    rows = []
-    for row in load("functional_equality.json")["results"]:
-        double, single = row["float64"], row["float32"]
-        cells = (
-            f"{found[key]:.0e}" if found[key] else "0" for found in (double, single) for key in ("state", "reward")
-        )
-        wrong = double["n_terminated"] + single["n_terminated"]
-        rows.append(
-            (f"`{row['env']}`", row["peer"], f"{row['steps']:,}", f"{row['n_terminated']:,}", *cells, str(wrong))
-        )
-    header = (
-        "environment",
-        "compared with",
-        "steps",
-        "terminal",
-        "state, float64",
-        "reward, float64",
-        "state, float32",
-        "reward, float32",
-        "wrong ends",
-    )
-    return table(header, rows)
-
-
-def functional_unstable() -> str:
-    """The steps of parking that are left out of the comparison."""
-    row = next(row for row in load("functional_equality.json")["results"] if "unstable" in row)
-    found = row["unstable"]
-    return (
-        f"{found['n']} of the {row['n_crashes']:,} steps with a crash, in which the final position differs by up to "
-        f"{found['position']:.1f} m and\nthe reward by up to {found['reward']:.2f}."
-    )
-
-
-def overlap() -> str:
-    """Learning with and without the overlap of environments and updates."""
-    rows = []
-    for case, settings in load("overlap.json").items():
-        if isinstance(settings, dict):
-            cells = (
-                f"{found['mean_return']:.1f} ({found['interval'][0]:.1f} to {found['interval'][1]:.1f})"
-                for found in settings.values()
-            )
-            rows.append((case, *cells))
-    return table(("mean return (95 % CI), 5 seeds", "`overlap=True`", "`overlap=False`"), rows)
-
-
 def mountain_car() -> str:
     """The exercise on MountainCar, one row for each seed."""
     rows = [
@@ -381,65 +363,80 @@ def lunar_lander() -> str:
     return table(header, rows)
 
 
-def size() -> str:
-    """The structure of the package before its restructuring and now, from ``scripts/structure.py --json``."""
-    before, after = load("structure/before.json"), load("structure/after.json")
-    names = {
-        "lines": "lines in `src`",
-        "files": "files",
-        "top_level_modules": "modules at the top level",
-        "files_in_agents": "files in `agents/`",
-        "cycles": "modules in import cycles",
-        "private_accesses": "accesses to private attributes of other objects",
-        "layering_violations": "imports against the order of the layers",
-        "repeated_share_in_algorithms": "lines of `algorithms/` that occur in three or more files, %",
-        "longest_function": "lines of the longest function",
-    }
+def data(path: str, key: str, *columns: str) -> str:
+    """A part of a file of results as it is, with its commit, date and command: a table of rows, or of names and values.
 
-    def count(value: Any) -> str:
-        if isinstance(value, list):
-            value = sum(len(entry) if isinstance(entry, list) else 1 for entry in value)
-        return f"{value:,}"
+    Args:
+        path: the file, from the root of the repository.
+        key: the part, such as ``results`` or ``rejeu/summary``; ``-`` for the whole file.
+        columns: what to show of each row, in the same way; all numbers and words if there are none.
+    """
+    content = load(path, ROOT)
+    part = within(content, key)
+    is_table = isinstance(part, list) or bool(columns)
+    if is_table:
+        found = [("", row) for row in part] if isinstance(part, list) else [*part.items()]
+        rows = [(name, row) for name, row in found if isinstance(row, dict)]
+        named = [("",)] if any(name for name, _ in rows) else []
+        header = [*(("",) if named else ()), *(column.split("/")[-1].replace("_", " ") for column in columns)]
+        cells = [
+            [*((name,) if named else ()), *(cell(within(row, column)) for column in columns)] for name, row in rows
+        ]
+    else:
+        header, cells = (
+            ["", ""],
+            [[name.replace("_", " "), cell(value)] for name, value in part.items() if is_plain(value)],
+        )
+    origin = [
+        content.get("commit", "")[:7],
+        content.get("date", ""),
+        f"`{content['command']}`" if "command" in content else "",
+    ]
+    text = ", ".join(filter(None, origin))
+    return f"{textwrap.fill(text, 135, break_on_hyphens=False)}\n\n{table(header, cells)}".strip()
 
-    rows = [(text, count(before[key]), count(after[key])) for key, text in names.items()]
-    # The layers are in the order of the new layout.
-    rows = [(text, "" if "layers" in text else b, a) for text, b, a in rows]
-    packages = sorted(before["lines_by_package"].keys() | after["lines_by_package"].keys())
-    for package in packages:
-        lines = (data["lines_by_package"].get(package) for data in (before, after))
-        rows.append((f"lines in {package}", *("" if n is None else f"{n:,}" for n in lines)))
-    return table(("", "before", "now"), rows)
+
+def within(content: Any, key: str) -> Any:
+    """Returns what is under a path of keys, None if there is nothing."""
+    for name in key.split("/") if key != "-" else ():
+        content = content.get(name) if isinstance(content, dict) else None
+    return content
+
+
+def is_plain(value: Any) -> bool:
+    """Returns whether a value fits into a cell: a number, a word, or a short list of them."""
+    return not isinstance(value, dict | list) or (
+        isinstance(value, list) and len(value) <= 3 and all(map(is_plain, value))
+    )
+
+
+def cell(value: Any) -> str:
+    """Formats a value of a file of results."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {cell(one)}" for name, one in value.items())
+    if isinstance(value, list):
+        return " to ".join(map(cell, value))
+    return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
 
 
 BLOCKS: dict[str, Callable[..., str]] = {
+    "data": data,
     "results": results,
     "curve": curve,
     "hyperparameters": hyperparameters,
+    "shared-hyperparameters": shared_hyperparameters,
     "supported": supported,
     "presets": training_times,
     "bit-flipping": bit_flipping,
     "ball": ball,
     "parking": parking,
     "speed": speed,
-    "backends": backends,
-    "functional": lambda: tables.functional(load("functional.json")),
-    "functional-equality": functional_equality,
-    "functional-unstable": functional_unstable,
     "mountain-car": mountain_car,
-    "overlap": overlap,
     "lunar-lander": lunar_lander,
-    "size": size,
-    "device": lambda name="device": tables.device_loops(load(f"{name}.json")),
-    "device-seeds": lambda name="device": tables.device_seeds(load(f"{name}.json")),
-    "device-peers": lambda: tables.peers(load("device_peers.json")),
-    "device-replay": lambda: tables.device_replay(load("device_replay.json")),
-    "parking-transfer": lambda: tables.transfer(load("parking_transfer.json")),
-    "sweep": lambda: tables.sweep(load("sweep.json")),
-    "sweep-kills": lambda name="sweep_kills": tables.sweep_kills(load(f"{name}.json", TRIALS)),
-    "pqn": lambda: tables.pqn(load("pqn.json")),
-    "remote": lambda: tables.remote(load("remote.json")),
-    "first-of-n": lambda: tables.first_of_n(load("first_of_n.json")),
-    "tune": lambda: tables.tune(load("tune.json")),
 }
 
 
@@ -447,7 +444,7 @@ def render(text: str) -> str:
     """Returns a page with every marked block regenerated; a block whose data does not exist yet is empty."""
 
     def block(match: re.Match[str]) -> str:
-        name, *arguments = match[2].split()
+        name, *arguments = shlex.split(match[2])
         try:
             return f"{match[1]}{BLOCKS[name](*arguments)}\n{match[3]}"
         except FileNotFoundError:

@@ -1,9 +1,11 @@
-"""Counts what one must read to follow four paths through the package, and verifies the lists in ``docs/design.md``.
+"""Counts everything that is called on four paths through the package, and compares it with ``docs/design.md``.
 
-The section "One transition" of that page lists definitions by file, one path under each heading such as
-``### SAC (5 files, 600 lines)``, and the leaf helpers, which need not be read, under ``### Leaf helpers``. This script
-counts files and lines, runs real steps of each path under a profiler, and fails if a function that they call is in no list,
-if a listed definition does not exist, or if a total exceeds its target. A target marked ``not reached yet`` is printed only.
+    python scripts/paths.py
+    python scripts/paths.py --write
+
+Real steps of each path run under a profiler. Each function of the package that is called counts with all its lines, and with
+the functions inside it, except those of ``EXEMPT``, which every path shares. Exits with status 1 if a path has more files or
+lines than the page says, or more than the page allows. ``--write`` puts what was measured into the page.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -28,19 +30,16 @@ from rejeu.loops.on_policy import on_policy
 
 PACKAGE = Path(rejeu.__file__).parent
 DESIGN = PACKAGE.parent.parent / "docs" / "design.md"
-HEADING = re.compile(r"^### (.+?) \((\d+) files, (\d+) lines(, not reached yet)?\)$")
-ENTRY = re.compile(r"^- `([\w/]+\.py)`: (.+)$")
-LEAF = re.compile(r"^- `([\w/]+(?:\.py|/))`(?: in ([\w ]+))?: .+")
+EXEMPT = ("core.py", "networks/", "spaces.py", "distributions.py", "prng.py")
+"""The vocabulary of the package: types, layers, spaces, distributions and random keys."""
+TABLE = re.compile(r"(<!-- paths -->\n)(.*?)(<!-- end of paths -->)", re.DOTALL)
+ROW = re.compile(r"^\| ([^|]+?) \| (\d+) \| ([\d,]+) \| (\d+) \| ([\d,]+) \|$", re.MULTILINE)
+"""Path, files and lines, and the most of each."""
+LISTED = ("SAC", "PPO", "HER")
+"""Paths whose functions the page lists, in the order in which they are called first."""
+Called = dict[tuple[str, str], None]
+"""Files and outermost names of functions, in the order of their first calls."""
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
-
-
-class Listed(NamedTuple):
-    """A path as listed on the page."""
-
-    files: dict[str, list[str]]
-    most_files: int
-    most_lines: int
-    is_enforced: bool
 
 
 class Reached(BaseException):
@@ -75,7 +74,7 @@ class Reach(gym.Env):
 
 
 @contextmanager
-def tracing(called: set[tuple[str, str]], until: Callable[..., Any] | None = None) -> Iterator[None]:
+def tracing(called: Called, until: Callable[..., Any] | None = None) -> Iterator[None]:
     """Adds the file and the outermost name of every function of the package that is called."""
     prefix = str(PACKAGE)
 
@@ -87,7 +86,7 @@ def tracing(called: set[tuple[str, str]], until: Callable[..., Any] | None = Non
                 raise Reached
             name = code.co_qualname.partition(".<")[0]
             if code.co_flags & inspect.CO_NEWLOCALS and not name.startswith("<"):  # not the body of a class
-                called.add((Path(code.co_filename).relative_to(PACKAGE).as_posix(), name))
+                called.setdefault((Path(code.co_filename).relative_to(PACKAGE).as_posix(), name))
 
     sys.setprofile(trace)
     try:
@@ -96,44 +95,44 @@ def tracing(called: set[tuple[str, str]], until: Callable[..., Any] | None = Non
         sys.setprofile(None)
 
 
-def trace_loop(agent: Any, loop: Any, n_turns: int) -> set[tuple[str, str]]:
+def trace_loop(agent: Any, loop: Any, n_turns: int) -> Called:
     """Returns the functions called by some turns of a loop."""
-    called: set[tuple[str, str]] = set()
+    called: Called = {}
     with tracing(called):
         for _ in loop(agent.run, agent.learner, agent.config, n_turns, lambda step: 0.0):
             pass
     return called
 
 
-def trace_sac() -> set[tuple[str, str]]:
+def trace_sac() -> Called:
     """Returns the functions called by turns of SAC: random and policy actions, updates, and the end of an episode."""
     env = gym.make("Pendulum-v1", max_episode_steps=4)
     agent = rejeu.SAC("MlpPolicy", env, learning_starts=4, batch_size=4, **SMALL)
     return trace_loop(agent, off_policy, 10)
 
 
-def trace_ppo() -> set[tuple[str, str]]:
+def trace_ppo() -> Called:
     """Returns the functions called by two rollouts of PPO."""
     env = gym.make("Pendulum-v1", max_episode_steps=3)
     agent = rejeu.PPO("MlpPolicy", env, n_steps=8, batch_size=4, n_epochs=1, **SMALL)
     return trace_loop(agent, on_policy, 17)
 
 
-def trace_her() -> set[tuple[str, str]]:
+def trace_her() -> Called:
     """Returns the functions called by sampling a relabeled batch."""
     buffer = {"replay_buffer_class": "HerReplayBuffer", "learning_starts": 10}
     agent = rejeu.SAC("MultiInputPolicy", Reach(), **buffer, **SMALL)
     agent.learn(9)
-    called: set[tuple[str, str]] = set()
+    called: Called = {}
     with tracing(called):
         for _ in range(2):
             agent.run.replay.draw(agent.run.rng, (8,), 0.0)
     return called
 
 
-def trace_train() -> set[tuple[str, str]]:
+def trace_train() -> Called:
     """Returns the functions called by ``rejeu train`` before the loop starts."""
-    called: set[tuple[str, str]] = set()
+    called: Called = {}
     with tempfile.TemporaryDirectory() as folder:
         words = ["train", "Pendulum-v1", "--algo", "SAC", "--steps", "2", "--out", f"{folder}/run", "--set"]
         with suppress(Reached), redirect_stdout(None), tracing(called, until=off_policy):
@@ -142,24 +141,6 @@ def trace_train() -> set[tuple[str, str]]:
 
 
 TRACES = {"SAC": trace_sac, "PPO": trace_ppo, "HER": trace_her, "rejeu train": trace_train}
-
-
-def read_page(text: str) -> tuple[dict[str, Listed], list[tuple[str, str | None]]]:
-    """Returns the paths by name, and the prefixes of leaf helpers with the path of each (None: all paths)."""
-    paths: dict[str, Listed] = {}
-    leaves: list[tuple[str, str | None]] = []
-    current: Listed | None = None
-    in_leaves = False
-    for line in text.splitlines():
-        if line.startswith("#"):
-            current, in_leaves = None, line == "### Leaf helpers"
-        if heading := HEADING.match(line):
-            current = paths[heading[1]] = Listed({}, int(heading[2]), int(heading[3]), heading[4] is None)
-        elif current is not None and (entry := ENTRY.match(line)):
-            current.files[entry[1]] = re.findall(r"`([\w.]+)`", entry[2])
-        elif in_leaves and (leaf := LEAF.match(line)):
-            leaves.append((leaf[1], leaf[2]))
-    return paths, leaves
 
 
 def lengths(path: Path) -> dict[str, int]:
@@ -178,41 +159,49 @@ def lengths(path: Path) -> dict[str, int]:
     return found
 
 
-def check(name: str, listed: Listed, called: set[tuple[str, str]], leaves: list[tuple[str, str | None]]) -> list[str]:
-    """Prints the totals of a path and returns the errors of its list."""
-    problems, n_lines = [], 0
-    for file, names in listed.files.items():
-        sizes = lengths(PACKAGE / file) if (PACKAGE / file).exists() else {}
-        problems += [f"{name}: {file} has no {one}" for one in names if one not in sizes]
-        n_lines += sum(sizes.get(one, 0) for one in names)
-    helpers: dict[tuple[str, str], int] = {}
-    prefixes = tuple(prefix for prefix, path in leaves if path in (None, name))
-    for file, function in sorted(called):
-        names = listed.files.get(file, [])
-        is_listed = function in names or function.partition(".")[0] in names
-        if not is_listed and not file.startswith(prefixes):
-            problems.append(f"{name}: calls {file}: {function}, which is not listed")
-        elif not is_listed:
-            helpers[file, function] = lengths(PACKAGE / file).get(function, 0)
-    n_files, is_within = len(listed.files), len(listed.files) <= listed.most_files and n_lines <= listed.most_lines
-    target = f"target {listed.most_files} files, {listed.most_lines} lines"
-    all_files, all_lines = len({file for file, _ in helpers} | set(listed.files)), n_lines + sum(helpers.values())
-    print(
-        f"{name:<12} {n_files} files, {n_lines} lines ({target}{'' if is_within else ': exceeded'}); "
-        f"with all leaf helpers that are called {all_files} files, {all_lines} lines"
-    )
-    if listed.is_enforced and not is_within:
-        problems.append(f"{name}: {n_files} files and {n_lines} lines exceed the {target}")
-    return problems
+def counted(called: Called) -> dict[str, dict[str, int]]:
+    """Returns the lines of each function that counts, by file."""
+    found: dict[str, dict[str, int]] = {}
+    for file, name in called:
+        if not file.startswith(EXEMPT):
+            found.setdefault(file, {})[name] = lengths(PACKAGE / file).get(name, 0)
+    return found
+
+
+def total(functions: dict[str, dict[str, int]]) -> tuple[int, int]:
+    """Returns the numbers of files and lines."""
+    return len(functions), sum(sum(lines.values()) for lines in functions.values())
+
+
+def block(found: dict[str, dict[str, dict[str, int]]], most: dict[str, tuple[int, int]]) -> str:
+    """Returns the part of the page about the paths: a table, and the functions of the paths that are listed."""
+    lines = ["| path | files | lines | files, at most | lines, at most |", "|---|---|---|---|---|"]
+    for name, functions in found.items():
+        (n_files, n_lines), (files, of_lines) = total(functions), most[name]
+        lines.append(f"| {name} | {n_files} | {n_lines:,} | {files} | {of_lines:,} |")
+    for name in LISTED:
+        lines += ["", f"{name}, in the order of the first calls:", ""]
+        lines += [f"- `{file}`: {', '.join(f'`{one}`' for one in names)}" for file, names in found[name].items()]
+    return "\n".join(lines) + "\n"
 
 
 def main() -> int:
-    """Checks all paths; returns 1 if there are errors."""
-    paths, leaves = read_page(DESIGN.read_text(encoding="utf-8"))
-    problems = [f"{DESIGN.name} lists no path {name}" for name in TRACES if name not in paths]
-    for name, trace in TRACES.items():
-        if name in paths:
-            problems += check(name, paths[name], trace(), leaves)
+    """Measures all paths; returns 1 if one has grown beyond the page."""
+    text = DESIGN.read_text(encoding="utf-8")
+    rows = {name: [int(one.replace(",", "")) for one in numbers] for name, *numbers in ROW.findall(text)}
+    found = {name: counted(trace()) for name, trace in TRACES.items()}
+    problems = []
+    for name, functions in found.items():
+        n_files, n_lines = total(functions)
+        known_files, known_lines, most_files, most_lines = rows[name]
+        print(f"{name:<12} {n_files} files, {n_lines} lines (page {known_files}, {known_lines})")
+        if n_files > most_files or n_lines > most_lines:
+            problems.append(f"{name}: {n_files} files and {n_lines} lines exceed {most_files} and {most_lines}")
+        elif (n_files > known_files or n_lines > known_lines) and "--write" not in sys.argv:
+            problems.append(f"{name} has grown; if it must, say why in the commit, and run scripts/paths.py --write")
+    if "--write" in sys.argv:
+        new = block(found, {name: (files, lines) for name, (_, _, files, lines) in rows.items()})
+        DESIGN.write_text(TABLE.sub(lambda match: match[1] + new + match[3], text), encoding="utf-8")
     print("\n".join(problems), file=sys.stderr, end="\n" if problems else "")
     return bool(problems)
 

@@ -2,7 +2,9 @@
 
     python scripts/structure.py [SRC] [--json]
 
-SRC is the folder that contains ``rejeu`` (default: ``src``). The layers are the list under "Layout" in docs/design.md.
+SRC is the folder that contains ``rejeu`` (default: ``src``). The layers are the list under "Layout" in docs/design.md, and the
+limits of lines the table under "Size". Every Python file of the package counts. Exits with status 1 if there is a cycle, an
+access to a private attribute, an import against the layers, or a folder with more lines than its limit.
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "rejeu"
-ENFORCED = ("cycles", "private_accesses", "private_imports", "layering_violations")
-"""Counts that must be 0: ``"cycles"``, ``"private_accesses"``, ``"private_imports"``, ``"layering_violations"``."""
+ENFORCED = ("cycles", "private_accesses", "private_imports", "layering_violations", "over_the_limit")
+"""Lists that must be empty."""
 PUBLIC_IN_SPITE_OF_ITS_NAME = {"_replace", "_asdict", "_fields", "_field_defaults", "_make", "_exit", "_getframe"}
 """Documented methods of named tuples, and of ``os`` and ``sys``."""
 GYMNASIUM_STATE = {"_np_random", "_has_reset", "_elapsed_steps"}
@@ -35,8 +37,6 @@ def parse(src: Path) -> dict[str, tuple[Path, ast.Module]]:
     """Returns path and syntax tree of every module of the package, by dotted name."""
     modules = {}
     for path in sorted((src / PACKAGE).rglob("*.py")):
-        if not path.stem.isidentifier():  # a notebook of the courses
-            continue
         parts = path.relative_to(src).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         modules[name] = path, ast.parse(path.read_text(encoding="utf-8"))
@@ -106,6 +106,25 @@ def private_imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, alias.name) for alias in node.names if is_private(alias.name))
 
 
+def limits() -> dict[str, int]:
+    """Returns the largest number of lines of each folder, from the table under "Size" in docs/design.md."""
+    section = (
+        (ROOT / "docs" / "design.md").read_text(encoding="utf-8").partition("\n## Size\n")[2].partition("\n## ")[0]
+    )
+    rows = re.findall(r"^\| `?([\w ]+?)/?`? \| ([\d,]+) \|", section, re.MULTILINE)
+    return {name: int(lines.replace(",", "")) for name, lines in rows}
+
+
+def over_the_limit(lines: Counter[str]) -> list[str]:
+    """Returns the folders that have more lines than their limit, or no limit."""
+    known = limits()
+    return [
+        f"{name} has {n:,} lines, {f'its limit is {known[name]:,}' if name in known else 'and no limit in docs/design.md'}"
+        for name, n in [*lines.items(), ("all", sum(lines.values()))]
+        if n > known.get(name, 0)
+    ]
+
+
 def layers() -> list[str]:
     """Returns the packages and modules of the list under "Layout" in docs/design.md, in its order."""
     text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -165,6 +184,17 @@ def longest_function(modules: dict[str, tuple[Path, ast.Module]]) -> tuple[int, 
     )
 
 
+def mean_function(modules: dict[str, tuple[Path, ast.Module]]) -> float:
+    """Returns the mean number of lines of a function, methods and nested functions included."""
+    lengths = [
+        node.end_lineno - node.lineno + 1
+        for _, tree in modules.values()
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.end_lineno is not None
+    ]
+    return round(sum(lengths) / len(lengths), 1)
+
+
 def measure(src: Path) -> dict[str, Any]:
     """Returns every count, and the details of those that should be 0."""
     modules = parse(src)
@@ -173,6 +203,8 @@ def measure(src: Path) -> dict[str, Any]:
     for name, (path, tree) in modules.items():
         parts = path.relative_to(src / PACKAGE).parts
         lines[parts[0] if len(parts) > 1 else "top level"] += len(path.read_text(encoding="utf-8").splitlines())
+        if not path.stem.isidentifier():  # a notebook, which imports what users import
+            continue
         found += [(name, imported, node.lineno) for imported, node in imports(name, path, tree, set(modules))]
     edges: dict[str, set[str]] = {name: set() for name in modules}
     for importer, imported, _ in found:
@@ -183,6 +215,7 @@ def measure(src: Path) -> dict[str, Any]:
     return {
         "files": len(modules),
         "lines": sum(lines.values()),
+        "mean_function": mean_function(modules),
         "lines_by_package": dict(lines.most_common()),
         "top_level_modules": len(list((src / PACKAGE).glob("*.py"))),
         "files_in_agents": len(list((src / PACKAGE / "agents").glob("*.py"))),
@@ -196,6 +229,7 @@ def measure(src: Path) -> dict[str, Any]:
         ],
         "private_imports": [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_imports(t)],
         "layering_violations": layering_violations(found, layers()),
+        "over_the_limit": over_the_limit(lines),
     }
 
 
@@ -208,8 +242,9 @@ def report(counts: dict[str, Any], verbose: bool) -> None:
     )
     print(f"{counts['files_in_agents']} files in agents/")
     print(f"{counts['repeated_share_in_algorithms']} % of the lines of algorithms/ occur in three or more of its files")
-    print(f"longest function: {counts['longest_function_name']}, {counts['longest_function']} lines")
-    for key in ("cycles", "private_accesses", "private_imports", "layering_violations"):
+    longest = f"{counts['longest_function_name']} has {counts['longest_function']}"
+    print(f"functions: {counts['mean_function']} lines in the mean; {longest}")
+    for key in ENFORCED:
         found = counts[key]
         sizes = f" of {', '.join(str(len(cycle)) for cycle in found)} modules" if key == "cycles" and found else ""
         print(f"{key.replace('_', ' ')}: {len(found)}{sizes}")

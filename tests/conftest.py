@@ -9,11 +9,13 @@ optax raises a Python float to an int32 power, which JAX's strict mode does not 
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import signal
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # set by shells for backg
 QUICK_TO_COMPILE = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
-MAPS = Path("/proc/self/maps")
+RESIDENT = Path("/proc/self/statm")
+MOST_MEMORY = 2**30
+"""Bytes of memory after which compiled functions are dropped. Larger files add up to another 600 MiB."""
 STEPS, EPISODES = 64, 25
 """Maximum number of training steps of an example. Restoring the best weights takes 20 finished episodes."""
 
@@ -47,6 +51,13 @@ def pytest_configure(config: pytest.Config) -> None:
     """Sets XLA's options before its first use. Slow tests train for minutes, so their programs are optimized."""
     if config.option.markexpr.startswith("not slow"):
         os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Gives learning runs and searches more time than other tests."""
+    for item in items:
+        if item.get_closest_marker("slow") or item.get_closest_marker("exhaustive"):
+            item.add_marker(pytest.mark.timeout(7200))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -64,12 +75,14 @@ def strict_dtypes() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def forget_registered() -> Iterator[None]:
-    """Removes the algorithms, presets and environments in JAX that a test registered, for example with a page of the docs."""
+    """Removes what a test registered, for example with a page of the docs: algorithms, presets, encoders and so on."""
     import rejeu
     from rejeu import presets
+    from rejeu.buffers.strategies import STRATEGIES
     from rejeu.envs.functional.registry import REGISTRY
+    from rejeu.networks.own import ENCODERS
 
-    registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered, REGISTRY)
+    registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered, REGISTRY, STRATEGIES, ENCODERS)
     before = [dict(registry) for registry in registries]
     yield
     for registry, entries in zip(registries, before, strict=True):
@@ -118,11 +131,16 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled_functions_are_dropped() -> Iterator[None]:
-    """Drops compiled functions before they exceed about 3 GB. Each one uses a few memory maps."""
+    """Drops compiled functions after a file if they have grown beyond what one process of tests should take.
+
+    They are compiled again from the cache on disk. The C library returns freed memory to the system only when asked.
+    """
     yield
-    if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 15_000:
+    if RESIDENT.exists() and int(RESIDENT.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MOST_MEMORY:
         from tests.sharing import forget_learners
 
         forget_learners()
         jax.clear_caches()
         gc.collect()
+        with suppress(AttributeError, OSError):  # another C library than GNU's
+            ctypes.CDLL(None).malloc_trim(0)

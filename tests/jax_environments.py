@@ -95,7 +95,7 @@ class Breaks(FunctionalEnv):
         return spaces.Discrete(2)
 
     def reset(self, key: Array) -> tuple[Array, Array]:
-        bad = (self.what == "reset") & (jax.random.uniform(key) < 0.1)
+        bad = (self.what == "reset") & (jax.random.uniform(key) < 0.3)
         return jnp.zeros((), jnp.int32), jnp.where(bad, jnp.nan, jnp.zeros(2))
 
     def step(self, key: Array, state: Array, action: Array) -> tuple[Array, Array, Array, Array, Array]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import re
 import shlex
 import sys
@@ -21,12 +22,14 @@ import pytest
 import rejeu
 from rejeu import cli, validation
 from rejeu.algorithms import ppo, sac
-from rejeu.cli import settings
-from rejeu.sweeps import process
-from rejeu.sweeps.plan import read_plan
+from rejeu.experiments import process
+from rejeu.experiments.plan import read_plan
+from rejeu.runs import values
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+WRITTEN = Path(os.environ.get("REJEU_PAGES", ROOT))
+"""The checkout whose pages are read; ``scripts/surface.py`` runs the examples of another one."""
+PAGES = [WRITTEN / "README.md", *sorted((WRITTEN / "docs").rglob("*.md"))]
 TURNS = 5
 """After which a window is closed."""
 
@@ -71,14 +74,16 @@ def table_commands(page):
     return [shlex.split(span)[1:] for span in spans]
 
 
-PAGES_WITH_COMMANDS_IN_TABLES = [ROOT / "docs" / name for name in ("coming-from-rl-zoo.md", "coming-from-cleanrl.md")]
+PAGES_WITH_COMMANDS_IN_TABLES = [
+    WRITTEN / "docs" / name for name in ("coming-from-rl-zoo.md", "coming-from-cleanrl.md")
+]
 PYTHON_PAGES = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
 COMMANDS = [(page, arguments) for page in PAGES for arguments in commands(page)]
 COMMANDS += [(page, arguments) for page in PAGES_WITH_COMMANDS_IN_TABLES for arguments in table_commands(page)]
 
 
 def name(value):
-    return str(value.relative_to(ROOT)) if isinstance(value, Path) else " ".join(value)
+    return str(value.relative_to(WRITTEN)) if isinstance(value, Path) else " ".join(value)
 
 
 def play_a_recording():
@@ -110,8 +115,8 @@ PREPARATIONS = {"docs/play.md": play_a_recording, "docs/networks.md": import_box
 def trainings_pretend(monkeypatch):
     """Lets the trainings of a study run a program that pretends."""
     pytest.importorskip("optuna")
-    fake = Path(__file__).parent / "tuning" / "fake_training.py"
-    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(fake), *words])
+    fake = Path(__file__).parent / "experiments" / "fake_training.py"
+    monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-S", str(fake), str(task)])
 
 
 @pytest.fixture
@@ -136,7 +141,7 @@ def windows_close(monkeypatch):
 @pytest.mark.parametrize("page", PYTHON_PAGES, ids=name)
 def test_the_examples_of_a_page_run(page, short, request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if prepare := PREPARATIONS.get(page.relative_to(ROOT).as_posix()):
+    if prepare := PREPARATIONS.get(page.relative_to(WRITTEN).as_posix()):
         prepare()
         request.getfixturevalue("windows_close")
     if page.name == "tuning.md":
@@ -239,7 +244,7 @@ def test_the_settings_of_the_page_on_rl_zoo_exist():
     assert len(spans) > 8
     for span in spans:
         words = shlex.split(span)
-        given = settings.apply(words[words.index("--set") + 1 :], {})
+        given = values.apply(words[words.index("--set") + 1 :], {})
         config = ppo.Config if "clip_range" in given or "vf" in span else sac.Config
         hindsight = {"replay_buffer_class": "HerReplayBuffer"} if "replay_buffer_kwargs" in given else {}
         validation.build(config, given | hindsight)

@@ -19,6 +19,22 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's"
 SOURCE = Path(interrupt.__file__)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def as_under_nohup():
+    """The tests must pass where SIGHUP is ignored, as under ``nohup`` and in some CI systems."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.fixture(autouse=True)
+def hangups_act(as_under_nohup):
+    """Each test, and the processes that it starts, handle SIGHUP as in a terminal."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
 def raise_signal(number=signal.SIGTERM):
     os.kill(os.getpid(), number)
 
@@ -82,7 +98,7 @@ def test_output_to_a_closed_terminal_is_no_error():
             print("stopped", flush=True)
         os._exit(stop.signal)
     """
-    assert subprocess.run([sys.executable, "-c", script]).returncode == signal.SIGHUP
+    assert subprocess.run([sys.executable, "-c", script], timeout=60).returncode == signal.SIGHUP
 
 
 def test_under_nohup_a_closed_terminal_is_ignored():
@@ -116,7 +132,7 @@ def test_a_signal_while_a_file_is_written_leaves_the_old_file_and_no_other(tmp_p
 def test_a_signal_during_imports_is_one_line(number, status, tmp_path):
     (tmp_path / "jax.py").write_text(f"import os, signal\nos.kill(os.getpid(), signal.{number})\nprint('went on')\n")
     path = os.pathsep.join([str(tmp_path), str(SOURCE.parents[1])])
-    command = [sys.executable, "-m", "rejeu", "list"]
+    command = [sys.executable, "-m", "rejeu", "evaluate", "run"]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "rejeu: interrupted\n")
 

@@ -24,6 +24,7 @@ from rejeu.core import TD_ERROR, Transition
 from rejeu.errors import CheckpointError
 from rejeu.loops.learner import Learner
 from rejeu.reporting.runs import Run
+from rejeu.runs.config import RunConfig
 from tests.environments import Reach
 
 ROOT = Path(__file__).parents[1]
@@ -189,11 +190,11 @@ def test_a_report_shows_what_differs_and_the_command_that_repeats_the_run(awac):
         algorithm="AWAC",
         env_id="Pendulum-v1",
         seed=1,
-        config={"imports": ["my awac.py"], "env_argument": "Pendulum-v1"},
+        config=RunConfig(env="Pendulum-v1", algorithm="AWAC", seed=1, imports=("my awac.py",)),
         hyperparameters=saved,
     )
     assert run.changed == {"gamma": (0.9, 0.99), "beta": (3.0, 1.0)}
-    words = "--algo AWAC --seed 1 --import 'my awac.py' --set gamma=0.9 beta=3.0"
+    words = "--import 'my awac.py' --algo AWAC --seed 1 --set gamma=0.9 beta=3.0"
     assert run.command == f"rejeu train Pendulum-v1 {words}"
 
 

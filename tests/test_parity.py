@@ -61,6 +61,11 @@ def put_mountain_car(env, obs):
     env.state = obs.astype(np.float64)
 
 
+def put_acrobot(env, obs):
+    angles = [math.atan2(obs[1], obs[0]), math.atan2(obs[3], obs[2])]
+    env.state = np.array([*angles, *obs[4:]], np.float64)
+
+
 def put_parking(env, obs):
     """Features are x, y, vx, vy, cos h and sin h, in units of 100, 100, 5, 5, 1 and 1; a car starts at rest."""
     x, y, _, _, cos, sin = obs["observation"].astype(np.float64)
@@ -86,6 +91,13 @@ def swing(obs, t, rng):
     """Half of them push the way that the car goes, the others anyhow."""
     action = rng.integers(3, size=len(obs))
     action[::2] = np.where(obs[::2, 1] >= 0, 2, 0)
+    return action
+
+
+def pump(obs, t, rng):
+    """Half of them push the way that the second link turns, the others anyhow."""
+    action = rng.integers(3, size=len(obs))
+    action[::2] = np.where(obs[::2, 5] >= 0, 2, 0)
     return action
 
 
@@ -117,6 +129,7 @@ REPLAYED = {
     "CartPole-v1": Replayed(put_cart_pole, balance, {FALLS, LIMIT}, every_step=True),
     "Pendulum-v1": Replayed(put_pendulum, torque, {LIMIT}, every_step=True, apart=at_top_speed),
     "MountainCar-v0": Replayed(put_mountain_car, swing, {FALLS, LIMIT}, every_step=True),
+    "Acrobot-v1": Replayed(put_acrobot, pump, {FALLS, LIMIT}, every_step=True),
     "parking-v0": Replayed(put_parking, drive, {(True, False, 0.0), (True, False, 1.0), (False, True, 0.0)}, n_envs=64),
     "FetchReach-v4": Replayed(put_fetch, reach, {(False, True, 0.0), (False, True, 1.0)}, n_envs=8),
 }

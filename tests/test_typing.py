@@ -40,7 +40,7 @@ SETTINGS = """
 strict = True
 follow_imports = silent
 
-[mypy-jax.*,equinox.*,optax.*,scipy.*,matplotlib.*,rich.*,envpool.*,msgspec.*,tyro.*,IPython.*]
+[mypy-jax.*,equinox.*,optax.*,scipy.*,matplotlib.*,rich.*,envpool.*,msgspec.*,IPython.*]
 follow_imports = skip
 """
 """The last two lines save most of the time: nothing in the script is of their types."""

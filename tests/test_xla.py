@@ -49,11 +49,3 @@ def test_other_processors_are_told_nothing(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     traced = jax.make_jaxpr(xla.one_kernel(lambda x: 2.0 * x))(jnp.ones(3))
     assert [equation.primitive.name for equation in traced.eqns] == ["mul"]
-
-
-def test_the_environment_limits_the_cores(monkeypatch):
-    monkeypatch.setenv(xla.CORES, "1")
-    assert xla.cores() == 1
-    for text in ("", "many", "0"):
-        monkeypatch.setenv(xla.CORES, text)
-        assert xla.cores() >= 1

@@ -5,7 +5,7 @@
 The run is SAC with hindsight experience replay on parking-v0 in 8 EnvPool environments. It has an evaluation every
 20,000 steps, a checkpoint every minute, a video every 100,000 steps, tables and a progress bar. Before the end of the
 warm-up the replay buffer is full and every feature has run more than once. After the warm-up no resource may grow.
-``trials/results/soak.json`` contains the measurements, one every ten seconds, and ``docs/images/soak.png`` shows them.
+``trials/results/soak.json`` contains the measurements, one every ten seconds, and ``trials/images/soak.png`` shows them.
 Requires psutil.
 """
 
@@ -24,7 +24,7 @@ import psutil
 from provenance import provenance
 
 RESULT = Path(__file__).parent / "results" / "soak.json"
-PICTURE = Path(__file__).parents[1] / "docs" / "images" / "soak.png"
+PICTURE = Path(__file__).parent / "images" / "soak.png"
 EVERY_SECONDS = 10.0
 WARM_UP = 0.25
 """Fraction of the run after which no resource may grow."""

@@ -1,15 +1,18 @@
-"""Kills runs, Ray workers, Ray nodes and sweeps at random moments, and compares the models with those of an undisturbed sweep.
+"""Kills runs, Ray workers, Ray nodes and commands with many runs at random moments, and compares the models.
 
-    python trials/sweep_kills.py --kills 30
+    python trials/sweep_kills.py --kills 30 --only sweep ray
+    python trials/sweep_kills.py --kills 20 --only seeds tune pbt --out trials/results/experiment_kills.json
 
-The plan has eight runs: SAC on Pendulum, DQN and PPO on CartPole. An undisturbed sweep trains it once, two runs at a
-time. Then sweeps are disturbed until there were as many kills as asked for, first with local processes, then on a Ray
-cluster of a head and two nodes on this machine. Every kill is a SIGKILL at a random moment: of a run; of the process
-``rejeu sweep`` (local), after which ``rejeu resume`` continues; of a Ray worker, or of everything that belongs to a node,
-in whose place a new one begins.
+A sweep has eight runs: SAC on Pendulum, DQN and PPO on CartPole. ``--seeds`` has four of DQN on CartPole. A study has
+three trials of PPO on CartPole and compares its winner with the default on five seeds. A population has four members of
+SAC on Pendulum and three rounds. An undisturbed one is trained once, two runs at a time. Then others are disturbed
+until there were as many kills as asked for, those on Ray on a cluster of a head and two nodes on this machine. Every
+kill is a SIGKILL at a random moment: of a run; of the command that began them, after which ``rejeu resume`` continues;
+of a Ray worker, or of everything that belongs to a node, in whose place a new one begins.
 
-Before each kill of a run the training time since its newest checkpoint is noted, which is what it loses. The others let their
-runs stop with a checkpoint. All arrays of the final models are compared bit for bit, and at the end no process may be left.
+Before each kill of a run the training time since its newest checkpoint is noted, which is what it loses. The others let
+their runs stop with a checkpoint. All arrays of the final models are compared bit for bit, and at the end no process
+may be left.
 """
 
 from __future__ import annotations
@@ -57,6 +60,25 @@ policy_kwargs.net_arch = [32, 32]
 algorithms = ["SAC"]
 policy_kwargs.net_arch = [16, 16]
 """
+QUIET = ["--checkpoint-minutes", "{minutes}", "--evaluate-episodes", "2"]
+SMALL = ["--set", "policy_kwargs.net_arch=[32,32]"]
+COMMANDS = {
+    "sweep": ["sweep", "{plan}"],
+    "ray": ["sweep", "{plan}"],
+    "seeds": [
+        *["train", "CartPole-v1", "--algo", "DQN", "--seeds", "4", "--seed", "0", "--steps", "{steps}"],
+        *["--evaluate-every", "1000000", "--no-report", "--no-video", *QUIET, *SMALL],
+    ],
+    "tune": [
+        *["tune", "CartPole-v1", "--algo", "PPO", "--trials", "3", "--steps", "{steps}", "--pruner", "none"],
+        *["--backend", "gymnasium", "--only", "learning_rate", "gamma", *QUIET, *SMALL],
+    ],
+    "pbt": [
+        *["pbt", "Pendulum-v1", "--algo", "SAC", "--members", "4", "--rounds", "3", "--round-steps", "{round_steps}"],
+        *["--backend", "gymnasium", "--only", "learning_rate", "gamma", *QUIET, *SMALL],
+    ],
+}
+"""The command line of each kind, without the folder and the number of workers."""
 
 
 class Cluster:
@@ -99,8 +121,13 @@ def processes(folder: Path) -> list[tuple[int, int, str]]:
     found = subprocess.run(["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
     rows = [line.split(None, 2) for line in found.splitlines()]
     rows = [row for row in rows if len(row) == 3 and "-m rejeu" in row[2] and f"{folder}/" in row[2]]
-    runs = [(int(pid), int(parent), args.partition(f"{folder}/")[2].split()[0]) for pid, parent, args in rows]
+    runs = [(int(pid), int(parent), run_of(args.rpartition(f"{folder}/")[2].split()[0])) for pid, parent, args in rows]
     return [row for row in runs if (folder / f"{row[2]}.log").is_file()]
+
+
+def run_of(task: str) -> str:
+    """Returns the run folder to which the file of a task belongs."""
+    return task.removesuffix(".task").removeprefix(".sweep/").replace("/process", "/run")
 
 
 def seconds_since_checkpoint(run: Path) -> float | None:
@@ -158,7 +185,8 @@ def wait_for_end(folder: Path, seconds: float = 120.0) -> float:
 def models(folder: Path) -> dict[str, Any]:
     from safetensors.numpy import load_file
 
-    return {path.parent.name: load_file(path) for path in sorted(folder.glob("*/agent.safetensors"))}
+    found = sorted(folder.rglob("agent.safetensors"))
+    return {str(path.parent.relative_to(folder)): load_file(path) for path in found}
 
 
 def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
@@ -174,32 +202,40 @@ def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
 
 
 def trial(
-    kills: int, plan: Path, undisturbed: dict[str, Any], root: Path, cluster: Cluster | None, rng: random.Random
+    kind: str,
+    words: list[str],
+    kills: int,
+    pause: tuple[float, float],
+    undisturbed: dict[str, Any],
+    root: Path,
+    cluster: Cluster | None,
+    rng: random.Random,
 ) -> dict[str, Any]:
-    """Disturbs sweeps until there were so many kills."""
+    """Disturbs commands of a kind until there were so many kills."""
     counts: Counter[str] = Counter()
     lost: list[float] = []
     ends: list[float] = []
     different: list[str] = []
     failed = rounds = 0
     options = ["--workers", "2"] + (["--ray", cluster.cluster.address] if cluster else [])
+    at_once = ["--jobs", "2"] if kind == "seeds" else options
     while counts.total() < kills:
         rounds += 1
-        folder, log = root / f"{'ray' if cluster else 'local'}-{rounds}", root / "printed.log"
-        sweep = start(["sweep", str(plan), "--out", str(folder), *options], log)
+        folder, log = root / f"{kind}-{rounds}", root / "printed.log"
+        sweep = start([*words, "--out", str(folder), *at_once], log)
         while sweep.poll() is None:
-            time.sleep(rng.uniform(*PAUSE))
+            time.sleep(rng.uniform(*pause))
             done = disturb(sweep, folder, cluster, rng) if counts.total() < kills else None
             if done is None:
                 continue
-            kind, seconds = done
-            counts[kind] += 1
+            victim, seconds = done
+            counts[victim] += 1
             lost += [] if seconds is None else [seconds]
             print(
-                f"kill {counts.total()}: {kind}" + (f", {seconds:.2f} s lost" if seconds is not None else ""),
+                f"{kind}, kill {counts.total()}: {victim}" + (f", {seconds:.2f} s lost" if seconds is not None else ""),
                 flush=True,
             )
-            if kind == "sweep":
+            if victim == "sweep":
                 ends.append(wait_for_end(folder))
                 sweep = start(["resume", str(folder), *options], log)
         failed += sweep.returncode != 0
@@ -209,7 +245,7 @@ def trial(
         print((root / "printed.log").read_text(encoding="utf-8"))
     return {
         "kills": counts.total(),
-        **{f"kills_of_a_{kind}": number for kind, number in sorted(counts.items())},
+        **{f"kills_of_a_{victim}": number for victim, number in sorted(counts.items())},
         "sweeps": rounds,
         "sweeps_that_failed": failed,
         "runs": rounds * len(undisturbed),
@@ -225,30 +261,35 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--checkpoint-seconds", type=float, default=3.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=["local", "ray"])
+    parser.add_argument("--only", nargs="*", choices=COMMANDS, default=["sweep", "ray"])
+    parser.add_argument("--pause", type=float, nargs=2, default=PAUSE, help="least and most seconds between two kills")
     parser.add_argument("--out", type=Path, default=RESULT)
     arguments = parser.parse_args()
     from provenance import provenance
 
     rng = random.Random(arguments.seed)
     result: dict[str, Any] = {**provenance(), "checkpoint_interval_seconds": arguments.checkpoint_seconds}
+    minutes = str(round(arguments.checkpoint_seconds / 60, 4))
     with tempfile.TemporaryDirectory() as name:
         root = Path(name).resolve()
         plan = root / "plan.toml"
-        plan.write_text(PLAN.format(steps=arguments.steps, minutes=arguments.checkpoint_seconds / 60), encoding="utf-8")
-        began = time.monotonic()
-        sweep = start(["sweep", str(plan), "--out", str(root / "undisturbed"), "--workers", "2"], root / "printed.log")
-        if sweep.wait() != 0:
-            raise SystemExit((root / "printed.log").read_text(encoding="utf-8"))
-        undisturbed = models(root / "undisturbed")
-        print(f"{len(undisturbed)} runs took {time.monotonic() - began:.0f} s undisturbed", flush=True)
-        for kind, opened in (("local", no_cluster), ("ray", new_cluster)):
-            if arguments.only in (None, kind):
-                with opened() as cluster:
-                    result[kind] = trial(arguments.kills, plan, undisturbed, root, cluster, rng)
-                print(json.dumps(result[kind], indent=1), flush=True)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        plan.write_text(PLAN.format(steps=arguments.steps, minutes=minutes), encoding="utf-8")
+        values = {"plan": plan, "minutes": minutes, "steps": arguments.steps, "round_steps": arguments.steps // 10}
+        for kind in arguments.only:
+            words = [word.format(**values) for word in COMMANDS[kind]]
+            began, undisturbed = time.monotonic(), root / f"{kind}-undisturbed"
+            at_once = "--jobs" if kind == "seeds" else "--workers"
+            command = start([*words, "--out", str(undisturbed), at_once, "2"], root / "printed.log")
+            if command.wait() != 0:
+                raise SystemExit((root / "printed.log").read_text(encoding="utf-8"))
+            known = models(undisturbed)
+            print(f"{kind}: {len(known)} runs took {time.monotonic() - began:.0f} s undisturbed", flush=True)
+            with new_cluster() if kind == "ray" else no_cluster() as cluster:
+                found = trial(kind, words, arguments.kills, arguments.pause, known, root, cluster, rng)
+            result["local" if kind == "sweep" else kind] = found
+            print(json.dumps(found, indent=1), flush=True)
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@
 
 Every measurement runs in a new process. The libraries alternate, in several rounds. Each sample is appended to
 ``benchmarks/results/bench.jsonl`` as soon as it is measured. At the end, all samples and a description of the machine
-are written to ``benchmarks/results/bench.json``. ``docs/performance.md`` and its figures are generated from that file.
+are written to ``benchmarks/results/bench.json``. ``benchmarks/performance.md`` is generated from that file.
 
 Other programs distort the timings, so the command refuses to run on a busy machine.
 """
@@ -28,7 +28,7 @@ import platformdirs
 from benchmarks.bench import machine, peers, plan, report, runner
 
 RESULT = runner.ROOT / "benchmarks" / "results" / "bench.json"
-PAGE = runner.ROOT / "docs" / "performance.md"
+PAGE = runner.ROOT / "benchmarks" / "performance.md"
 TAKES_PATHS = ("--sb3-python", "--sbx-python", "--peers", "--out", "--page")
 
 
@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
         "--peers", type=Path, metavar="DIR", help="where environments for the peers are made; default: the cache folder"
     )
     add("--out", type=Path, default=RESULT, help="the file of results")
-    add("--page", type=Path, default=PAGE, help="the page; its pictures go to the folder images beside it")
+    add("--page", type=Path, default=PAGE, help="the page")
     return found
 
 

@@ -1,4 +1,4 @@
-"""Writes ``docs/performance.md`` from the results file."""
+"""Writes ``benchmarks/performance.md`` from the results file."""
 
 from __future__ import annotations
 
@@ -7,70 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.bench import machine, plan
-from benchmarks.bench.pictures import NAMES, number
 from benchmarks.bench.sections import files, memory, parking, per_step, replay, rollouts, startup
 from benchmarks.bench.summary import Sample, best, disturbed, drift, peak, step_seconds
-from benchmarks.bench.text import table, with_spread
-
-DID_NOT_HELP = (
-    "A scan around a single gradient step costs 20 to 30 us. An environment step with one update calls it without a scan.",
-    "Two threads for XLA help only above batches of 256 with 256-256 networks. DDPG with batches of 128 and 128-128 "
-    "networks was 1.5 times as slow with two.",
-    "Unrolled scans compile much longer and run at the same speed.",
-    "bfloat16 is slower on a CPU.",
-    "Both critics in one batched matrix product were not faster than two products.",
-    "An actor in NumPy is not bit-equal to XLA's.",
-    "Synchronous dispatch made no difference.",
-    "Blockwise transposition for weight gradients made no difference.",
-    "XLA's matrix products without its library YNN take the same time at these sizes.",
-    "Optimization level 1 compiles an update in half the time and runs it a third slower. It is used for what runs once.",
-    "Adam with one division per element instead of three saves 0 to 2 % of an update.",
-    "One vector for PPO's weights, gradients and moments saves 1 % of a step.",
-)
-HELPED = (
-    "**Packing the state into few vectors** makes dispatch 2 to 3 times faster than a tree of arrays.",
-    "**Donating the state** saves a copy.",
-    "**Fewer NumPy calls** in storing and sampling, and one vector for the inputs of an update, save a sixth of a SAC step.",
-    "**Copying whole rows** of the replay buffer is several times faster than selecting each column.",
-    "**Weight gradients without a transposed left operand**, which XLA's fast products do not support: an update of "
-    "SAC, DDPG, TD3, DQN, TQC or CrossQ takes 0.5 to 15 % less.",
-    "**Random bits computed once**: XLA recomputes elementwise operations in every kernel that reads them. As a reduction the "
-    "hash is computed once, which halves the compilation time of SAC.",
-    "**No optimization of what runs once**: the initial state of SAC compiles in 1.3 s instead of 4.4 s.",
-    "**Updates on one thread**: if more than eight kernels are ready, XLA moves half of them to another thread, whose core "
-    "has cold caches. Separate functions and single kernels (`xla.py`) prevent this: an update of TD3 takes 22 % less, DDPG "
-    "18, TQC 14, SAC 10, DQN 9, CrossQ 5.",
-    "**Quantile losses by a scan over targets** instead of a table of all pairs: 0.5 ms instead of 8 for QR-DQN, 0.2 instead "
-    "of 1.6 for TQC.",
-)
-IN_THE_WAY = (
-    "**DDPG and TD3 are limited by products of small matrices.** They are 60 to 65 % of an update, at 44 to 60 us for each "
-    "128 by 128 by 128 product. XLA's thread is busy 96 % of the time. With SAC (64-64) the loop's thread is.",
-    "**Stepping environments empties the caches.** Passing the observations of 16 environments to compiled code takes 46 us "
-    "by itself, and 102 to 126 us after a step.",
-    "**Parking on highway-env is limited by the environment**, which takes 90 % of the training time.",
-    "**PPO on Gymnasium is limited by the environments.** The ratio at the limit is below 4 with 16 environments.",
-    "**Calls of compiled code and environments on the host** are no limit where both are one program: see [Training on the "
-    "device](device.md).",
-)
-"""Profiling results on the machine of the report."""
+from benchmarks.bench.text import NAMES, number, table, with_spread
 
 
 def write(results: Mapping[str, Any], page: Path) -> None:
-    """Writes the page, and its figures to the folder ``images`` next to it."""
+    """Writes the page."""
     samples = results["samples"]
     sections = [
         head(results),
         how_to_read(results),
         parking(samples),
-        per_step(samples, page),
-        rollouts(samples, page),
-        replay(samples, page),
+        per_step(samples),
+        rollouts(samples),
+        replay(samples),
         memory(samples),
         startup(samples),
         files(samples),
         machine_limits(samples),
-        tried(),
         conditions(results),
     ]
     page.parent.mkdir(parents=True, exist_ok=True)
@@ -83,6 +38,7 @@ def head(results: Mapping[str, Any]) -> str:
     text = f"""# Performance
 
 This page is written by `scripts/bench` from one run on one machine. All samples are in `benchmarks/results/bench.json`.
+[Notes](notes.md) say what made rejeu faster, what did not, and what limits it.
 
 **The machine:** {described["processor"]}, {described["cores"]} cores{memory_text}, {described["system"]}.
 
@@ -169,23 +125,6 @@ def sac_by_hand() -> int:
     from benchmarks.bench.work import flops
 
     return flops.sac_by_hand(3, 1, (64, 64), 64)
-
-
-def tried() -> str:
-    helped, not_helped, in_the_way = (
-        "\n".join(f"- {fact}" for fact in facts) for facts in (HELPED, DID_NOT_HELP, IN_THE_WAY)
-    )
-    return f"""## Optimizations that did not help
-
-{not_helped}
-
-Optimizations that helped:
-
-{helped}
-
-## Remaining gap to the limit
-
-{in_the_way}"""
 
 
 def conditions(results: Mapping[str, Any]) -> str:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
-from benchmarks.bench import pictures, plan
-from benchmarks.bench.pictures import NAMES, number
+from benchmarks.bench import plan
 from benchmarks.bench.summary import (
     ByRound,
     Limit,
@@ -21,9 +19,7 @@ from benchmarks.bench.summary import (
     spread,
     step_seconds,
 )
-from benchmarks.bench.text import percent, table, times, times_of_most, variant_of, with_spread
-
-PICTURES = {"steps": "speed-steps.png", "rollouts": "speed-rollouts.png", "replay": "speed-replay.png"}
+from benchmarks.bench.text import NAMES, number, percent, table, times, times_of_most, variant_of, with_spread
 
 
 def parking(samples: Sequence[Sample]) -> str:
@@ -102,19 +98,15 @@ def share_table(cases: Sequence[tuple[str, Sequence[Sample], Mapping[str, float]
     return f"{text}\n\n{table(header, rows)}"
 
 
-def per_step(samples: Sequence[Sample], page: Path) -> str:
+def per_step(samples: Sequence[Sample]) -> str:
     names = [name for name in (*plan.STEPS, plan.POOL) if best(samples, "steps", name, "rejeu")]
     if not names:
         return ""
-    rows, limits, drawn = [], {}, {}
+    rows, limits = [], {}
     for name in names:
         by = {library: step_seconds(samples, "steps", name, library) for library in plan.LIBRARIES}
         limits[name] = limit(samples, "steps", name, env_of(name))
-        drawn[name] = {library: spread(numbers) for library, numbers in by.items() if numbers}
         rows.append((name, *compared(samples, name, by, limits[name]), *limit_cells(limits[name], 1e3)))
-    picture = page.parent / "images" / PICTURES["steps"]
-    one = {name: by for name, by in drawn.items() if name != plan.POOL} or drawn
-    pictures.draw_steps(one, limits, picture, "A step with one update, one environment")
     measured = [
         (name, best(samples, "steps", name, "rejeu"), gap_to(samples, "steps", name, limits[name])) for name in names
     ]
@@ -130,8 +122,6 @@ Milliseconds per environment step with one gradient step, with one Gymnasium env
 environments on EnvPool and eight updates at once. {settings}.
 
 {table(header, rows)}
-
-![Milliseconds per step](images/{PICTURES["steps"]})
 
 {share_table(measured)}"""
 
@@ -169,12 +159,10 @@ def env_of(name: str) -> str:
     return plan.env_name(plan.STEPS[name][1], 1, "gymnasium")
 
 
-def rollouts(samples: Sequence[Sample], page: Path) -> str:
-    tables, drawn, limits, measured = [], {}, {}, []
+def rollouts(samples: Sequence[Sample]) -> str:
+    tables, measured = [], []
     for algorithm in ("PPO", "A2C"):
         rows = []
-        lines: dict[str, dict[int, Spread]] = {}
-        at: dict[str, dict[int, float]] = {}
         for n in plan.N_ENVS:
             for backend in plan.BACKENDS:
                 name, home = f"{algorithm}, {n} on {backend}", f"{algorithm}, {n} on gymnasium"
@@ -186,13 +174,6 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
                 measured.append(
                     (name, best(samples, "rollouts", name, "rejeu"), gap_to(samples, "rollouts", name, found))
                 )
-                line = "rejeu" if backend == "gymnasium" else "rejeu, EnvPool"
-                lines.setdefault(line, {})[n] = rate_of(own)
-                if found is not None:
-                    at.setdefault(line, {})[n] = 1.0 / found.seconds
-                for library, numbers in peers.items():
-                    if numbers:
-                        lines.setdefault(library, {})[n] = rate_of(numbers)
                 cells = [str(n), {"gymnasium": "Gymnasium", "envpool": "EnvPool"}[backend], rate_text(own)]
                 for library, numbers in peers.items():
                     if library == "sbx" and algorithm == "A2C":
@@ -206,11 +187,8 @@ def rollouts(samples: Sequence[Sample], page: Path) -> str:
             header += ["SBX", "ratio"] if algorithm == "PPO" else []
             limit_header = ("limit, us per step", "environment part", "arithmetic part", "of the limit")
             tables.append(f"### {algorithm}\n\n{table((*header, *limit_header), rows)}")
-            drawn[algorithm], limits[algorithm] = lines, at
     if not tables:
         return ""
-    picture = page.parent / "images" / PICTURES["rollouts"]
-    pictures.draw_rollouts(drawn, limits, picture, f"{plan.LANDER}: steps per second")
     return f"""## On-policy: PPO and A2C by number of environments
 
 Environment steps per second on {plan.LANDER}, 64-64 networks, updates included. PPO: rollouts of {plan.ROLLOUT:,} steps
@@ -219,14 +197,7 @@ environments in the process, so their figures are the same in both rows. SBX has
 
 {(chr(10) * 2).join(tables)}
 
-![Steps per second by number of environments](images/{PICTURES["rollouts"]})
-
 {share_table(measured)}"""
-
-
-def rate_of(seconds: ByRound) -> Spread:
-    """Converts seconds per step to steps per second."""
-    return spread({turn: 1.0 / value for turn, value in seconds.items()})
 
 
 def rate_text(seconds: ByRound) -> str:
@@ -234,7 +205,7 @@ def rate_text(seconds: ByRound) -> str:
     return with_spread({turn: 1.0 / value for turn, value in seconds.items()})
 
 
-def replay(samples: Sequence[Sample], page: Path) -> str:
+def replay(samples: Sequence[Sample]) -> str:
     lines: dict[str, dict[int, ByRound]] = {}
     for library, what in (("rejeu", "hindsight"), ("sb3", "hindsight"), ("rejeu", "priority")):
         for row in best(samples, "replay", what, library):
@@ -249,8 +220,6 @@ def replay(samples: Sequence[Sample], page: Path) -> str:
         own, peer = (lines.get(f"{library}, hindsight", {}).get(size, {}) for library in ("rejeu", "sb3"))
         row = (cells("rejeu, hindsight", size), cells("sb3, hindsight", size), times(ratio(peer, own)))
         rows.append((f"{size:,}", *row, cells("rejeu, priority", size)))
-    drawn = {line: {size: spread(by[size]) for size in sizes if size in by} for line, by in lines.items()}
-    pictures.draw_replay(drawn, page.parent / "images" / PICTURES["replay"], "Drawing a batch from a full buffer")
     header = ("transitions", "rejeu, HER", "Stable-Baselines3, HER", "ratio", "rejeu, prioritized")
     return f"""## Sampling batches
 
@@ -259,9 +228,7 @@ Microseconds per batch of 256 from a full buffer with episodes of 100 steps. HER
 Prioritized replay: Pendulum's observations, sampling and updating the priorities of the previous batch; Stable-Baselines3
 does not have it.
 
-{table(header, rows)}
-
-![Microseconds per batch by size of the buffer](images/{PICTURES["replay"]})"""
+{table(header, rows)}"""
 
 
 def memory(samples: Sequence[Sample]) -> str:

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from benchmarks.bench.pictures import number
 from benchmarks.bench.summary import ByRound, Limit, Sample, Spread, ratio, spread
 
 Row = Sequence[str]
+NAMES = {"rejeu": "rejeu", "sb3": "Stable-Baselines3", "sbx": "SBX"}
+
+
+def number(value: float) -> str:
+    """Formats a number with three significant figures.
+
+    >>> [number(x) for x in (0.1234, 2.5, 1234.0)]
+    ['0.123', '2.5', '1,234']
+    """
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def table(header: Row, rows: Iterable[Row]) -> str:

@@ -52,6 +52,8 @@ if TYPE_CHECKING:
         RunInUseError,
         WorkerError,
     )
+    from rejeu.experiments.sweep import sweep
+    from rejeu.experiments.tune import tune
     from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
     from rejeu.exploration.parameter_space import ParameterNoise
     from rejeu.reporting import plots
@@ -62,8 +64,6 @@ if TYPE_CHECKING:
     from rejeu.sb3.common.evaluation import evaluate_policy
     from rejeu.sb3.common.monitor import Monitor
     from rejeu.schedules import Exponential, Linear
-    from rejeu.sweeps.sweep import sweep
-    from rejeu.tuning import tune
 
 __version__ = "0.1.0"
 
@@ -89,8 +89,8 @@ _MODULES = {
     "rejeu.reporting.report": "write_report",
     "rejeu.reporting.video": "record_video show_videos",
     "rejeu.schedules": "Exponential Linear",
-    "rejeu.sweeps.sweep": "sweep",
-    "rejeu.tuning": "tune",
+    "rejeu.experiments.sweep": "sweep",
+    "rejeu.experiments.tune": "tune",
 }
 """The public names by the module that defines them."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -181,8 +181,24 @@ class Elementwise(optax.GradientTransformation):
     """An optimizer that treats every number of the gradients by itself, which XLA compiles into one kernel on a CPU."""
 
 
+class Clipped(NamedTuple):
+    """An optimizer whose gradients are limited by :func:`clip` first."""
+
+    optimizer: optax.GradientTransformation
+    max_value: float | None
+    max_norm: float | None
+
+    def init(self, params: PyTree) -> PyTree:
+        """Returns the initial state of the optimizer."""
+        return self.optimizer.init(params)
+
+
+Optimizer: TypeAlias = optax.GradientTransformation | Clipped
+"""A transformation from gradients to directions, without a learning rate."""
+
+
 def descend(
-    params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: optax.GradientTransformation, rate: Any
+    params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: Optimizer, rate: Any
 ) -> tuple[PyTree, PyTree]:
     """Returns the parameters and the optimizer state after one step of ``rate`` against ``gradients``.
 
@@ -190,10 +206,13 @@ def descend(
         params: what is learned.
         gradients: of a loss with respect to ``params``.
         optimizer_state: of ``optimizer``.
-        optimizer: a transformation without a learning rate, such as ``optax.scale_by_adam()``.
+        optimizer: what :func:`rejeu.algorithms.optimizers.make` returned, or another transformation without a learning
+            rate, such as ``optax.scale_by_adam()``.
         rate: the learning rate, which may be a traced value of a schedule; or one for each part of ``params``, as a
             pytree that is a prefix of it.
     """
+    if isinstance(optimizer, Clipped):
+        gradients, optimizer = clip(gradients, optimizer.max_value, optimizer.max_norm), optimizer.optimizer
     step = one_kernel(_descend) if isinstance(optimizer, Elementwise) else _descend
     return step(params, gradients, optimizer_state, optimizer, rate)
 
@@ -208,7 +227,7 @@ def minimize(
     loss: Callable[..., tuple[Array, Any]],
     params: PyTree,
     optimizer_state: PyTree,
-    optimizer: optax.GradientTransformation,
+    optimizer: Optimizer,
     rate: Any,
     *arguments: Any,
 ) -> tuple[PyTree, PyTree, Array, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from rejeu import xla
-from rejeu.io.memory import free_memory
+from rejeu.hardware import free_memory
 
 NAMES = ("auto", "cpu", "gpu")
 """``auto`` is JAX's default device: the first GPU if there is one that JAX supports, else the CPU."""

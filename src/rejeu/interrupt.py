@@ -37,6 +37,15 @@ class Stopped(KeyboardInterrupt):
         self.signal = number
 
 
+active: list[Interrupt] = []
+"""The contexts that are entered, outermost first."""
+
+
+def requested() -> int | None:
+    """Returns the signal that asked to stop, if a context of :class:`Interrupt` received one; else None."""
+    return next((one.signal for one in active if one.signal is not None), None)
+
+
 class Interrupt:
     """Context in which the first Ctrl-C, SIGTERM or SIGHUP sets ``requested``. A second signal takes effect immediately.
 
@@ -56,6 +65,7 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         self._previous = install(self._handle)
+        active.append(self)
         return self
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -80,6 +90,7 @@ class Interrupt:
             raise Stopped(self.signal)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        active.remove(self)
         restore(self._previous)
 
 

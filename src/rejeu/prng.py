@@ -56,9 +56,9 @@ def _fold_in(key: Array, data: Any) -> Array:
 
 
 def _random_bits(key: Array, bit_width: int, shape: tuple[int, ...]) -> Array:
-    if bit_width == 64:
-        raise NotImplementedError("rejeu's keys do not support 64-bit random numbers; use jax.random.key")
     high, low = _hashes(key, shape)
+    if bit_width == 64:  # with ``jax_enable_x64``
+        return (high.astype(jnp.uint64) << jnp.uint64(32)) | low
     # XLA would recompute ``high ^ low``, and so the hash, in every kernel that reads the bits: nine times in an update of
     # SAC, which took twice as long to compile. It computes a reduction once.
     words = jnp.where(jnp.arange(2) == 0, high[..., None], low[..., None])

@@ -134,7 +134,7 @@ def check_function(name: str, function: Schedule) -> None:
     if "progress_remaining" in inspect.signature(function).parameters:
         raise ValueError(
             f"{name}: functions are called with the progress, which runs from 0 to 1, and this one takes "
-            "progress_remaining; give lambda progress: function(1 - progress)"
+            "progress_remaining; give lambda progress: function(1 - progress), or use the algorithms of rejeu.sb3"
         )
     try:
         result = jax.eval_shape(function, jax.ShapeDtypeStruct((), jnp.float32))

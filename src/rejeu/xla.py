@@ -14,12 +14,12 @@ import platformdirs
 from jax import Array
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from rejeu.hardware import cores
+
 THREADS = "NPROC"
 """Environment variable with the size of XLA's CPU thread pool."""
 DEVICES = "--xla_force_host_platform_device_count"
 """Option of XLA with the number of devices as which the CPU appears."""
-CORES = "REJEU_CORES"
-"""Environment variable with the most cores that a process should use; set for each run of a sweep."""
 LITTLE_WORK = 2**23
 """Multiplications in the largest layer of an update up to which one thread is faster than two. Measured on 2 cores: with
 two threads a step of DDPG with batches of 128 and layers 128-128 takes 1.5 times as long; with one thread batches of 256 and
@@ -55,16 +55,6 @@ def enable_cache() -> None:
     if unset and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("rejeu", appauthor=False))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def cores() -> int:
-    """Returns the number of processor cores that this process may use; the environment variable ``REJEU_CORES`` limits it."""
-    try:
-        found = len(os.sched_getaffinity(0))
-    except AttributeError:  # macOS and Windows
-        found = os.cpu_count() or 1
-    limit = os.environ.get(CORES, "")
-    return min(found, int(limit)) if limit.isdecimal() and int(limit) > 0 else found
 
 
 def threads_for(work: float) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -124,3 +126,14 @@ def test_what_seeds_cannot_be_combined_with_is_said_in_one_line(
     assert said in error
     assert "\n" not in error
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_compiled_programs_are_collected_with_their_agents(seeds: int) -> None:
+    settings: dict[str, Any] = {"learning_starts": 10, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+    agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 30, seeds=seeds, **settings)
+    kept = weakref.ref(agents[0].learner.algorithm.update)
+    assert kept() is not None
+    del agents
+    gc.collect()
+    assert kept() is None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import itertools
 import os
 import re
 import shutil
@@ -18,7 +20,7 @@ import pytest
 
 import rejeu
 from rejeu import xla
-from rejeu.agents.run_files import run_files
+from rejeu.agents.run_files import copy_run, run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.io import checkpoint, json_arrays
@@ -643,3 +645,35 @@ def test_observations_of_half_precision_are_saved(tmp_path):
     with pytest.warns(UserWarning, match="at the start of new episodes"):
         resumed = rejeu.SAC.resume(tmp_path, env())
     assert_same(resumed.replay_buffer.arrays(), agent.replay_buffer.arrays())
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id", "settings"),
+    [
+        ("SAC", "Pendulum-v1", {"learning_starts": 20, "batch_size": 16, "priorities": {}}),
+        ("SAC", "jax/Pendulum-v1", {"learning_starts": 20, "batch_size": 16}),
+        ("PPO", "CartPole-v1", {"n_steps": 24, "batch_size": 8}),
+    ],
+)
+def test_no_two_copies_of_a_run_are_trained_to_the_same_agent(tmp_path, name, env_id, settings):
+    kind = rejeu.AGENTS[name]
+    agent = kind("MlpPolicy", env_id, seed=0, policy_kwargs={"net_arch": [8]}, **settings)
+    agent.learn(60, callback=Checkpoint(tmp_path / "source", every=30))
+    ends = {}
+    for folder, seed in (("one", 1), ("two", 2), ("again", 1), ("source", None)):
+        if seed is not None:
+            copy_run(tmp_path / "source", tmp_path / folder, seed)
+        with pytest.warns(UserWarning, match="it is a copy of another run") if seed else contextlib.nullcontext():
+            copied = kind.resume(tmp_path / folder)
+        np.testing.assert_equal(copied.get_parameters(), agent.get_parameters() | keys_of(copied))
+        copied.learn(60, reset_num_timesteps=False)
+        ends[folder] = copied.get_parameters() | {"returns": copied.evaluate(2, seed=copied.seed).returns}
+    np.testing.assert_equal(ends["one"], ends["again"])
+    for one, other in itertools.combinations(("one", "two", "source"), 2):
+        assert all(np.any(ends[one][key] != ends[other][key]) for key in ends[one] if "weight" in key)
+        assert np.any(ends[one]["returns"] != ends[other]["returns"])
+
+
+def keys_of(agent):
+    """The keys of the updates, which a copy has of its own."""
+    return {key: value for key, value in agent.get_parameters().items() if key == "key"}

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rejeu
-from rejeu.callbacks import Evaluate
+from rejeu.callbacks import Checkpoint, Evaluate
 from tests.jax_environments import Forbidden, Reach
 from tests.sharing import shared_learners
 
@@ -46,9 +45,7 @@ def train_alone(kind: Any, env: Any, n_steps: int, n_envs: int, seed: int, setti
         pytest.param(rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.MaskablePPO, Forbidden(), ON_POLICY, {}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.DQN, "jax/CartPole-v1", {**SMALL, "priorities": {}}, {}, marks=pytest.mark.exhaustive),
-        (rejeu.DQN, "CartPole-v1", {**SMALL, "priorities": {}}, {}),
-        pytest.param(rejeu.TD3, "Pendulum-v1", {**SMALL, "normalize": True, "action_noise": 0.1, "overlap": False}, {},
-                     marks=pytest.mark.exhaustive),
+        (rejeu.A2C, "CartPole-v1", {"n_steps": 5, "policy_kwargs": {"net_arch": [8]}}, {"ent_coef": [0.0, 0.1]}),
         pytest.param(rejeu.SAC, "jax/Pendulum-v1", SMALL, {"tau": [0.01, 0.1]}, marks=pytest.mark.exhaustive),
         pytest.param(
             rejeu.DDPG,
@@ -94,11 +91,22 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: s
     assert agents[1].learn(20, reset_num_timesteps=False).num_timesteps == 70
 
 
+def test_a_run_of_several_that_resumes_says_that_it_continues_alone(tmp_path: Any) -> None:
+    callback = lambda agent: Checkpoint(tmp_path / str(agent.seed), every=30)  # noqa: E731
+    agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 60, seeds=2, callback=callback, **SMALL)
+    with pytest.warns(UserWarning, match="one of 2 runs in one program"):
+        resumed = rejeu.DQN.resume(tmp_path / "1")
+    assert resumed.resumed is not None
+    assert not resumed.resumed.exact
+    for name, value in agents[1].get_parameters().items():
+        np.testing.assert_array_equal(value, resumed.get_parameters()[name])
+    resumed.learn(10, Checkpoint(tmp_path / "1", every=5))
+    assert rejeu.DQN.resume(tmp_path / "1").resumed.exact
+
+
 @pytest.mark.parametrize(
     ("env", "settings", "message"),
     [
-        ("CartPole-v1", {"learning_rate": [1e-3, 1e-4]}, "in JAX environments only"),
-        ("CartPole-v1", {"train_freq": [1, "episode"]}, "updates depend on episodes"),
         ("jax/CartPole-v1", {"train_freq": (1, "episode")}, "updates depend on episodes"),
         ("jax/CartPole-v1", {"gamma": [0.9, 0.99]}, "gamma cannot differ"),
         ("jax/CartPole-v1", {"batch_size": [8, 16]}, "batch_size cannot differ"),
@@ -152,74 +160,3 @@ def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
     assert raised.value.batch is not None
     assert raised.value.batch.parent == tmp_path / "1e+30"
     assert str(raised.value).startswith("seed 0, learning_rate=1e+30: ")
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("normalize", [False, True])
-def test_an_error_of_one_run_on_the_host_names_its_batch(tmp_path: Any, normalize: bool) -> None:
-    def callbacks(agent: Any) -> list[Any]:
-        agent.report_folder = tmp_path
-        agents.append(agent)
-        return []
-
-    agents: list[Any] = []
-    settings = {**SMALL, "learning_rate": 1e30, "normalize": normalize}
-    with pytest.raises(rejeu.NonFiniteError) as raised:
-        rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "CartPole-v1", 120, seeds=2, callback=callbacks, **settings)
-    assert raised.value.batch is not None
-    assert all(np.isfinite(value).all() for value in agents[0].get_parameters().values())
-
-
-class Echo(gym.Env):
-    """Its observation is the action; the rewards of environments with the seed 4 become huge."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-    def __init__(self) -> None:
-        self.n_steps, self.is_huge = 0, False
-        self.taken: list[np.ndarray] = []
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.is_huge |= seed == 4
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: np.ndarray) -> Any:
-        self.n_steps += 1
-        self.taken.append(action)
-        return action, 1e30 if self.is_huge and self.n_steps > 40 else 0.0, False, self.n_steps % 10 == 0, {}
-
-
-@pytest.fixture
-def echo() -> Any:
-    """The id of an environment."""
-    gym.register("Echo-v0", Echo)
-    yield "Echo-v0"
-    del gym.registry["Echo-v0"]
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("overlap", [True, False])
-@pytest.mark.parametrize("rate", [1e-3, lambda progress: jnp.where(progress > 0.5, 1e30, 1e-3)])
-def test_a_bad_update_on_the_host_ends_all_runs_with_the_next_turn(
-    tmp_path: Any, echo: str, overlap: bool, rate: Any
-) -> None:
-    """With the second learning rate all actions of both runs would be NaN in the middle of a chunk."""
-
-    def callbacks(agent: Any) -> list[Any]:
-        agent.report_folder = tmp_path
-        agents.append(agent)
-        return []
-
-    agents: list[Any] = []
-    settings = {**SMALL, "learning_rate": rate, "overlap": overlap}
-    seeds = [4, 9] if rate == 1e-3 else [5, 9]
-    with pytest.raises(rejeu.NonFiniteError, match=rf"seed {seeds[0]}: .* The agent is as it was") as raised:
-        rejeu.train_seeds(rejeu.SAC, "MlpPolicy", echo, 120, seeds=seeds, callback=callbacks, **settings)
-    for agent in agents:
-        assert raised.value.step <= agent.run.step <= raised.value.step + overlap
-        assert np.isfinite(agent.env.envs[0].unwrapped.taken).all()
-        assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
-    which = agents if rate == 1e-3 else agents[:1]
-    assert all(agent.n_updates == agent.get_parameters()["n_updates"] for agent in which)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import jax
 import numpy as np
 import pytest
@@ -136,45 +135,3 @@ def test_padding_leaks_into_no_update():
     spoilt = rollout._replace(**{name: spoil(getattr(rollout, name)).astype(np.float32) for name in names})
     for one, two in zip(*(jax.tree.leaves(update(state, r, CLOCK)) for r in (rollout, spoilt)), strict=True):
         np.testing.assert_array_equal(one, two)
-
-
-def test_the_defaults_are_those_of_stable_baselines3():
-    theirs = {
-        "learning_rate": 7e-4,
-        "n_steps": 5,
-        "gamma": 0.99,
-        "gae_lambda": 1.0,
-        "ent_coef": 0.0,
-        "vf_coef": 0.5,
-        "max_grad_norm": 0.5,
-        "use_rms_prop": True,
-        "rms_prop_eps": 1e-5,
-        "normalize_advantage": False,
-    }
-    config = a2c.Config()
-    assert {key: getattr(config, key) for key in theirs} == theirs
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"n_steps": 0}, "n_steps=0 must be a whole number of at least 1"),
-        ({"rms_prop_eps": 0.0}, "rms_prop_eps=0.0 must be a finite number, above 0"),
-        ({"use_rms_prop": 1}, "use_rms_prop=1 must be True or False"),
-        ({"gae_lambda": 1.1}, "gae_lambda=1.1 must be a finite number, at least 0 and at most 1"),
-        ({"learning_rate": float("nan")}, "learning_rate=nan must be finite"),
-        (
-            {"critic_learning_rate": 1e-3, "policy_kwargs": {"share_layers": True}},
-            "critic_learning_rate is a learning rate of its own for the value, which share_layers=True forbids; leave one",
-        ),
-    ],
-)
-def test_an_impossible_setting_is_refused_in_one_line(settings, message):
-    with pytest.raises((ValueError, TypeError), match=message) as caught:
-        a2c.Config(**settings)
-    assert "\n" not in str(caught.value)
-
-
-def test_an_action_space_that_does_not_fit_is_refused_in_one_line():
-    with pytest.raises(ValueError, match=r"A2C needs a Box, .* got Dict.*ActionWrapper"):
-        a2c.make(a2c.Config(), OBS_SPACE, gym.spaces.Dict({"a": gym.spaces.Discrete(2)}))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -234,36 +233,6 @@ def test_a_policy_acts_on_each_observation_by_itself():
     np.testing.assert_allclose(
         algorithm.exploit(state.actor, obs)[:1], algorithm.exploit(state.actor, obs[:1]), atol=1e-6
     )
-
-
-def test_the_defaults_are_those_of_stable_baselines3_contrib():
-    config = crossq.Config()
-    shown = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    expected = {"learning_rate": 1e-3, "policy_delay": 3, "renorm_warmup_steps": 100_000, "n_critics": 2}
-    expected |= {"gamma": 0.99, "batch_size": 256, "ent_coef": "auto", "learning_starts": 100}
-    assert {key: shown[key] for key in expected} == expected
-    state = jax.eval_shape(crossq.make(config, OBS_SPACE, ACTION_SPACE).init, jax.random.PRNGKey(0))
-    assert [layer.weight.shape for layer in state.critics.torso.layers] == [(2, 5, 1024), (2, 1024, 1024)]
-    assert [layer.weight.shape for layer in state.actor.torso.layers] == [(3, 256), (256, 256)]
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"policy_delay": 0}, "policy_delay=0 must be a whole number of at least 1"),
-        ({"renorm_warmup_steps": -1}, "renorm_warmup_steps=-1 must be"),
-        ({"policy_kwargs": {"layer_norm": True}}, "take net_arch and activation_fn, not layer_norm"),
-        ({"ent_coef": 0}, "ent_coef=0 must be"),
-    ],
-)
-def test_an_impossible_setting_is_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        crossq.Config(**settings)
-
-
-def test_discrete_actions_are_refused():
-    with pytest.raises(ValueError, match="CrossQ needs a Box action space"):
-        crossq.make(crossq.Config(), OBS_SPACE, gym.spaces.Discrete(2))
 
 
 def test_it_finds_the_best_action_of_a_probe_and_its_values_and_a_file_keeps_them(tmp_path):

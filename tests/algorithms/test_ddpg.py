@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import gymnasium as gym
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.algorithms import ddpg
 from rejeu.core import TD_ERROR
-from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_DIM, OBS_SPACE, box_batch
+from tests.algorithms.batches import BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch
 from tests.environments import Sampled
 from tests.numpy_networks import (
     Adam,
@@ -228,76 +227,7 @@ def test_the_learning_rate_follows_its_schedule():
         np.testing.assert_allclose(later, 0.75 * first, rtol=1e-3)
 
 
-# What it starts from.
-
-
-def test_the_defaults_are_those_of_stable_baselines3():
-    """The signature of ``stable_baselines3.DDPG.__init__`` in version 2.9.2, and the widths in its ``td3/policies.py``."""
-    theirs = {
-        "learning_rate": 1e-3,
-        "buffer_size": 1_000_000,
-        "learning_starts": 100,
-        "batch_size": 256,
-        "tau": 0.005,
-        "gamma": 0.99,
-        "train_freq": 1,
-        "gradient_steps": 1,
-        "action_noise": None,
-        "n_steps": 1,
-    }
-    config = ddpg.Config()
-    assert {key: getattr(config, key) for key in theirs} == theirs
-    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
-    state = jax.eval_shape(ddpg.make(config, OBS_SPACE, ACTION_SPACE).init, key)
-    widths = lambda network: [layer.weight.shape for layer in (*network.torso.layers, network.head)]  # noqa: E731
-    assert widths(state.actor) == [(OBS_DIM, 400), (400, 300), (300, ACTION_DIM)]
-    assert widths(state.critic) == [(OBS_DIM + ACTION_DIM, 400), (400, 300), (300, 1)]
-
-
 # What is refused.
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"tau": 0.0}, "tau=0.0 must be a finite number, above 0 and at most 1"),
-        ({"gamma": 1.01}, "gamma=1.01 must be a finite number, at least 0"),
-        ({"learning_rate": -1e-3}, "learning_rate=-0.001"),
-        ({"target_update_interval": 0}, "target_update_interval=0 must be a whole number of at least 1"),
-        ({"batch_size": 0}, "batch_size=0 must be a whole number of at least 1"),
-    ],
-)
-def test_an_impossible_setting_is_refused_in_one_line(settings, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        ddpg.Config(**settings)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("policy_delay", "DDPG has no setting 'policy_delay'"),
-        ("learning_rte", "DDPG has no setting 'learning_rte'; did you mean learning_rate"),
-    ],
-)
-def test_a_setting_that_it_does_not_have_is_named(setting, message):
-    with pytest.raises(TypeError, match=message):
-        rejeu.DDPG("MlpPolicy", Sampled(OBS_SPACE), **{setting: 2})
-
-
-@pytest.mark.parametrize(
-    ("space", "message"),
-    [
-        (gym.spaces.MultiDiscrete([2, 2]), "DDPG needs a Box action space, got MultiDiscrete.*ActionWrapper"),
-        (gym.spaces.Box(-np.inf, np.inf, (2,)), "DDPG needs finite action bounds, got .*RescaleAction"),
-        (gym.spaces.Box(-np.inf, np.inf, (2, 2)), "DDPG needs finite action bounds, got .*RescaleAction"),
-        (gym.spaces.Box(1.0, 1.0, (2,)), "every action bound must satisfy low < high"),
-    ],
-)
-def test_an_action_space_that_does_not_fit_is_refused_in_one_line(space, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        ddpg.make(ddpg.Config(), OBS_SPACE, space)
-    assert "\n" not in str(caught.value)
 
 
 def test_an_observation_space_without_arrays_is_refused():

@@ -380,41 +380,6 @@ def test_recorded_updates_clip_their_gradients_and_move_every_network(record):
         assert moved > 1e-3, part
 
 
-# What is refused.
-
-
-@pytest.mark.parametrize(
-    ("space", "instead"),
-    [(gym.spaces.Box(-1.0, 1.0, (2,)), "SAC or TD3"), (gym.spaces.MultiDiscrete([2, 2]), "ActionWrapper")],
-)
-def test_other_action_spaces_are_refused_with_what_to_use(space, instead):
-    with pytest.raises(ValueError, match=f"DQN needs a Discrete action space, got .*{instead}"):
-        dqn.make(dqn.Config(), OBS_SPACE, space)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"exploration_fraction": 0}, "exploration_fraction=0 must be"),
-        ({"exploration_initial_eps": 1.5}, "exploration_initial_eps=1.5 must be"),
-        ({"exploration_final_eps": -0.1}, "exploration_final_eps=-0.1 must be"),
-        ({"exploration_schedule": "cosine"}, "must be 'linear' or 'exponential'"),
-        (
-            {"exploration_schedule": "exponential", "exploration_final_eps": 0},
-            "is not possible with an exponential schedule",
-        ),
-        ({"target_update_interval": 0}, "target_update_interval=0 must be"),
-        ({"max_grad_norm": 0}, "max_grad_norm=0 must be"),
-        ({"clip_grad_value": -1}, "clip_grad_value=-1 must be"),
-        ({"loss": "absolute"}, "loss='absolute' must be 'huber' or 'squared'"),
-        ({"action_noise": rejeu.NormalActionNoise([0.0], [0.1])}, "does not apply to Discrete actions"),
-    ],
-)
-def test_an_impossible_setting_is_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        dqn.Config(**setting)
-
-
 # What it learns.
 
 

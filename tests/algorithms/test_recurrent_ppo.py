@@ -591,29 +591,6 @@ def test_memory_is_begun_anew_when_training_is(agent):
     assert all(np.isfinite(value).all() for value in other.get_parameters().values())
 
 
-@pytest.mark.parametrize(
-    ("settings", "error", "message"),
-    [
-        ({"use_sde": True}, ValueError, "state-dependent noise is not available for policies with memory"),
-        ({"n_episodes": 1}, ValueError, "give n_steps and leave it out"),
-        ({"critic_learning_rate": 1e-3}, ValueError, "leave it out"),
-        ({"policy_kwargs": {"cell": "rnn"}}, ValueError, "must be 'lstm' or 'gru'"),
-        ({"policy_kwargs": {"lstm_hidden_size": 0}}, ValueError, "lstm_hidden_size=0"),
-        ({"policy_kwargs": {"shared_lstm": 1}}, TypeError, "shared_lstm=1 must be True or False"),
-        ({"policy_kwargs": {"share_layers": True}}, ValueError, "needs shared_lstm=True"),
-        (
-            {"policy_kwargs": {"shared_lstm": True, "share_features_extractor": False}},
-            ValueError,
-            "shared_lstm=True conflicts with share_features_extractor=False: .*; leave out one",
-        ),
-        ({"policy_kwargs": {"lstm_size": 4}}, TypeError, "lstm_hidden_size"),
-    ],
-)
-def test_a_bad_setting_is_refused_with_the_fix(settings, error, message):
-    with pytest.raises(error, match=message):
-        small(**settings)
-
-
 def test_the_network_reads_through_the_encoder():
     """A Discrete observation is one-hot encoded before the cell."""
     shape = RecurrentConfig(lstm_hidden_size=SIZE, net_arch=(5,))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import equinox as eqx
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from rejeu.algorithms import td3
 from rejeu.core import TD_ERROR
-from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_DIM, OBS_SPACE, box_batch, noise_of
+from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.numpy_networks import (
     Adam,
     action_value as value,
@@ -260,66 +259,3 @@ def test_each_update_draws_other_noise(learner):
     later = eqx.tree_at(lambda s: s.n_updates, state, jnp.int32(DELAY))
     losses = [float(update(s, random_batch(), CLOCK)[1]["critic_loss"]) for s in (state, later)]
     assert losses[0] != losses[1]
-
-
-# What it starts from.
-
-
-def test_the_defaults_are_those_of_stable_baselines3():
-    """The signature of ``stable_baselines3.TD3.__init__`` in version 2.9.2, and the numbers in its ``policies.py``."""
-    theirs = {
-        "learning_rate": 1e-3,
-        "buffer_size": 1_000_000,
-        "learning_starts": 100,
-        "batch_size": 256,
-        "tau": 0.005,
-        "gamma": 0.99,
-        "train_freq": 1,
-        "gradient_steps": 1,
-        "action_noise": None,
-        "n_steps": 1,
-        "policy_delay": 2,
-        "target_policy_noise": 0.2,
-        "target_noise_clip": 0.5,
-    }
-    config = td3.Config()
-    assert {key: getattr(config, key) for key in theirs} == theirs
-    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
-    state = jax.eval_shape(td3.make(config, OBS_SPACE, ACTION_SPACE).init, key)
-    widths = lambda network: [layer.weight.shape for layer in (*network.torso.layers, network.head)]  # noqa: E731
-    assert widths(state.actor) == [(OBS_DIM, 400), (400, 300), (300, ACTION_DIM)]
-    assert widths(state.critics) == [(2, OBS_DIM + ACTION_DIM, 400), (2, 400, 300), (2, 300, 1)]
-
-
-# What is refused.
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"policy_delay": 0}, "policy_delay=0 must be a whole number of at least 1"),
-        ({"policy_delay": 1.5}, "policy_delay=1.5 must be a whole number of at least 1"),
-        ({"n_critics": 0}, "n_critics=0 must be a whole number of at least 1"),
-        ({"target_policy_noise": -0.1}, "target_policy_noise=-0.1 must be a finite number, at least 0"),
-        ({"target_noise_clip": float("nan")}, "target_noise_clip=nan must be a finite number, at least 0"),
-        ({"tau": 1.5}, "tau=1.5 must be a finite number"),
-    ],
-)
-def test_an_impossible_setting_is_refused_in_one_line(settings, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        td3.Config(**settings)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("space", "message"),
-    [
-        (gym.spaces.Discrete(3), "TD3 needs a Box action space, got Discrete.*use DQN"),
-        (gym.spaces.MultiBinary(3), "TD3 needs a Box action space, got MultiBinary.*ActionWrapper"),
-        (gym.spaces.Box(0.0, np.inf, (2,)), "TD3 needs finite action bounds, got .*RescaleAction"),
-    ],
-)
-def test_an_action_space_that_does_not_fit_is_refused_in_one_line(space, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        td3.make(td3.Config(), OBS_SPACE, space)
-    assert "\n" not in str(caught.value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import gymnasium as gym
@@ -208,38 +207,6 @@ def test_a_fixed_temperature_stays():
     after, metrics = update(state, random_batch(), CLOCK)
     assert float(metrics["ent_coef"]) == pytest.approx(0.2)
     assert float(after.log_alpha) == float(state.log_alpha)
-
-
-def test_the_defaults_are_those_of_stable_baselines3_contrib():
-    config = tqc.Config()
-    shown = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    expected = {"learning_rate": 3e-4, "n_quantiles": 25, "top_quantiles_to_drop_per_net": 2, "n_critics": 2}
-    expected |= {"tau": 0.005, "gamma": 0.99, "batch_size": 256, "ent_coef": "auto", "target_update_interval": 1}
-    assert {key: shown[key] for key in expected} == expected
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"n_quantiles": 2, "top_quantiles_to_drop_per_net": 2}, "would leave nothing of n_quantiles=2; use at most 1"),
-        (
-            {"top_quantiles_to_drop_per_net": -1},
-            "top_quantiles_to_drop_per_net=-1 must be a whole number of at least 0",
-        ),
-        ({"n_quantiles": 0}, "n_quantiles=0 must be a whole number of at least 1"),
-        ({"n_critics": 0}, "n_critics=0 must be"),
-        ({"ent_coef": "automatic"}, "ent_coef='automatic' must be"),
-        ({"target_entropy": "low"}, "target_entropy='low' must be"),
-    ],
-)
-def test_an_impossible_setting_is_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        tqc.Config(**settings)
-
-
-def test_discrete_actions_are_refused():
-    with pytest.raises(ValueError, match="TQC needs a Box action space"):
-        tqc.make(tqc.Config(), OBS_SPACE, gym.spaces.Discrete(2))
 
 
 class Halfway(gym.Env):

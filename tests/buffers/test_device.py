@@ -20,6 +20,7 @@ from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.functional.vector import goal_functions
 from rejeu.loops.device.off_policy import draws
 from rejeu.schedules import Linear
+from tests.buffers.test_hindsight import closest
 from tests.jax_environments import Reach
 from tests.loops.device.same_draws import use_same_draws
 
@@ -107,14 +108,14 @@ def test_uniform_batches_equal_those_of_the_host(n_envs: int, n: int, n_steps: i
 
 @pytest.mark.parametrize(
     "strategy",
-    ["future", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("final", "episode", "random"))],
+    ["future", closest, *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("final", "episode", "random"))],
 )
 @pytest.mark.parametrize(
     ("n", "n_steps", "stops"),
     [(15, 1, False), (100, 1, True), (100, 3, True)],
     ids=["running", "overwritten", "n-step"],
 )
-def test_hindsight_batches_equal_those_of_the_host(strategy: str, n: int, n_steps: int, stops: bool) -> None:
+def test_hindsight_batches_equal_those_of_the_host(strategy: Any, n: int, n_steps: int, stops: bool) -> None:
     config = HindsightConfig(n_sampled_goal=4, goal_selection_strategy=strategy)
     goals = goal_functions(Reach(stops=stops))
     assert goals is not None

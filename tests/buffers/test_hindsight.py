@@ -6,6 +6,8 @@ sampled goal tells where it was taken from.
 
 from __future__ import annotations
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from scipy import stats
 
 from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer, HindsightConfig, counters
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
+from rejeu.buffers.strategies import register_goal_strategy
+from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.goals import GoalFunctions
 from tests.replay_model import GOAL_OBSERVATION, Model, Turn, make_ring, observe_goal, play, turns
 
@@ -259,6 +263,28 @@ FUNCTIONS = {
     "future": lambda rng, time, first, last: time + 1 + (rng.random(len(time)) * (last - time)).astype(np.int64),
     "episode": lambda rng, time, first, last: first + (rng.random(len(time)) * (last - first + 1)).astype(np.int64),
 }
+
+
+@register_goal_strategy("closest")
+def closest(steps):
+    """Of four later observations, takes the one whose achieved goal is closest to the goal."""
+    times = steps.integers(steps.np.repeat(steps.time[:, None] + 1, 4, axis=1), steps.last[:, None] + 1)
+    distance = steps.np.abs(steps.achieved(times) - steps.desired()[:, None]).sum(axis=-1)
+    return steps.np.take_along_axis(times, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
+
+
+def test_a_strategy_of_the_users_own_sees_goals_and_is_known_by_its_name():
+    named, _ = filled(1, 40, RUNNING_AND_WRAPPED, closest)
+    assert named.config.goal_selection_strategy == "closest"
+    later, _ = filled(1, 40, RUNNING_AND_WRAPPED, "future")
+    distances = []
+    for buffer in (named, later):
+        buffer.config = dataclasses.replace(buffer.config, n_sampled_goal=10**6)
+        plain = ReplayBuffer(buffer.ring, 0.9).sample(np.random.default_rng(0), (400,))
+        batch = buffer.sample(np.random.default_rng(0), (400,))
+        np.testing.assert_array_equal(batch.obs["observation"], plain.obs["observation"])
+        distances.append(np.abs(batch.obs["desired_goal"] - plain.obs["desired_goal"])[:-1].mean())
+    assert distances[0] < distances[1]
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])

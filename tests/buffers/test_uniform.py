@@ -11,7 +11,7 @@ from scipy import stats
 
 from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
-from rejeu.buffers.ring import COUNTERS, check_memory
+from rejeu.buffers.ring import COUNTERS
 from rejeu.buffers.uniform import ReplayBuffer
 from tests.replay_model import Model, Turn, make_ring, observe, play, turns
 
@@ -200,11 +200,6 @@ def test_small_numbers_leave_no_gaps_between_larger_ones():
     boxes = {"a": (9, np.uint8), "b": (2, np.float32), "c": (7, np.uint8)}
     space = gym.spaces.Dict({key: gym.spaces.Box(0, 255, (n,), dtype) for key, (n, dtype) in boxes.items()})
     assert make_ring(100, 1, space).nbytes == 100 * (9 + 2 * 4 + 7 + 4 + 4 + 1)
-
-
-def test_memory_beyond_the_machine_is_refused_with_the_numbers():
-    with pytest.raises(MemoryError, match=r"buffer_size=1000 takes .* GiB .* machine has .* GiB; try buffer_size=\d+"):
-        check_memory(2**60, 1000)
 
 
 # Files of buffers.

@@ -15,9 +15,10 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Evaluate
-from rejeu.cli import main, one_line, run_folder, settings
+from rejeu.cli import main, one_line
 from rejeu.reporting.logging import CsvFile
 from rejeu.reporting.report.page import plotly_script
+from rejeu.runs import folder, values
 from tests.full_disk import FullDisk
 from tests.tiers import exhaustive
 
@@ -179,7 +180,7 @@ def test_goal_environments_are_trained_with_hindsight(tmp_path):
 
 def test_without_a_name_the_run_folder_is_new_each_time(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folders = [run_folder.create(None, "ALE/Pong-v5", "SAC", 7).path for _ in range(3)]
+    folders = [folder.create(None, "ALE/Pong-v5", "SAC", 7).path for _ in range(3)]
     assert len(set(folders)) == 3
     assert re.fullmatch(r"ALE-Pong-v5-SAC-seed7-\d{8}-\d{6}", folders[0].name)
 
@@ -298,7 +299,7 @@ def test_python_m_rejeu_is_the_same_command():
 
 def test_set_takes_dotted_names_numbers_lists_and_words():
     argv = ['train_freq=[1,"episode"]', "learning_rate=1e-3", "policy_kwargs.net_arch=[64,64]", "ent_coef=auto_0.1"]
-    assert settings.apply(argv, {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
+    assert values.apply(argv, {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
         "policy_kwargs": {"layer_norm": True, "net_arch": [64, 64]},
         "gamma": 0.9,
         "train_freq": [1, "episode"],
@@ -308,12 +309,12 @@ def test_set_takes_dotted_names_numbers_lists_and_words():
 
 
 def test_set_understands_pythons_false_as_false():
-    assert settings.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
+    assert values.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
 
 
 def test_set_leaves_the_preset_as_it_was():
     preset = rejeu.presets.find("parking-v0")
-    settings.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
+    values.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
 
 
@@ -362,6 +363,9 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "--env", "Pendulum-v1"], "the environment is given without an option: rejeu train ENV"),
         (["tune", "Pendulum-v1", "--lr", "1e-3"], "hyperparameters are given as --set learning_rate=1e-3"),
         (["evaluate", "run", "-n", "5"], "no option -n; "),
+        (["train", "Pendulum-v1", "--tensorboard"], "no option --tensorboard; logs are named by --log tensorboard"),
+        (["train", "Pendulum-v1", "--gamma=0.9"], "hyperparameters are given as --set gamma=VALUE"),
+        (["resume", "run", "--net-arch", "64"], "given as --set policy_kwargs.net_arch=[64,64]"),
         (["train", "-s", "0"], "rejeu train has no option -s; did you mean --set?"),
         (["train", "Pendulum v1"], "no environment is called 'Pendulum v1'; did you mean Pendulum-v1"),
         (["train", "Pendulum-v1", "--seed", "x"], "--seed 'x' must be a whole number"),
@@ -591,7 +595,7 @@ def test_a_warning_is_one_line_on_the_command_line(capsys):
     argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1"]
     with pytest.MonkeyPatch.context() as patch:
         warn = lambda out: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
-        patch.setattr("rejeu.cli.run_folder.check_free", warn)
+        patch.setattr("rejeu.cli.train.check_free", warn)
         patch.setattr("rejeu.cli.environment.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
         with warnings.catch_warnings():
             warnings.simplefilter("always")

@@ -108,5 +108,10 @@ def test_status(runs, capsys):
     write_run(runs / "short", steps=1000, every=10)
     config = runs / "short" / "config.json"
     config.write_text(config.read_text(encoding="utf-8").replace("1000", "5000"), encoding="utf-8")
+    capsys.readouterr()
     assert cli.main(["status", str(runs / "short")]) == 3
+    assert "over the last 100 episodes" in capsys.readouterr().out
+    write_run(runs / "few", steps=1000, every=50)
+    cli.main(["status", str(runs / "few")])
+    assert "over the last 20 episodes" in capsys.readouterr().out
     assert cli.main(["status", str(runs / "none")]) == 2

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -11,9 +12,9 @@ import pytest
 
 import rejeu
 from rejeu import cli
-from rejeu.sweeps import process
+from rejeu.experiments import process
 
-FAKE = Path(__file__).parents[1] / "tuning" / "fake_training.py"
+FAKE = Path(__file__).parents[1] / "experiments" / "fake_training.py"
 SMALL = ["--algo", "SAC", "--members", "4", "--rounds", "2", "--round-steps", "10", "--only", "learning_rate"]
 SMALL += ["--search", "learning_rate=1e-5..4e-3"]
 
@@ -21,8 +22,11 @@ SMALL += ["--search", "learning_rate=1e-5..4e-3"]
 @pytest.fixture
 def pretend(monkeypatch):
     """Lets trainings run a program that pretends."""
-    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
-    monkeypatch.setattr("rejeu.tuning.members.POLL", 0.03)
+    monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-S", str(FAKE), str(task)])
+    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0.03)
+    monkeypatch.setattr(
+        "rejeu.experiments.population.copy_run", lambda source, target, seed: shutil.copytree(source, target)
+    )
 
 
 def test_a_population_from_the_command_line(pretend, tmp_path, capsys):

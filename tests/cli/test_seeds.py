@@ -4,33 +4,38 @@ import dataclasses
 import json
 import os
 import sys
+from pathlib import Path
 
 import pytest
 
 from rejeu import cli
 from rejeu.cli import seeds
 from rejeu.cli.commands import Train
-from rejeu.sweeps import process, processes
-from rejeu.sweeps.jobs import Code, Options
+from rejeu.experiments import process
+from rejeu.runs.config import RunConfig
 from tests.reporting.test_comparison import write_run
 
-PROGRAM = (
-    "import sys; seed = sys.argv[sys.argv.index('--seed') + 1]; print('the seed is', seed); sys.exit(2 * (seed == '1'))"
-)
+PROGRAM = """
+import json, sys
+seed = json.load(open(sys.argv[1]))["run"]["seed"]
+print("the seed is", seed)
+sys.exit(2 * (seed == 1))
+"""
 
 
 @pytest.fixture
 def other_program(monkeypatch):
     """Runs another program in the place of ``rejeu``, and writes the run folders."""
-    start = processes.LocalLauncher.start
+    start = process.LocalLauncher.start
 
-    def start_other(self, words, run, log, lock):
-        seed = int(words[words.index("--seed") + 1])
-        write_run(run, seed=seed, level=10.0 + seed)
-        return start(self, words, run, log, lock)
+    def start_other(self, task, log, lock):
+        content = json.loads(task.read_text(encoding="utf-8"))
+        seed = content["run"]["seed"]
+        write_run(Path(content["folder"]), seed=seed, level=10.0 + seed)
+        return start(self, task, log, lock)
 
-    monkeypatch.setattr(processes.LocalLauncher, "start", start_other)
-    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-c", PROGRAM, *words])
+    monkeypatch.setattr(process.LocalLauncher, "start", start_other)
+    monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-c", PROGRAM, str(task)])
 
 
 def test_a_seed_that_fails_keeps_its_log_and_does_not_stop_the_others(tmp_path, other_program, capsys):
@@ -57,34 +62,27 @@ def test_result_as_json(tmp_path, other_program, capsys):
 
 def test_options_are_passed_on():
     arguments = Train(
-        "CartPole-v1",
-        algo="DQN",
+        env="CartPole-v1",
+        algorithm="DQN",
         steps=500,
         seeds=1,
         seed=1,
         checkpoint_minutes=0.5,
         imports=("my_module",),
-        assignments=(("gamma=0.9", "train_freq=[1,'episode']"),),
-        log=(("json",),),
+        hyperparameters={"gamma": 0.9, "train_freq": [1, "episode"]},
+        log=("json",),
     )
     (job,) = seeds.make_jobs(arguments)
-    assert job.train_words("OUT", Code(imports=arguments.imports)) == [
-        *("train", "CartPole-v1", "--import", "my_module", "--algo", "DQN", "--steps", "500"),
-        *("--checkpoint-minutes", "0.5", "--log", "json", "--set", "gamma=0.9", 'train_freq=[1, "episode"]'),
-        *("--seed", "1", "--out", "OUT"),
-    ]
+    task = job.task(Path("OUT"), False, arguments.imports)
+    given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
+    assert (task.folder, task.run, task.resume) == ("OUT", RunConfig(**given), False)
 
 
 def test_the_address_of_a_cluster_is_in_no_file(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "")
-    arguments = Train("CartPole-v1", seeds=2, seed=1, backend="ray", ray="10.0.0.1:6379")
-    assert {job.options.ray for job in seeds.make_jobs(arguments)} == {"auto"}
+    arguments = Train(env="CartPole-v1", seeds=2, seed=1, backend="ray", ray="10.0.0.1:6379")
+    assert {job.run.ray for job in seeds.make_jobs(arguments)} == {"auto"}
     assert os.environ["RAY_ADDRESS"] == "10.0.0.1:6379"
-
-
-def test_every_option_of_train_is_one_of_a_job():
-    names = {one.name for one in dataclasses.fields(Train)}
-    assert names - seeds.OWN == {one.name for one in dataclasses.fields(Options)}
 
 
 def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):

@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 
 import rejeu
 from rejeu import cli, supervised
-from rejeu.sweeps.folder import read_folder
+from rejeu.experiments.folder import read_folder
 
 PLAN = """\
 environments = ["CartPole-v1"]
@@ -100,7 +100,7 @@ def test_a_supervised_process_stops_when_its_input_ends(child):
 def test_a_mistake_in_the_plan(tmp_path, capsys):
     path = write_plan(tmp_path, 0)
     assert cli.main(["sweep", str(path), "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err == f"rejeu: error: {path}, line 4: steps=0 must be a whole number of at least 1\n"
+    assert capsys.readouterr().err == f"rejeu: error: {path}, line 4: steps=0: expected `int` >= 1\n"
     assert not (tmp_path / "out").exists()
 
 

@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 from rejeu import cli
-from rejeu.sweeps import process
+from rejeu.experiments import process
 
 optuna = pytest.importorskip("optuna")
-FAKE = Path(__file__).parents[1] / "tuning" / "fake_training.py"
+FAKE = Path(__file__).parents[1] / "experiments" / "fake_training.py"
 SMALL = ["--steps", "40", "--evaluate-every", "10", "--only", "learning_rate", "--search", "learning_rate=1e-5..4e-3"]
 
 
 @pytest.fixture
 def pretend(monkeypatch):
     """Lets trainings run a program that pretends."""
-    monkeypatch.setattr(process, "program", lambda words: [sys.executable, "-S", str(FAKE), *words])
-    monkeypatch.setattr("rejeu.tuning.search.POLL", 0.03)
+    monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-S", str(FAKE), str(task)])
+    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0.03)
 
 
 def tune(*words, out):
@@ -33,10 +33,18 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
     assert tune("--trials", "3", "--final-seeds", "0", out=tmp_path / "study") == 0
     printed = capsys.readouterr().out
     assert "algorithm     SAC, seed 0, pruner median" in printed
+    assert "at the end" not in printed
     assert "search        learning_rate: 1e-05 to 0.004, logarithmic" in printed
     assert "trials        3 complete" in printed
     assert f"preset        {tmp_path / 'study' / 'preset.json'}" in printed
     assert (tmp_path / "study" / "study.html").is_file()
+
+
+def test_the_final_comparison_is_announced_with_its_length(pretend, tmp_path, capsys):
+    assert tune("--trials", "2", "--search", "learning_rate=1e-4..9e-4", out=tmp_path / "study") == 0
+    printed = capsys.readouterr().out
+    assert "at the end    the best trial and the default: 5 fresh seeds each, 10 trainings of 40 steps\n" in printed
+    assert "with the default: 5 fresh seeds each, 10 trainings of 40 steps, about " in printed
 
 
 def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeypatch):
@@ -75,7 +83,10 @@ def test_a_study_without_a_complete_trial_exits_with_2(pretend, tmp_path, capsys
     ("words", "message"),
     [
         (["tune", "Pendulum-v1", "--algo", "SACK"], "no algorithm is called 'SACK'; did you mean SAC?"),
-        (["tune", "Acrobot-v1"], "Acrobot-v1 has no preset; name the algorithm to tune, such as --algo PPO"),
+        (
+            ["tune", "Blackjack-v1"],
+            "Blackjack-v1 has no preset; name the algorithm to tune, such as --algo PPO",
+        ),
         (["tune", "Pendulum-v9", "--algo", "SAC"], "Pendulum"),
         (["tune", "Pendulum-v1", "--only", "gama"], "has no setting 'gama'; did you mean gamma?"),
         (["tune", "Pendulum-v1", "--search", "gamma=0.9..0.8"], "--search gamma: the range from 0.9 to 0.8 is empty"),
@@ -126,12 +137,12 @@ def command(*words):
 @pytest.mark.exhaustive
 def test_the_preset_of_a_real_study_trains(tmp_path):
     out = tmp_path / "study"
-    words = [*REAL, "--trials", 3, "--steps", 2000, "--final-seeds", 3, "--trial-seeds", 2, "--out", out, "--json"]
+    words = [*REAL, "--trials", 3, "--steps", 2000, "--final-seeds", 5, "--trial-seeds", 2, "--out", out, "--json"]
     done = subprocess.run(command(*words), capture_output=True, text=True, check=True)
     result = json.loads(done.stdout)
     assert [one["state"] for one in result["trials"]] == ["complete"] * 3
     assert result["verdict"] in ("better", "worse", "no difference found")
-    assert [row["runs"] for row in result["comparison"]] == [3, 3]
+    assert [row["runs"] for row in result["comparison"]] == [5, 5]
     words = ["train", "CartPole-v1", "--preset", out / "preset.json", "--out", tmp_path / "run", "--no-video"]
     subprocess.run(command(*words), capture_output=True, check=True)
 

@@ -7,9 +7,9 @@ import pytest
 from safetensors.numpy import load_file
 
 from rejeu import cli
-from rejeu.cli import run_folder
-from rejeu.cli.run_folder import RunFolder
 from rejeu.errors import CheckpointError
+from rejeu.runs import folder as run_folder
+from rejeu.runs.folder import RunFolder
 
 SHORT = [
     "--algo=SAC", "--envs=3", "--backend=gymnasium-async", "--seed=0", "--no-report", "--no-video",

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from rejeu import courses
+from rejeu.courses import checks
 from rejeu.errors import MissingExtra
 
 
@@ -16,6 +17,17 @@ def test_a_notebook_goes_on_without_a_window(error, monkeypatch, capsys):
     monkeypatch.setattr("rejeu.play.play", play)
     assert courses.by_hand("Mountain", episodes=3) == []
     assert capsys.readouterr().out == f"{error}\n"
+
+
+def test_a_french_notebook_says_so_in_french(monkeypatch, capsys):
+    def play(*_, **__):
+        raise OSError("cannot open a window")
+
+    monkeypatch.setattr("rejeu.play.play", play)
+    checks.speak("fr")
+    assert courses.by_hand("Mountain", episodes=3) == []
+    checks.speak("en")
+    assert "Impossible d'ouvrir une fenêtre" in capsys.readouterr().out
 
 
 def test_the_scores_are_yours_and_those_of_the_agent_are_printed(monkeypatch, capsys):

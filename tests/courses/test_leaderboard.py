@@ -80,6 +80,37 @@ def test_a_model_that_takes_too_long_is_not_ranked(folder, tmp_path):
     assert "it needs more than" in board["not_evaluated"][0]["reason"]
 
 
+def test_a_model_whose_returns_are_not_finite_is_not_ranked(tmp_path):
+    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}, seed=0)
+    agent.save(tmp_path / "good")
+    agent.run.state = [leaf * 0 + 3e38 if leaf.dtype == "float32" else leaf for leaf in agent.run.state]
+    agent.save(tmp_path / "huge")
+    run(tmp_path, tmp_path / "board.json")
+    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    assert [model["name"] for model in board["models"]] == ["good"]
+    assert [one["name"] for one in board["not_evaluated"]] == ["huge"]
+
+
+def test_success_is_not_what_the_author_of_a_file_calls_so(tmp_path):
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0, success_threshold=-1e9)
+    agent.save(tmp_path / "proud")
+    for options, rate in (((), 0.0), (("--success-threshold", "1"), 1.0)):
+        run(tmp_path, tmp_path / "board.json", *options)
+        (model,) = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))["models"]
+        assert (model["success_rate"], model["seed"], model["steps"]) == (rate, 0, 0)
+
+
+def test_a_leaderboard_in_french(folder, tmp_path):
+    run(folder, tmp_path / "board.md", "--language", "fr")
+    text = (tmp_path / "board.md").read_text(encoding="utf-8")
+    assert "| place | modèle | algorithme | pas | graine | retour moyen |" in text
+    assert "| 1 à 2 | anna | DQN | 0 | 0 |" in text
+    assert "il a été entraîné sur MountainCar-v0, et non sur CartPole-v1" in text
+    pytest.importorskip("jinja2")
+    run(folder, tmp_path / "board.html", "--language", "fr")
+    assert '<html lang="fr">' in (tmp_path / "board.html").read_text(encoding="utf-8")
+
+
 def test_a_page_without_models_says_so(folder):
     pytest.importorskip("jinja2")
     page = leaderboard.page(leaderboard.Leaderboard("CartPole-v1", 1, (), (("anna", "damaged"),)))

@@ -14,6 +14,9 @@ import rejeu
 from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, auto_backend, make_vector
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
+from rejeu.loops.run import restart
+from rejeu.sb3.common.env_util import make_vec_env
+from rejeu.sb3.common.vec_env import VecNormalize
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 
@@ -464,6 +467,19 @@ def test_training_begins_with_the_seeds_given_for_each_environment_and_not_with_
     assert (first(0, 4) != first(1, 4)).any()  # one number is the agent's to choose
 
 
+@pytest.mark.parametrize("kind", ["gymnasium", "envpool", "jax", "SyncVectorEnv", "VecNormalize"])
+def test_runs_with_consecutive_seeds_share_no_first_observation(kind):
+    def environments():
+        if kind == "VecNormalize":
+            return VecNormalize(make_vec_env("Pendulum-v1", 8), norm_obs=False)
+        if kind == "SyncVectorEnv":
+            return gym.vector.SyncVectorEnv([lambda: gym.make("Pendulum-v1")] * 8)
+        return make_vector("jax/Pendulum-v1" if kind == "jax" else "Pendulum-v1", 8, kind)
+
+    starts = [restart(small_sac(environments(), seed=seed).run).copy() for seed in range(5)]
+    assert len(np.unique(np.concatenate(starts), axis=0)) == 40
+
+
 @pytest.mark.parametrize(
     ("seed", "message"),
     [
@@ -491,3 +507,12 @@ def test_a_dict_in_a_dict_that_holds_one_array_is_read():
     vector = InProcess([Sampled(space) for _ in range(2)], seed=0)
     assert vector.reset()["arm"]["angles"].shape == (2, 2)
     assert vector.step(np.zeros((2, 1), np.float32)).obs["arm"]["angles"].shape == (2, 2)
+
+
+def test_environments_of_ones_own_are_not_looked_up_in_envpool(monkeypatch):
+    def refuse():
+        raise AssertionError("EnvPool is imported")
+
+    monkeypatch.setattr("rejeu.envs.registry.import_envpool", refuse)
+    gym.register("rejeu-test/Own-v0", lambda: gym.make("CartPole-v1"))
+    assert auto_backend("rejeu-test/Own-v0", 8) == "gymnasium"

@@ -8,10 +8,10 @@ import warnings
 import pytest
 
 from rejeu.cli.output import noted_in
+from rejeu.experiments.process import Process
 from rejeu.io import atomic
 from rejeu.reporting.history import History
 from rejeu.reporting.logging import CsvFile, JsonLines
-from rejeu.sweeps.process import Process
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
 

@@ -24,23 +24,24 @@ class Reading:
 def train(bad, is_reported, n_updates=4 * MAX_CALLS):
     """Runs a loop whose update number ``bad`` leaves NaN; readings show it, or only a look at the state does."""
 
+    newest = [-1]
+
     def update(state, batch, clock):
         number = int(batch.reward[0])
-        return [np.append(state[0], np.nan if number == bad else float(number))[-3:]], None, None
+        after = [np.append(state[0], np.nan if number == bad else float(number))[-3:]]
+        if not np.isfinite(state[0]).all():
+            after = [np.full(3, np.nan)]
+        is_bad = is_reported and not np.isfinite(after[0]).all()
+        return after, Reading(int(is_bad), number, newest), None
 
     copies = []
     copy = lambda state: copies.append(state) or [array.copy() for array in state]  # noqa: E731
     monitor = NonFiniteMonitor(copy, lambda state: bool(np.isfinite(state[0]).all()), skips=False)
-    state, newest = [np.zeros(3)], [-1]
+    state = [np.zeros(3)]
     for number in range(n_updates):
-        monitor.follow(state)
-        batch = Transition(None, None, np.array([float(number)]), None, None)
         n_unread, newest[0] = len(monitor), number
-        before = state
-        state = update(state, batch, CLOCK)[0]
-        state = [np.full(3, np.nan)] if not np.isfinite(before[0]).all() else state
-        is_bad = is_reported and not np.isfinite(state[0]).all()
-        monitor.record(state, update, batch, CLOCK, readings=Reading(int(is_bad), number, newest), n_updates=number)
+        batch = Transition(None, None, np.array([float(number)]), None, None)
+        state = monitor.update(update, state, batch, CLOCK, number)[0]
         monitor.read(n_unread)
     return copies
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,13 +14,14 @@ from gymnasium import spaces
 from scipy import signal, stats
 
 import rejeu
-from rejeu import validation
+from rejeu import cli, validation
 from rejeu.algorithms import config as configs, sac
 from rejeu.core import ensemble
 from rejeu.errors import CheckpointError
 from rejeu.networks import (
     BRANCHES,
     CNN,
+    ENCODERS,
     NATURE,
     SMALL,
     Convolution,
@@ -551,6 +553,37 @@ def test_an_agent_with_own_modules_learns_and_loads(agent, tmp_path):
     loaded = rejeu.load(path, policy_kwargs=policy)
     obs = np.array([0.6, -0.8, 2.0], np.float32)
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], made.predict(obs, deterministic=True)[0])
+
+
+NAMED = """
+import equinox as eqx
+from rejeu.networks import register_encoder
+
+@register_encoder("numbers")
+def numbers(key, leaves):
+    return eqx.nn.Linear(leaves[0].n_features, 5, key=key)
+"""
+
+
+def test_a_named_encoder_is_given_on_the_command_line_saved_and_loaded(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("numbers_file.py").write_text(NAMED)
+    given = ["--import", "numbers_file.py", "--set", "policy_kwargs.encoder=numbers", "max_grad_norm=1"]
+    small = ["--steps", "120", "--evaluate-episodes", "1", "--out", "run", "--no-report", "--no-video"]
+    assert cli.main(["train", "Pendulum-v1", "--algo", "SAC", *given, *small]) == 0
+    agent = rejeu.load("run")
+    assert (agent.config.policy_kwargs.encoder, agent.config.max_grad_norm) == ("numbers", 1.0)
+    assert agent.state.actor.encoder.n_features == 5
+    del ENCODERS["numbers"]
+    with pytest.raises(CheckpointError, match="encoder is your own, 'numbers'"):
+        rejeu.load("run")
+    assert rejeu.load("run", policy_kwargs={"encoder": numbers}).state.actor.encoder.n_features == 5
+    with pytest.raises(ValueError, match="encoder='numbers' is not registered"):
+        PolicyConfig(encoder="numbers")
+
+
+def numbers(key, leaves):
+    return eqx.nn.Linear(leaves[0].n_features, 5, key=key)
 
 
 # --- in an agent ----------------------------------------------------------------------------------------------------

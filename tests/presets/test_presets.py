@@ -23,7 +23,7 @@ def test_find_returns_the_preset_of_an_environment_and_algorithm():
 
 def test_find_returns_none_where_there_is_no_preset():
     assert presets.find("parking-v0", "DQN") is None
-    assert presets.find("Taxi-v3") is None
+    assert presets.find("Blackjack-v1") is None
 
 
 def test_every_default_algorithm_exists():
@@ -51,7 +51,7 @@ def test_result_shows_mean_interval_and_seeds():
 
 def test_first_result_is_of_the_preset_as_it_is():
     assert presets.find_result("CartPole-v1", "PPO").setting == ""
-    assert presets.find_result("Taxi-v3", "DQN") is None
+    assert presets.find_result("Blackjack-v1", "DQN") is None
 
 
 def test_environments_in_jax_have_the_presets_of_their_twins():

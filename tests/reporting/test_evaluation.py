@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -96,6 +98,15 @@ def test_success_comes_from_the_last_step():
     )
     assert result.success_rate == 1.0
     assert (result.lengths <= 4).all()  # at most 4 apart, one a step
+
+
+def test_intervals_do_not_import_scipy_stats():
+    code = "import sys, numpy as np; from rejeu.reporting.evaluation import Evaluation\n"
+    code += (
+        "x = Evaluation(np.arange(3.0), np.ones(3), np.array([0.0, 1.0, 1.0])); x.return_interval, x.success_interval\n"
+    )
+    code += "assert 'scipy.stats' not in sys.modules and 'matplotlib' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_statistics_equal_numpy_and_scipy():

@@ -42,8 +42,8 @@ def test_json_lines_that_are_continued_keep_the_complete_rows_up_to_a_step(tmp_p
 
 @pytest.mark.parametrize(
     "content",
-    [b"stfp,a\r\n1,2\r\n", b"step,a\r\n1," + b"2" * 200_000 + b"\r\n", b'step,a\r\n1,"2\r\n' + b"3,4\r\n" * 40_000],
-    ids=["no step", "a long cell", "a quote that does not end"],
+    [b"stfp,a\r\n1,2\r\n", b"2" * 200_000 + b"\r\n1,2\r\n", b'"step,a\r\n1,2\r\n'],
+    ids=["no step", "a long name", "a quote that does not end"],
 )
 def test_a_table_that_cannot_be_continued_is_kept_under_another_name(tmp_path, content):
     path = tmp_path / "metrics.csv"
@@ -58,7 +58,7 @@ def test_damaged_rows_of_a_table_are_left_out_when_it_is_continued(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_bytes("step,a\r\n1,2\r\n²,3\r\n".encode() + b"2,\xff\r\n" + b"9" * 5000 + b",4\r\n3\r\n4,5,6\r\n5,7\r\n")
     CsvFile(path, up_to=10)
-    assert path.read_text(encoding="utf-8").splitlines() == ["step,a", "1,2", "2,\ufffd", "5,7"]
+    assert path.read_text(encoding="utf-8").splitlines() == ["step,a", "1,2", "5,7"]
 
 
 @pytest.mark.parametrize("log", [CsvFile, JsonLines])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from rejeu.cli import settings
 from rejeu.reporting.runs import read_run
+from rejeu.runs import values
 
 CONFIG = {
     "env": "CartPole-v1",
@@ -29,7 +29,7 @@ CONFIG = {
     "versions": {"python": "3.11.7", "envpool": None},
 }
 EPISODES = "step,env,return,length,success,seconds\r\n40,0,20.0,20,nan,0.5\r\n100,1,30.5,30,nan,1.25\r\n"
-EVALUATIONS = "step,seconds,success_rate,mean_return\r\n50,0.7,nan,25.0\r\n"
+EVALUATIONS = "step,seconds,success_rate,mean_return\r\n100,0.7,nan,25.0\r\n"
 METRICS = "step,rollout/ep_rew_mean,train/loss\r\n50,20.0,\r\n90,21.0,0.5\r\n"
 
 
@@ -67,8 +67,8 @@ def test_changed_hyperparameters_and_command(folder):
     run = read_run(folder)
     assert run.changed == {"gamma": (0.9, 0.99), "policy_kwargs.net_arch": ([64, 64], None)}
     assert run.command == (
-        "rejeu train CartPole-v1 --algo DQN --steps 100 --seed 3 --envs 2 --backend gymnasium --evaluate-every 50 "
-        "--evaluate-episodes 5 --env-kwargs sutton_barto_reward=true --set gamma=0.9 batch_size=32 "
+        "rejeu train CartPole-v1 --env-kwargs sutton_barto_reward=true --algo DQN --steps 100 --envs 2 "
+        "--backend gymnasium --seed 3 --evaluate-every 50 --evaluate-episodes 5 --set gamma=0.9 batch_size=32 "
         "'policy_kwargs.net_arch=[64, 64]'"
     )  # the default batch_size too, since the preset has another
 
@@ -86,7 +86,7 @@ def test_command_has_wrappers_nulls_and_long_values(folder):
     words = shlex.split(read_run(folder).command)
     assert words[:3] == ["rejeu", "train", "my_env:Walk-v0"]
     assert [words[i + 1] for i, word in enumerate(words) if word == "--wrapper"] == ["my_env:Shaped", "a b"]
-    given = settings.apply(words[words.index("--set") + 1 :], {})
+    given = values.apply(words[words.index("--set") + 1 :], {})
     assert (given["max_grad_norm"], given["action_noise"]) == (None, noise)
 
 
@@ -144,7 +144,8 @@ def test_config_with_values_of_wrong_types(folder):
     (folder / "config.json").write_text(json.dumps(bad), encoding="utf-8")
     run = read_run(folder)
     assert (run.seed, run.steps_asked, run.minutes_asked, run.hyperparameters) == (None, None, None, {})
-    assert run.algorithm == '["<script>"]'
+    assert run.algorithm == ""
+    assert "config.json is damaged" in run.notes[0]
 
 
 def test_tables_that_are_not_text(folder):
@@ -153,7 +154,7 @@ def test_tables_that_are_not_text(folder):
     run = read_run(folder)
     assert len(run.episodes) == 0
     assert len(run.metrics) == 0
-    assert run.steps == 50
+    assert run.steps == 100
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights")

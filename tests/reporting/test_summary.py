@@ -34,7 +34,7 @@ FIGURE_OF_THE_ACTOR = """
                     /
     state -17-33-  /
 """
-"""Both as they stand in ../shared/seeds/002_c02ee75899cc9380.txt, the actor's for 4-dimensional actions."""
+"""Both as in the course's document, the actor's for 4-dimensional actions."""
 
 
 class State(eqx.Module):

@@ -1,4 +1,4 @@
-"""Tables of numbers: the fast reader against Python's own conversion."""
+"""Tables of numbers in CSV files."""
 
 import math
 
@@ -26,9 +26,7 @@ def test_numbers_equal_those_of_python(tmp_path):
     found = read_table(tmp_path / "a.csv").columns["value"]
     correct = np.array([expected(word) for word in words])
     np.testing.assert_array_equal(np.isnan(found), np.isnan(correct))
-    short = np.array([sum(map(str.isdigit, word)) <= 15 for word in words])
-    np.testing.assert_array_equal(found[short], correct[short])
-    np.testing.assert_allclose(found, correct, rtol=5e-16)
+    np.testing.assert_array_equal(found, correct)
 
 
 def test_only_some_columns(tmp_path):
@@ -44,7 +42,6 @@ def test_only_some_columns(tmp_path):
         (b"", "a.csv is empty"),
         (b"a,a\n1,2\n", "a.csv has 2 columns, expected up to 512 of different names"),
         (b"a,b\n1,2\n3\n4,5\n", "left out of a.csv: 1 damaged row"),
-        (b"a,b\n1," + b"2" * 70 + b"\n", "left out of a.csv: 1 damaged row"),
         (b"a,b\n1,2\n3,", "the last row of a.csv is incomplete and was left out"),
         (b"a,b\r1,2\r3,4\n", "the header of a.csv is damaged"),
         (b"a" * 200_000 + b"\n1\n", "the header of a.csv is damaged"),

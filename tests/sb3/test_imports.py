@@ -109,8 +109,7 @@ def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("module", "names"),
     [
-        ("", ["SAC", "HerReplayBuffer"]),
-        (".sac", ["SAC"]),
+        ("", ["HerReplayBuffer"]),
         (".her", ["HerReplayBuffer", "GoalSelectionStrategy"]),
         (".her.goal_selection_strategy", ["GoalSelectionStrategy"]),
         (".her.her_replay_buffer", ["HerReplayBuffer"]),

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu import sb3
+from rejeu.schedules import at
 from tests.golden.vec_env_script import Walk
 
 PATHS = {
@@ -200,11 +202,37 @@ def test_seeds_and_schedules():
     first = random.random(), np.random.get_state()[1].tolist()  # noqa: NPY002
     set_random_seed(3)
     assert (random.random(), np.random.get_state()[1].tolist()) == first  # noqa: NPY002
-    agent = rejeu.DQN(
-        "MlpPolicy", Walk(), learning_rate=get_linear_fn(1e-3, 1e-4, 0.5), policy_kwargs={"net_arch": [4]}
-    )
-    assert agent.config.learning_rate == LinearSchedule(1e-3, 1e-4, 0.5) == rejeu.Linear(1e-3, 1e-4, 0.5)
+    agent = sb3.DQN("MlpPolicy", Walk(), learning_rate=get_linear_fn(1e-3, 1e-4, 0.5), policy_kwargs={"net_arch": [4]})
+    assert agent.config.learning_rate == rejeu.Linear(1e-3, 1e-4, 0.5)
+    assert get_linear_fn(1.0, 0.1, 0.5) == LinearSchedule(1.0, 0.1, 0.5)
+    assert [LinearSchedule(1.0, 0.0, 0.5)(x) for x in (1.0, 0.75, 0.5, 0.0)] == [1.0, 0.5, 0.0, 0.0]
     assert get_schedule_fn(3e-4) == 3e-4
+
+
+def count_down(x):
+    return 1e-3 * x
+
+
+@pytest.mark.parametrize(
+    "schedule",
+    [count_down, lambda progress: 1e-3 * progress, lambda progress_remaining: 1e-3 * progress_remaining],
+)
+def test_every_function_given_as_a_schedule_takes_the_remaining_progress(schedule, in_tmp_path):
+    settings = {"n_steps": 4, "batch_size": 4, "policy_kwargs": {"net_arch": [4]}}
+    agent = sb3.PPO("MlpPolicy", Walk(), learning_rate=schedule, clip_range=schedule, **settings)
+    for config in (agent.config, sb3.PPO.load(agent.save("a"), learning_rate=schedule, clip_range=schedule).config):
+        for given in (config.learning_rate, config.clip_range):
+            assert [float(at(given, progress)) for progress in (0.0, 0.5, 1.0)] == pytest.approx([1e-3, 5e-4, 0.0])
+
+
+def test_files_name_schedules_that_are_code_and_contain_those_that_are_not(in_tmp_path):
+    from rejeu.sb3.common.utils import LinearSchedule
+
+    sb3.DQN("MlpPolicy", Walk(), learning_rate=count_down, policy_kwargs={"net_arch": [4]}).save("code")
+    with pytest.raises(rejeu.CheckpointError, match="count_down"):
+        sb3.DQN.load("code")
+    sb3.DQN("MlpPolicy", Walk(), learning_rate=LinearSchedule(1e-3, 0, 1), policy_kwargs={"net_arch": [4]}).save("line")
+    assert rejeu.load("line").config.learning_rate == rejeu.Linear(1e-3, 0.0)
 
 
 def test_evaluation_checkpoints_and_stopping_together(in_tmp_path):

@@ -14,7 +14,7 @@ from rejeu.agents import model_files, outputs, policy, resume, training
 from rejeu.agents.base import BaseAgent
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
-from rejeu.envs.adapters import vec_env_view
+from rejeu.envs import seeds
 from rejeu.envs.masks import split
 from rejeu.io import checkpoint
 from rejeu.reporting import summary
@@ -250,7 +250,9 @@ class Agent(BaseAgent):
         if not self.is_learning:
             self.abandon_episodes()
         if env.venv is None:
-            env.venv = vec_env_view(env)
+            from rejeu.sb3.common.vec_env.adapters import to_vec_env  # only who asks for it needs the package
+
+            env.venv = to_vec_env(env)
         return env.venv
 
     def set_logger(self, logger: Logger) -> None:
@@ -275,7 +277,7 @@ class Agent(BaseAgent):
                 "set_env was called while the agent learns; stop training first (a callback that returns False), then "
                 "call set_env and learn(..., reset_num_timesteps=False)"
             )
-        vector = self.make_envs(env, 1, seed=self.seed)
+        vector = self.make_envs(env, 1, seed=seeds.of_run(self.seed))
         self.check_spaces(vector, "the new environment")
         self.made_from_id = isinstance(env, str)
         run = self.run

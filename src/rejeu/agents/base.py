@@ -18,7 +18,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import devices, spaces, validation, xla
+from rejeu import devices, hardware, spaces, validation, xla
 from rejeu.algorithms import config as configs, contract
 from rejeu.callbacks.base import RunFolder, Stateful
 from rejeu.core import Algorithm
@@ -26,16 +26,16 @@ from rejeu.envs.make import Backend, VectorEnv
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.io.failed_writes import FailedWrites
-from rejeu.loops import finite
+from rejeu.loops import nonfinite
 from rejeu.loops.device.driver import Stops
 from rejeu.loops.learner import Learner
 from rejeu.loops.packing import PackedState
 from rejeu.loops.run import Progress, Run, initial_run
 from rejeu.loops.training_call import TrainingCall
 from rejeu.normalization import normalized
+from rejeu.reporting.formatting import counted, html_table
 from rejeu.reporting.history import History
 from rejeu.reporting.logging import Logger, check_logs
-from rejeu.reporting.text import counted, html_table
 from rejeu.validation import number, whole, whole_seed
 
 BEST_WINDOW = 20
@@ -112,6 +112,8 @@ class BaseAgent(ABC):
     """Identifies the run in its checkpoints."""
     is_learning: bool = False
     """Whether ``learn`` is running."""
+    n_together: int = 1
+    """Runs in the program of the current or last ``learn``."""
     training_call: TrainingCall | None = None
     """The current or last call of ``learn``: its limits and progress."""
     interrupted: bool = False
@@ -155,7 +157,7 @@ class BaseAgent(ABC):
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
     report_folder: Path | None = None
-    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
+    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.nonfinite.folder_of`."""
     made_from_id: bool = False
     """Whether the environments were made from an id."""
     trained_on: tuple[str, Mapping[str, Any]] | None = None
@@ -164,6 +166,11 @@ class BaseAgent(ABC):
     """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
     carry_shapes: Any = None
     """Shapes of a recurrent policy's state for one episode; computed when they are first needed."""
+
+    @staticmethod
+    def converted(settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Converts keyword arguments of the constructor and of ``load`` from another form, such as Stable-Baselines3's."""
+        return dict(settings)
 
     def __init__(
         self,
@@ -180,6 +187,7 @@ class BaseAgent(ABC):
         device: str = "auto",
         **hyperparameters: Any,
     ) -> None:
+        hyperparameters = self.converted(hyperparameters)
         known = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
         validation.check_names(hyperparameters, known, self.name)
         config = self.algorithm.Config(**hyperparameters)
@@ -245,7 +253,7 @@ class BaseAgent(ABC):
     def n_threads(self, n_envs: int) -> int:
         """Returns how many threads JAX should use: all for images and large layers, else one."""
         if any(leaf.kind == "image" for leaf in self.obs_leaves):
-            return xla.cores()
+            return hardware.cores()
         weights = [leaf.size for leaf in jax.tree.leaves(self.learner.shapes) if len(leaf.shape) > 1]
         return xla.threads_for(self.gradient_batch_size(n_envs) * max(weights, default=0))
 
@@ -338,7 +346,7 @@ class BaseAgent(ABC):
     @property
     def state(self) -> Any:
         """A copy of the algorithm's state. Waits for pending updates."""
-        finite.settle(self)
+        nonfinite.settle(self)
         return self.learner.state(self.run.state)
 
     @property

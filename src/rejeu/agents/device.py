@@ -11,8 +11,8 @@ import numpy as np
 from rejeu import devices
 from rejeu.agents.base import BaseAgent
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.device import STRATEGIES
 from rejeu.buffers.hindsight import HerReplayBuffer
+from rejeu.buffers.strategies import takes_generator
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.envs.masks import functional_vector
@@ -87,8 +87,8 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
     strategy = None if config.hindsight is None else config.hindsight.goal_selection_strategy
     if type(buffer) not in (ReplayBuffer, HerReplayBuffer):
         return f"the replay buffer {type(buffer).__name__} is your own"
-    if strategy is not None and strategy not in STRATEGIES:
-        return "goal_selection_strategy is a function of your own"
+    if strategy is not None and takes_generator(strategy):
+        return "goal_selection_strategy is a function of NumPy's generator; write it as a function (steps) -> times"
     if config.priorities is not None and most_updates(config, buffer.ring.n_envs) is None:
         return "priorities with gradient_steps=-1 after whole episodes exist on the host only"
     if config.frame_stack is not None:

@@ -249,6 +249,7 @@ def load(
     if header.get("algorithm") != name:
         other = str(header.get("algorithm"))[:40]
         raise CheckpointError(f"{path} holds a {other} agent, not {name}; use rejeu.load(path) or rejeu.{other}.load")
+    changes = cls.converted(changes)
     own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
     try:
         saved = interpret(header, file.room, cls.algorithm.Config, changes)

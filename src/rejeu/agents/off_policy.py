@@ -27,7 +27,6 @@ from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
 from rejeu.io.records import brief
 from rejeu.loops.device import loops as device_loops
-from rejeu.loops.first_of_n import first_of_n
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
 
@@ -135,8 +134,7 @@ class OffPolicyAgent(Agent):
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
             return device_loops.off_policy(self.run, self.learner, self.config, n_steps, progress, self.stops)
-        learn = off_policy if self.run.env.wait_for is None else first_of_n
-        return learn(self.run, self.learner, self.config, n_steps, progress)
+        return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:
         begin_episodes(self.run)

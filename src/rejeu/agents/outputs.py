@@ -18,8 +18,7 @@ from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.history import COLUMNS
 from rejeu.reporting.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
-from rejeu.reporting.runs import Episodes, Run
-from rejeu.reporting.tables import Table
+from rejeu.reporting.runs import Episodes, Run, evaluation_table
 from rejeu.reporting.trackers import Background
 
 TABLE_SECONDS = 2.0
@@ -110,15 +109,6 @@ def record(agent: BaseAgent, path: Path, evaluations: Sequence[tuple[int, Evalua
     """Returns the training of an agent so far as a run; ``path`` is only for its name."""
     env = agent.run.env
     history = agent.history
-    results = [evaluation for _, evaluation in evaluations]
-    columns = {
-        "step": [step for step, _ in evaluations],
-        "success_rate": [one.success_rate for one in results],
-        "mean_return": [one.mean_return for one in results],
-        "std_return": [one.std_return for one in results],
-        "mean_length": [one.mean_length for one in results],
-        "episodes": [len(one.returns) for one in results],
-    }
     return Run(
         path=path.absolute(),
         name=path.stem,
@@ -131,7 +121,7 @@ def record(agent: BaseAgent, path: Path, evaluations: Sequence[tuple[int, Evalua
         steps=agent.run.step,
         seconds=agent.seconds["total"],
         episodes=Episodes(*(history[column] for column in COLUMNS)),
-        evaluations=Table({name: np.array(values, np.float64) for name, values in columns.items()}),
+        evaluations=evaluation_table(evaluations),
     )
 
 

@@ -16,7 +16,7 @@ from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
-from rejeu.loops import finite
+from rejeu.loops import nonfinite
 from rejeu.loops.run import clock_of
 from rejeu.reporting.evaluation import Evaluation, evaluate
 from rejeu.spaces import Leaf
@@ -88,7 +88,7 @@ def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.
     Raises:
         ValueError: if the shapes of ``memory`` do not match.
     """
-    finite.settle(agent)
+    nonfinite.settle(agent)
     run, learner, n = agent.run, agent.learner, len(ended)
     has_memory = learner.algorithm.recall is not None
     if deterministic and not has_memory:
@@ -119,7 +119,7 @@ def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> n
     if action is None and not is_discrete:
         raise ValueError(f"q_values needs actions of {space}; only for Discrete actions it returns the values of all")
     given = None if action is None else _actions(space, action, single, n)
-    finite.settle(agent)
+    nonfinite.settle(agent)
     values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
     if is_discrete and given is not None:
         values = values[:, np.arange(n), given]
@@ -153,7 +153,7 @@ def value(agent: BaseAgent, observation: Any, memory: Any, episode_start: Any) -
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
     learner = agent.learner
-    finite.settle(agent)
+    nonfinite.settle(agent)
     if learner.algorithm.recall is None:
         memory = ()
     elif memory is None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import re
 import secrets
+import shutil
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,13 +40,15 @@ from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.io import atomic, checkpoint, json_arrays
 from rejeu.io.records import Count, Positive, Seconds
-from rejeu.loops import finite
+from rejeu.loops import nonfinite
 from rejeu.loops.run import Run
 
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 ROWS_FILE = re.compile(r"rows_\d{12}_[0-9a-f]+\.safetensors")
 SCALARS = ("learn_from", "owed", "steps_since_update")
 """Counters of a run that model files do not hold."""
+MOMENT = 0.5
+"""Seconds to wait for the lock, which a process that asks whether the run is locked holds for a moment."""
 PER_ENV = ("playing", "ended", "episode_return", "episode_length", "running_return")
 """Fields of a run that are arrays with one entry per environment."""
 
@@ -103,7 +106,7 @@ class RunFolder:
         """
         atomic.make_folder(self.folder)
         try:
-            self._lock.acquire(timeout=0)
+            self._lock.acquire(timeout=MOMENT)
         except Timeout:
             raise RunInUseError(
                 f"another process is training in {self.folder}; wait for it, stop it, or give Checkpoint another folder"
@@ -141,7 +144,7 @@ class RunFolder:
             NonFiniteError: if the last update left numbers that are not finite; nothing is written then.
         """
         agent = self.agent
-        finite.settle(agent)
+        nonfinite.settle(agent)
         run = agent.run
         try:
             if not isinstance(run.replay, RolloutBuffer):
@@ -223,8 +226,41 @@ def step_of(path: Path) -> int:
     return int(found[1])
 
 
-UPDATES = 2
+def newest_step(folder: Path) -> int:
+    """Returns the environment step of the newest checkpoint in a folder, -1 if there is none."""
+    found = run_files(folder)
+    return step_of(found[0]) if found else -1
+
+
+UPDATES = 3
 """Number of the arithmetic of updates; a change that rounds anything differently raises it."""
+
+
+def copy_run(source: Path, target: Path, seed: int) -> None:
+    """Writes the newest checkpoint in a folder to a new one, as a run with random numbers of its own.
+
+    Networks, optimizers and replay buffer are the same. Exploration, batches, evaluations and the environments, which begin
+    new episodes, draw from ``seed``, so that two copies of a run are trained to different agents.
+    """
+    path = run_files(source)[0]
+    with checkpoint.opened(path, "run") as file:
+        header, arrays = file.header, file.read()
+    saved = json_arrays.decode(header["run"], arrays)
+    saved |= {
+        "rng": np.random.default_rng(seed).bit_generator.state,
+        "seed": seed,
+        "reason": "it is a copy of another run",
+    }
+    saved |= {"envs": None, "obs": None, "action": None}
+    kept = {name: array for name, array in arrays.items() if not name.startswith("run.")}
+    if "state.key" in kept:  # of the updates
+        kept["state.key"] = np.random.SeedSequence(seed).generate_state(2).astype(kept["state.key"].dtype)
+    header = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
+    header |= {"seed": seed, "run_id": secrets.token_hex(8), "run": json_arrays.encode(saved, kept, "run")}
+    atomic.make_folder(target)
+    for name in header["rows"]:
+        shutil.copy(source / name, target / name)
+    checkpoint.write(target / path.name, "run", kept, header)
 
 
 def versions() -> dict[str, Any]:
@@ -248,6 +284,8 @@ class RunHeader(msgspec.Struct):
     own_env: Any = False
     threads: Annotated[int, Meta(ge=1, le=1024)] | None = None
     """Of JAX's device; missing in older checkpoints."""
+    n_together: Positive = 1
+    """Runs in the program that trained it."""
     versions: Any = None
     """:func:`versions` of the process that wrote it; missing in older checkpoints."""
 
@@ -338,6 +376,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "wait_for": run.env.wait_for,
         "own_env": agent.made_from_id,
         "threads": xla.threads(),
+        "n_together": agent.n_together,
         "versions": versions(),
         "run": json_arrays.encode(everything, arrays, "run"),
     }

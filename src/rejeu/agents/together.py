@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import jax
 
-from rejeu import devices, xla
+from rejeu import devices, hardware, xla
 from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
 from rejeu.agents.device import require_memory
@@ -26,7 +26,7 @@ from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.registry import is_functional
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt
-from rejeu.loops import finite
+from rejeu.loops import nonfinite
 from rejeu.loops.device import loops
 from rejeu.loops.device.driver import Stops
 from rejeu.loops.device.variants import Variants
@@ -55,23 +55,23 @@ def train_seeds(
     device: str = "auto",
     **settings: Any,
 ) -> list[A]:
-    """Trains independent runs together, in JAX environments in one program on the device, and returns their agents.
+    """Trains independent runs and returns their agents.
 
-    Every run is that of an agent with the same seed and settings that was trained alone, up to the rounding of sums, whose
-    order differs (see ``docs/device.md``).
+    Runs in JAX environments are trained together, in one program on the device. Each is that of an agent with the same seed
+    and settings that was trained alone, up to the rounding of sums, whose order differs (see ``docs/device.md``). Runs in
+    other environments are trained one after another.
 
     Args:
         kind: the class of the agents, such as ``rejeu.SAC``.
         policy: as for the agent.
-        env: an id, or an environment in JAX. Other environments are stepped on the host, those of one run after those of
-            another, and one call acts or updates for all runs; that is possible for off-policy agents.
+        env: an id, or an environment in JAX.
         total_timesteps: environment steps of each run.
         seeds: how many runs, with the seeds 0, 1, ...; or their seeds.
         n_envs: environments of each run.
-        minutes: stop after this wall time.
+        minutes: stop after this wall time, which runs that are trained one after another have each.
         callback: called with each agent before training; returns its callbacks.
         log_interval: episodes of a run between two rows of its statistics.
-        progress_bar: show the progress of the first run, which is that of all.
+        progress_bar: show the progress of the first run, which is that of all that are trained together.
         device: ``"auto"``, ``"cpu"`` or ``"gpu"``. If JAX has several devices of the kind, they share the runs.
         settings: arguments of the agent. A list of numbers in place of a float hyperparameter, such as
             ``learning_rate=[1e-4, 3e-4, 1e-3]``, trains every seed with each of them, or with each combination of several.
@@ -112,6 +112,11 @@ def train_seeds(
             require_memory(first, len(numbers) * len(values))
         first.made_from_id = isinstance(env, str)
         agents += [first, *(sibling(first, vector(seed), seed) for seed in numbers[1:])]
+    if agents[0].run.env.backend != "jax":
+        for agent in agents:
+            called = None if callback is None else callback(agent)
+            agent.learn(total_timesteps, called, log_interval, progress_bar=progress_bar, minutes=minutes)
+        return agents
     calls = [training.start_call(agent, total_timesteps, None, minutes, log_interval, True) for agent in agents]
     callbacks = [calling.listed(None if callback is None else callback(agent)) for agent in agents]
     learn_together(agents, calls, callbacks, progress_bar=progress_bar, differing=tuple(lists))
@@ -137,9 +142,9 @@ def numbers_of(seeds: int | Iterable[int]) -> list[int]:
 
 def start_device(n_runs: int) -> None:
     """Starts JAX's device for so many runs in one program: a CPU as one device for each core, which share the runs."""
-    n_devices = min(xla.cores(), n_runs)
+    n_devices = min(hardware.cores(), n_runs)
     if n_devices > 1:
-        xla.start_device(xla.cores() // n_devices, n_devices)
+        xla.start_device(hardware.cores() // n_devices, n_devices)
 
 
 def first_envs(env: Any, n_envs: int, seed: int) -> Any:
@@ -241,7 +246,7 @@ def learn_together(
         except NonFiniteUpdate as broken:
             which = agents[broken.which]
             values = [f"{name}={getattr(which.config, name):g}" for name in differing]
-            raise finite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
+            raise nonfinite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
         finally:
             for agent in agents:
                 agent.run.state = [jax.numpy.array(part) for part in agent.run.state]  # views until now
@@ -264,7 +269,7 @@ def common_stops(
             )
         if call.n_episodes is not None:
             raise ValueError("several runs in one program end after steps or minutes, not after episodes")
-        agent.stops = device.stops_at(call, one)
+        agent.stops, agent.n_together = device.stops_at(call, one), len(agents)
         found |= {*agent.stops.every}
     return Stops(tuple(sorted(found)))
 
@@ -274,20 +279,12 @@ def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
     assert agent.env is not None
     if isinstance(agent.config, OffPolicyConfig) and not isinstance(agent.config.train_freq, int):
         return f"updates depend on episodes (train_freq={agent.config.train_freq!r})"
-    if agent.env.backend == "jax":
-        return device.reason_against(agent, callbacks)
-    if not isinstance(agent.config, OffPolicyConfig):
-        return f"{agent.name} is on-policy, and the backend of {agent.env.env_id} is {agent.env.backend!r}, not 'jax'"
-    return device.reason_against_callbacks(callbacks)
+    return device.reason_against(agent, callbacks)
 
 
 def check_differing(agent: Agent, names: Iterable[str]) -> None:
     """Raises ``ValueError`` if hyperparameters cannot differ between the runs of one program."""
     kinds = {field.name: str(field.type) for field in dataclasses.fields(agent.config)}
-    if [*names] and (agent.env is None or agent.env.backend != "jax"):
-        raise ValueError(
-            f"{', '.join(names)}: hyperparameters can differ between the runs of one program in JAX environments only"
-        )
     for name in names:
         if name not in kinds:
             raise ValueError(f"{name} is no hyperparameter of {agent.name} and is equal for all runs; give one value")

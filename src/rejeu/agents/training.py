@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
@@ -16,12 +17,12 @@ from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.interrupt import Interrupt
-from rejeu.loops import finite
+from rejeu.loops import nonfinite
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress
 from rejeu.loops.training_call import TrainingCall, checked_limits
+from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Sink
-from rejeu.reporting.text import counted
 
 
 def start_call(
@@ -40,6 +41,8 @@ def start_call(
     run = agent.run
     if run.env is None:
         raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
+    if run.step == 0 and (doubt := agent.config.doubts(run.env.n_envs)):
+        warnings.warn(doubt, UserWarning, stacklevel=3)
     resumes = total_timesteps is None and minutes is None and episodes is None
     if resumes:
         call = unfinished_call(agent)
@@ -96,7 +99,7 @@ def train(
     if progress_bar:
         callbacks.append(ProgressBar.of(call, taken=agent.run.step - call.first_step))
     callbacks = calling.in_order(callbacks)
-    agent.stops = device.stops_of(agent, call, callbacks)
+    agent.stops, agent.n_together = device.stops_of(agent, call, callbacks), 1
     if agent.stops is not None:
         device.require_memory(agent)
     with session(agent, call, callbacks, tb_log_name, sinks) as record:
@@ -106,9 +109,9 @@ def train(
                     if record(turn) or interrupt.requested:
                         break
             agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
-            finite.settle(agent)
+            nonfinite.settle(agent)
         except NonFiniteUpdate as broken:
-            raise finite.reported(agent, broken) from None
+            raise nonfinite.reported(agent, broken) from None
 
 
 @contextmanager
@@ -195,7 +198,7 @@ def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str) -
     """Keeps the current weights if ``score`` is the best of its kind so far; returns whether it is."""
     if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
         return False
-    finite.settle(agent)
+    nonfinite.settle(agent)
     agent.best = Best(score, by, agent.run.step, agent.learner.copy(agent.run.state))
     return True
 

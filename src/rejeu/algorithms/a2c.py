@@ -48,8 +48,6 @@ class Config(OnPolicyConfig):
     """Hyperparameters of A2C; the defaults are Stable-Baselines3's, except for the variant of RMSprop (see above)."""
 
     learning_rate: float | Schedule = 7e-4
-    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_7e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
     n_steps: int = 5
     """Steps of each environment between two updates. A larger number estimates the gradient better and updates less
     often."""

@@ -1,4 +1,4 @@
-"""The hyperparameters of off-policy algorithms, and configurations as JSON.
+"""The hyperparameters of every algorithm and of off-policy algorithms, and configurations as JSON.
 
 A configuration is a frozen, hashable dataclass. Each field has an attribute docstring, from which ``help()``, the command
 line and the documentation are generated. Values are given in the form of Stable-Baselines3 and converted when the
@@ -22,7 +22,7 @@ from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.errors import MissingObjectError
 from rejeu.exploration import noise as action_noises
-from rejeu.networks import PolicyConfig, Widths, reads_image, settled
+from rejeu.networks import ENCODERS, PolicyConfig, Widths, reads_image, settled
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf, leaves
@@ -39,12 +39,63 @@ OWN_MODULES = ("encoder", "torso", "head")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffPolicyConfig:
-    """The hyperparameters of every algorithm with a replay buffer."""
+class AlgorithmConfig:
+    """The hyperparameters of every algorithm. Abstract."""
 
     learning_rate: float | Schedule = 3e-4
-    """Step size of every network's optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
+    """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
     ``"lin_3e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
+    gamma: float = 0.99
+    """Discount factor, in [0, 1]."""
+    max_grad_norm: float | None = None
+    """Maximum Euclidean norm of each optimizer's gradient; larger gradients are scaled down. None: no limit."""
+    normalize: NormalizationConfig | None = None
+    """Normalize observations and rewards by running statistics: True, or a dict with ``norm_obs``, ``norm_reward``,
+    ``clip_obs``, ``clip_reward``. The statistics are saved with the agent, which takes raw observations."""
+    nonfinite: Literal["stop", "skip"] = "stop"
+    """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
+    it and saves what was learned from, or ``"skip"`` that update and count it."""
+    optimizer: Any = "adam"
+    """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, an Optax
+    optimizer such as ``optax.lamb``, or one that was created with the learning rate 1, which is then ``learning_rate``."""
+    policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
+    """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
+    (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``), or modules of your own
+    as ``encoder``, ``torso`` and ``head``."""
+
+    name: ClassVar[str] = ""
+    is_checked: ClassVar[bool] = False
+    """Whether :meth:`__post_init__` has run; set on each instance."""
+    policy_kwargs_class: ClassVar[type[PolicyConfig]] = PolicyConfig
+    """The class of ``policy_kwargs``."""
+    hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
+    """Default widths of the networks."""
+    hidden_layers_on_images: ClassVar[Widths] = hidden_layers
+    """The same where the observation is an image."""
+    for_many: ClassVar[Mapping[str, Any]] = {}
+    """Hyperparameters that ``rejeu train`` uses with 64 environments or more, without a preset."""
+    search_space: ClassVar[SearchSpace] = {}
+    """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
+
+    def __post_init__(self) -> None:
+        coerce(self, "learning_rate", schedules.parse, least=0)
+        coerce(self, "optimizer", optimizers.parse, optional=type(self).optimizer is None)
+        coerce(self, "gamma", number, least=0, most=1)
+        coerce(self, "max_grad_norm", number, above=0, optional=True)
+        assign(self, normalize=normalization.parse(self.normalize))
+        coerce(self, "nonfinite", choice, among=("stop", "skip"))
+        coerce(self, "policy_kwargs", nested, kind=self.policy_kwargs_class)
+        assign(self, is_checked=True)
+
+    def doubts(self, n_envs: int) -> str:
+        """Returns why these settings are unlikely to learn well with ``n_envs`` environments; empty if that is not known."""
+        return ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyConfig(AlgorithmConfig):
+    """The hyperparameters of every algorithm with a replay buffer."""
+
     buffer_size: int = 1_000_000
     """Maximum number of steps in the replay buffer, over all environments. The oldest are overwritten. Memory is
     proportional to it."""
@@ -54,8 +105,6 @@ class OffPolicyConfig:
     """Transitions per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
     tau: float = 0.005
     """Coefficient of the soft update of the target network (Polyak averaging), in (0, 1]."""
-    gamma: float = 0.99
-    """Discount factor, in [0, 1]."""
     train_freq: int | tuple[int, Literal["step", "episode"]] = 1
     """Update every ``train_freq`` environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
     environments together."""
@@ -78,48 +127,23 @@ class OffPolicyConfig:
     frame_stack: int | None = None
     """Number of frames that observations stack along the first axis. The replay buffer then stores each frame once and
     builds the stacks when it samples. None stores observations as they are."""
-    normalize: NormalizationConfig | None = None
-    """Normalize observations and rewards by running statistics: True, or a dict with ``norm_obs``, ``norm_reward``,
-    ``clip_obs``, ``clip_reward``. The statistics are saved with the agent, which takes raw observations."""
-    nonfinite: Literal["stop", "skip"] = "stop"
-    """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
-    it and saves the batch, or ``"skip"`` that update and count it."""
     overlap: bool = True
     """Step the environments while the update is computed: an action then uses the weights of the update before the last, in
     a fixed order, so that runs are reproducible. False waits for the newest weights before every action and is slower."""
-    optimizer: Any = "adam"
-    """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, an Optax
-    optimizer such as ``optax.lamb``, or one that was created with the learning rate 1, which is then ``learning_rate``."""
-    policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
-    """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
-    (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``), or modules of your own
-    as ``encoder``, ``torso`` and ``head``."""
 
-    name: ClassVar[str] = ""
-    is_checked: ClassVar[bool] = False
-    """Whether :meth:`__post_init__` has run; set on each instance."""
-    hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
-    """Default widths of the networks."""
-    hidden_layers_on_images: ClassVar[Widths] = hidden_layers
-    """The same where the observation is an image."""
     search_space: ClassVar[SearchSpace] = search.OFF_POLICY
-    """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
 
     def __post_init__(self) -> None:
-        coerce(self, "learning_rate", schedules.parse, least=0)
-        coerce(self, "optimizer", optimizers.parse)
+        AlgorithmConfig.__post_init__(self)
         coerce(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1)
         coerce(self, "frame_stack", whole, least=1, optional=True)
         coerce(self, "learning_starts", whole, least=0)
         coerce(self, "tau", number, above=0, most=1)
-        coerce(self, "gamma", number, least=0, most=1)
         coerce(self, "train_freq", train_freq)
         coerce(self, "gradient_steps", gradient_steps)
         coerce(self, "overlap", flag)
         coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
-        assign(self, normalize=normalization.parse(self.normalize), action_noise=action_noises.parse(self.action_noise))
-        coerce(self, "nonfinite", choice, among=("stop", "skip"))
-        coerce(self, "policy_kwargs", nested, kind=PolicyConfig)
+        assign(self, action_noise=action_noises.parse(self.action_noise))
         coerce(self, "replay_buffer_class", buffer_name)
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
         if self.batch_size > self.buffer_size:
@@ -127,7 +151,6 @@ class OffPolicyConfig:
                 f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "
                 f"try buffer_size={max(10 * self.batch_size, 10_000)} or batch_size={self.buffer_size}"
             )
-        assign(self, is_checked=True)
 
     @property
     def hindsight(self) -> HindsightConfig | None:
@@ -153,6 +176,7 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
             argument = f"{key}=dict({argument})"
         raise MissingObjectError(
             f"its {keys[-1]} is your own, {name!r}, and no file holds code; give it again: load(path, {argument})"
+            + (", or import the module that registers it (--import MODULE)" if keys[-1] == "encoder" else "")
         )
     return build(kind, merged)
 
@@ -162,7 +186,8 @@ def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]
     for key, value in saved.items():
         if isinstance(value, Mapping) and set(value) == {OWN}:
             yield (key,), str(value[OWN])[:40]
-        elif key in OWN_MODULES and isinstance(value, str):  # as older files mention a torso
+        elif key in OWN_MODULES and isinstance(value, str) and (key != "encoder" or value not in ENCODERS):
+            # Older files mention a torso in this way.
             yield (key,), value[:40]
         elif isinstance(value, Mapping):
             yield from (((key, *keys), name) for keys, name in own_names(value))

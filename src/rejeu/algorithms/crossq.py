@@ -28,16 +28,21 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.sac import temperature
-from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, exploit, explore
-from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of, temperature_step
+from rejeu.algorithms.sac.continuous import (
+    LOG_STD_RANGE,
+    EntropyConfig,
+    exploit,
+    explore,
+    initial_alpha,
+    metrics_of,
+    temperature_step,
+)
 from rejeu.algorithms.search import Integers, SearchSpace
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, ensemble, minimize, weighted_mean
+from rejeu.core import Algorithm, Clock, Metrics, Optimizer, PyTree, Transition, ensemble, minimize, weighted_mean
 from rejeu.distributions import TanhNormal
 from rejeu.networks import PolicyConfig, Widths, action_values, values_by_critics
 from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
@@ -59,8 +64,6 @@ class Config(EntropyConfig):
     """Hyperparameters of CrossQ; the defaults are those of Stable-Baselines3 Contrib."""
 
     learning_rate: float | Schedule = 1e-3
-    """Step size of every optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_1e-3"`` or a function of the progress from 0 to 1."""
     policy_delay: int = 3
     """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
     renorm_warmup_steps: int = 100_000
@@ -113,7 +116,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, target_entropy = leaves(observation_space), config.entropy_target(-float(action_dim))
-    optimizer = optimizers.make(config.optimizer, b1=ADAM_B1)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm, b1=ADAM_B1)
 
     def init(key: Array) -> State:
         return initial_state(key, obs_leaves, action_dim, config, optimizer)
@@ -165,7 +168,7 @@ def initial_state(
     obs_leaves: tuple[Leaf, ...],
     action_dim: int,
     config: Config,
-    optimizer: optax.GradientTransformation,
+    optimizer: Optimizer,
 ) -> State:
     """Returns the state before the first update."""
     actor_key, critics_key, update_key = jax.random.split(key, 3)
@@ -178,7 +181,7 @@ def initial_state(
     actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(ACTOR_LAYERS))
     widths = shape.critic_widths(CRITIC_LAYERS)
     critics = ensemble(lambda k: network(k, action_dim, 1, widths), critics_key, config.n_critics)
-    log_alpha, alpha_optimizer = temperature.initial(config)
+    log_alpha, alpha_optimizer = initial_alpha(config)
     return State(
         actor=actor,
         critics=critics,

@@ -15,6 +15,9 @@ The target moves just before the first gradient step at or after every multiple 
 same numbers as in Stable-Baselines3, where it moves between two gradient steps. If several multiples have passed since
 the last gradient step, so many soft updates are made at once, of ``1 - (1 - tau)^n`` together. Unlike there, the
 interval is counted in environment steps exactly, also where the number of environments does not divide it.
+
+Unlike in the paper on dueling networks, the gradients of both streams enter the shared layers unscaled, without the factor
+``1 / sqrt(2)``.
 """
 
 from __future__ import annotations
@@ -39,13 +42,12 @@ from rejeu.core import (
     Algorithm,
     Clock,
     Metrics,
+    Optimizer,
     PyTree,
     Transition,
-    clip,
     copy,
-    descend,
+    minimize,
     polyak,
-    value_and_grad,
     weighted_mean,
     without_gradient,
 )
@@ -83,7 +85,6 @@ class QLearningConfig(OffPolicyConfig):
     """How epsilon decreases: linearly, or by the same factor for equal parts of the run. The run is measured in what
     ``learn`` was given: steps, episodes or minutes."""
     max_grad_norm: float | None = 10.0
-    """Maximum Euclidean norm of the gradient over all parameters; larger gradients are scaled down. None: no limit."""
 
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
@@ -97,7 +98,6 @@ class QLearningConfig(OffPolicyConfig):
                 "or by action_noise=ParameterNoise()"
             )
         coerce(self, "target_update_interval", whole, least=1)
-        coerce(self, "max_grad_norm", number, above=0, optional=True)
         check_epsilon(self)
 
     @property
@@ -111,8 +111,6 @@ class Config(QLearningConfig):
     """Hyperparameters of DQN; the defaults are those of Stable-Baselines3."""
 
     learning_rate: float | Schedule = 1e-4
-    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_1e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
     clip_grad_value: float | None = None
     """Maximum absolute value of each component of the gradient, applied before ``max_grad_norm``. None: no limit."""
     loss: Literal["huber", "squared"] = "huber"
@@ -153,7 +151,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     n_actions = check_discrete_action(action_space, config.name)
     obs_leaves, shape = network_inputs(config, observation_space)
-    optimizer, epsilon = optimizers.make(config.optimizer), config.epsilon
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm, config.clip_grad_value)
+    epsilon = config.epsilon
 
     def init(key: Array) -> State:
         network = Dueling if config.dueling else Network
@@ -163,12 +162,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         moves = moves_due(state.step, clock.step, config.target_update_interval)
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
         target = without_gradient(td_target)(state.network, target_network, batch, config.double_q)
-        (loss, td_error), gradients = value_and_grad(td_loss, has_aux=True)(
-            state.network, batch, target, LOSSES[config.loss]
-        )
-        gradients = clip(gradients, config.clip_grad_value, config.max_grad_norm)
         rate = at(config.learning_rate, clock.progress)
-        network, optimizer_state = descend(state.network, gradients, state.optimizer, optimizer, rate)
+        network, optimizer_state, loss, td_error = minimize(
+            td_loss, state.network, state.optimizer, optimizer, rate, batch, target, LOSSES[config.loss]
+        )
         step = jnp.asarray(clock.step, jnp.uint32)
         metrics = metrics_of(loss, jnp.mean(td_error + target), epsilon, clock) | {TD_ERROR: jnp.abs(td_error)}
         return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
@@ -176,7 +173,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return epsilon_greedy_algorithm(init, update, epsilon)
 
 
-def initial_state(network: Any, optimizer: optax.GradientTransformation) -> State:
+def initial_state(network: Any, optimizer: Optimizer) -> State:
     """Returns the state before the first update."""
     return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0))
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import optax
 
-from rejeu.core import Elementwise
+from rejeu.core import Clipped, Elementwise, Optimizer
 
 WEIGHT_DECAY = 1e-4
 """Decoupled weight decay of ``"adamw"``, which is multiplied by the learning rate as well."""
@@ -67,13 +67,21 @@ def parse(key: str, value: Any) -> Any:
     )
 
 
-def make(optimizer: Any, **adam: float) -> optax.GradientTransformation:
-    """Returns a transformation from gradients to directions, without a learning rate.
+def make(optimizer: Any, max_norm: float | None = None, max_value: float | None = None, **adam: float) -> Optimizer:
+    """Returns a transformation from gradients to directions, without a learning rate, for :func:`rejeu.core.descend`.
 
     Args:
         optimizer: what :func:`parse` returned.
+        max_norm: largest Euclidean norm of the gradient of all parameters; larger gradients are scaled down. None: no
+            limit.
+        max_value: largest absolute value of each component, applied before. None: no limit.
         adam: the algorithm's settings of Adam (``b1``, ``eps``); an optimizer of your own has its own.
     """
+    made = _unlimited(optimizer, **adam)
+    return made if max_norm is None and max_value is None else Clipped(made, max_value, max_norm)
+
+
+def _unlimited(optimizer: Any, **adam: float) -> optax.GradientTransformation:
     if isinstance(optimizer, str):
         return Elementwise(*OPTIMIZERS[optimizer](**adam))
     given = optimizer if isinstance(optimizer, optax.GradientTransformation) else optimizer(1.0)

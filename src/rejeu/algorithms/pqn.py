@@ -19,13 +19,13 @@ padding is not counted.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
@@ -35,7 +35,7 @@ from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy_algorithm, epsilon_schedule, metrics_of, taken
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, clip, descend, value_and_grad
+from rejeu.core import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
 from rejeu.networks import Network, PolicyConfig, Widths
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
@@ -44,6 +44,19 @@ from rejeu.validation import assign, coerce, number, whole
 
 HIDDEN_LAYERS = (128, 128)
 """Default widths of the network but on images, those of the authors' code."""
+FEW = 8
+"""Number of environments up to which the defaults are meant."""
+FOR_MANY = {
+    "learning_rate": 2.5e-4,
+    "n_steps": 32,
+    "batch_size": 128,
+    "n_epochs": 2,
+    "q_lambda": 0.65,
+    "exploration_fraction": 0.1,
+    "exploration_final_eps": 0.001,
+}
+"""Hyperparameters for many environments, those of the authors for Atari with 128. With 1 to 8 environments they learn nothing
+on ordinary runs: epsilon falls before there is anything to exploit, and gradient steps are few."""
 
 
 @dataclass(frozen=True)
@@ -64,31 +77,28 @@ class NormalizedConfig(PolicyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Config(RolloutConfig):
-    """Hyperparameters of PQN; the defaults are those of the authors for Atari, with 128 environments."""
+    """Hyperparameters of PQN; the defaults are for 1 to 8 environments, :data:`FOR_MANY` for about 128."""
 
-    learning_rate: float | Schedule = 2.5e-4
-    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_2.5e-4"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
-    n_steps: int = 32
+    learning_rate: float | Schedule = 5e-4
+    n_steps: int = 128
     """Steps of each environment between two updates. A larger number bootstraps later and updates less often."""
-    batch_size: int = 128
+    batch_size: int = 32
     """Steps per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
-    n_epochs: int = 2
+    n_epochs: int = 4
     """Passes over every rollout. More learn more from it, with targets that are further behind."""
-    q_lambda: float = 0.65
+    q_lambda: float = 0.9
     """Lambda of Q(lambda), in [0, 1]: 0 bootstraps after one step, 1 sums all rewards to the end of the episode or the
     rollout. A larger value has less bias and more variance, and follows random actions for longer."""
-    exploration_fraction: float = 0.1
+    exploration_fraction: float = 0.5
     """Fraction of the run over which epsilon decreases, in (0, 1]."""
     exploration_initial_eps: float = 1.0
     """Initial probability of a random action, in [0, 1]."""
-    exploration_final_eps: float = 0.001
+    exploration_final_eps: float = 0.05
     """Probability of a random action from ``exploration_fraction`` of the run on, in [0, 1]."""
     exploration_schedule: Literal["linear", "exponential"] = "linear"
     """How epsilon decreases: linearly, or by the same factor for equal parts of the run. The run is measured in what
     ``learn`` was given: steps, episodes or minutes."""
     max_grad_norm: float | None = 10.0
-    """Maximum Euclidean norm of the gradient over all parameters; larger gradients are scaled down. None: no limit."""
     optimizer: Any = "radam"
     """As for the other algorithms, such as ``"adam"`` or ``optax.lamb``; the authors use rectified Adam."""
     policy_kwargs: NormalizedConfig = dataclasses.field(default_factory=NormalizedConfig)
@@ -100,12 +110,27 @@ class Config(RolloutConfig):
     policy_kwargs_class: ClassVar[type[PolicyConfig]] = NormalizedConfig
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     search_space: ClassVar[SearchSpace] = search.PQN
+    for_many: ClassVar[Mapping[str, Any]] = FOR_MANY
 
     def __post_init__(self) -> None:
         RolloutConfig.__post_init__(self)
         coerce(self, ("batch_size", "n_epochs"), whole, least=1)
         coerce(self, "q_lambda", number, least=0, most=1)
         check_epsilon(self)
+
+    def doubts(self, n_envs: int) -> str:
+        """Returns a warning if these are the defaults with many environments, or the values for many with few."""
+        if n_envs <= FEW and all(getattr(self, key) == value for key, value in FOR_MANY.items()):
+            return (
+                f"these hyperparameters of PQN are for about 128 environments, and there are {n_envs}; use the defaults"
+            )
+        defaults = all(getattr(self, key) == getattr(type(self), key) for key in FOR_MANY)
+        if n_envs > FEW and defaults:
+            return (
+                f"PQN's defaults are for 1 to {FEW} environments, and there are {n_envs}; for about 128 use "
+                "rejeu.PQN(..., **rejeu.algorithms.pqn.FOR_MANY), else set learning_rate, batch_size and n_epochs"
+            )
+        return ""
 
     def steps_per_gradient(self, n_envs: int) -> int:
         """Returns the number of steps of ``n_envs`` environments per gradient step."""
@@ -153,7 +178,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     n_actions = check_discrete_action(action_space, config.name)
     obs_leaves, shape = network_inputs(config, observation_space)
-    optimizer, epsilon = optimizers.make(config.optimizer), epsilon_schedule(config)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+    epsilon = epsilon_schedule(config)
 
     def init(key: Array) -> State:
         network_key, update_key = jax.random.split(key)
@@ -168,10 +194,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
         def step(i: Array, learned: tuple[Network, PyTree, Array]) -> tuple[Network, PyTree, Array]:
             network, optimizer_state, sums = learned
-            network, optimizer_state, found = gradient_step(
-                network, optimizer_state, minibatch(i), optimizer, rate, config.max_grad_norm
+            network, optimizer_state, loss, q_value = minimize(
+                td_loss, network, optimizer_state, optimizer, rate, minibatch(i)
             )
-            return network, optimizer_state, sums + found
+            return network, optimizer_state, sums + jnp.stack([loss, q_value])
 
         begin = (state.network, state.optimizer, jnp.zeros(2, jnp.float32))
         network, optimizer_state, sums = jax.lax.fori_loop(0, n_steps, step, begin)
@@ -224,20 +250,6 @@ def lambda_returns(reward: Array, next_value: Array, discount: Array, ended: Arr
 
     _, result = jax.lax.scan(back, jnp.zeros_like(reward[0]), (bootstrapped, factor), reverse=True)
     return result
-
-
-def gradient_step(
-    network: Network,
-    optimizer_state: PyTree,
-    batch: Samples,
-    optimizer: optax.GradientTransformation,
-    rate: Any,
-    max_grad_norm: float | None,
-) -> tuple[Network, PyTree, Array]:
-    """Returns network and optimizer state after a step on a minibatch, and its loss and mean value, ``float32[2]``."""
-    (loss, q_value), gradients = value_and_grad(td_loss, has_aux=True)(network, batch)
-    network, optimizer_state = descend(network, clip(gradients, None, max_grad_norm), optimizer_state, optimizer, rate)
-    return network, optimizer_state, jnp.stack([loss, q_value])
 
 
 def td_loss(network: Network, batch: Samples) -> tuple[Array, Array]:

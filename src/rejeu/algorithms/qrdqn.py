@@ -40,7 +40,7 @@ from rejeu.algorithms.dqn import (
     taken,
 )
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, clip, descend, weighted_mean
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, descend, weighted_mean
 from rejeu.networks import Network
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_discrete_action
@@ -52,16 +52,11 @@ class Config(QLearningConfig):
     """Hyperparameters of QR-DQN; the defaults are those of sb3-contrib."""
 
     learning_rate: float | Schedule = 5e-5
-    """Step size of the optimizer: a number, ``rejeu.Linear(start, end)``, ``rejeu.Exponential(start, end)``,
-    ``"lin_5e-5"`` or a function of the progress from 0 to 1. A larger value learns faster until it diverges."""
     n_quantiles: int = 200
     """Quantiles of the return per action. A larger number describes the distribution more finely, at a higher cost."""
     exploration_fraction: float = 0.005
-    """Fraction of the run over which epsilon decreases, in (0, 1]."""
     exploration_final_eps: float = 0.01
-    """Probability of a random action from ``exploration_fraction`` of the run on, in [0, 1]."""
     max_grad_norm: float | None = None
-    """Maximum Euclidean norm of the gradient over all parameters; larger gradients are scaled down. None: no limit."""
 
     name: ClassVar[str] = "QRDQN"
 
@@ -79,7 +74,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     n_actions, n_quantiles = check_discrete_action(action_space, config.name), config.n_quantiles
     obs_leaves, shape = network_inputs(config, observation_space)
-    optimizer, epsilon = optimizers.make(config.optimizer, eps=0.01 / config.batch_size), config.epsilon
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm, eps=0.01 / config.batch_size)
+    epsilon = config.epsilon
 
     def init(key: Array) -> State:
         outputs = Network(key, obs_leaves, n_actions * n_quantiles, shape.critic_widths(HIDDEN_LAYERS), shape)
@@ -90,7 +86,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
         target = td_target(target_network, batch)
         (loss, current), gradients = jax.value_and_grad(quantile_loss, has_aux=True)(state.network, batch, target)
-        gradients = clip(gradients, None, config.max_grad_norm)
         rate = at(config.learning_rate, clock.progress)
         network, optimizer_state = descend(state.network, gradients, state.optimizer, optimizer, rate)
         step = jnp.asarray(clock.step, jnp.uint32)

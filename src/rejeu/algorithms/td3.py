@@ -26,8 +26,14 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import network_inputs
-from rejeu.algorithms.ddpg.continuous import actor_loss, explore, policy
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, DeterministicPolicyConfig, metrics_of
+from rejeu.algorithms.ddpg.continuous import (
+    HIDDEN_LAYERS,
+    DeterministicPolicyConfig,
+    actor_loss,
+    explore,
+    metrics_of,
+    policy,
+)
 from rejeu.core import (
     AVERAGED,
     Algorithm,
@@ -99,7 +105,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, shape = network_inputs(config, observation_space)
-    optimizer = optimizers.make(config.optimizer)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)

@@ -32,10 +32,10 @@ from rejeu.algorithms.sac.continuous import (
     exploit,
     explore,
     initial_state,
+    metrics_of,
     policy,
     temperature_and_targets,
 )
-from rejeu.algorithms.sac.temperature import metrics_of
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network, QNetwork
@@ -79,7 +79,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     obs_leaves, shape = leaves(observation_space), config.policy_kwargs
     target_entropy = config.entropy_target(-float(action_dim))
     n_kept = config.n_critics * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
-    optimizer = optimizers.make(config.optimizer)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array) -> QNetwork:
         widths = shape.critic_widths(HIDDEN_LAYERS)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, NamedTuple
 
 import jax
@@ -25,13 +26,12 @@ from rejeu.buffers import device_priorities
 from rejeu.buffers.device_priorities import DevicePriorities
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
+from rejeu.buffers.strategies import BUILT_IN, STRATEGIES, GoalStrategy, HindsightSteps
 from rejeu.buffers.uniform import bootstrap_discount
 from rejeu.core import PyTree, Transition
 
 RUNNING = np.iinfo(np.int32).max
 """The end of an episode that has not ended."""
-STRATEGIES = ("future", "final", "episode", "random")
-"""The goal strategies of hindsight that exist here."""
 
 GoalFunction = Callable[[Array, Array], Array]
 """A traceable function of achieved and desired goals ``(n, ...)`` that returns ``(n,)``."""
@@ -81,7 +81,7 @@ class DeviceReplay:
     n_steps: int = 1
     each_reward: bool = False
     """Whether transitions of several steps have :attr:`Transition.rewards`."""
-    strategy: str | None = None
+    strategy: str | GoalStrategy | None = None
     """The goal strategy, None without hindsight."""
     n_sampled_goal: int = 4
     achieved: int = 0
@@ -291,13 +291,24 @@ class DeviceReplay:
             other = self.draw_rows(ring, key, n)
             return self.positions(other.env, other.time + 1)
         place = self.positions(rows.env, ring.episode[rows.position])
-        time, last = rows.time, jnp.minimum(ring.ends[place], ring.head[rows.env])
-        if self.strategy == "final":
-            return self.positions(rows.env, last)
-        if self.strategy == "episode":
-            time = jnp.maximum(ring.begins[place], self.oldest(ring)[rows.env])
-        ahead = below(jax.random.bits(jax.random.fold_in(key, 0), (n,), jnp.uint32), last - time)
-        return self.positions(rows.env, time + 1 + ahead)
+        first = jnp.maximum(ring.begins[place], self.oldest(ring)[rows.env]) + 1
+        last = jnp.minimum(ring.ends[place], ring.head[rows.env])
+        numbers = count()
+
+        def achieved(times: Array) -> Array:
+            env = rows.env.reshape(-1, *[1] * (times.ndim - 1))
+            return ring.obs[self.achieved][self.positions(env, times)]
+
+        def integers(low: Array, high: Array) -> Array:
+            shape = jnp.broadcast_shapes(jnp.shape(low), jnp.shape(high))
+            return low + below(jax.random.bits(jax.random.fold_in(key, next(numbers)), shape, jnp.uint32), high - low)
+
+        desired = lambda: ring.obs[self.desired][rows.position]  # noqa: E731
+        choose = STRATEGIES[self.strategy] if isinstance(self.strategy, str) else self.strategy
+        times = choose(HindsightSteps(jnp, rows.time, first, last, achieved, desired, integers))  # type: ignore[misc]
+        if self.strategy not in BUILT_IN:
+            times = jnp.clip(times.astype(jnp.int32), first, last)
+        return self.positions(rows.env, times)
 
     def _window(self, ring: DeviceRing, rows: DeviceRows) -> tuple[Array, Array, Array]:
         """Returns the steps that n-step returns sum: positions, which of them count and which are terminal, ``(batch, n)``."""

@@ -16,15 +16,16 @@ remains a crash.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
+from typing import Any
 
 import numpy as np
 
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.ring import TERMINATED, Ring, Rows
+from rejeu.buffers.strategies import BUILT_IN, STRATEGIES, GoalStrategy, HindsightSteps, name_of, takes_generator
 from rejeu.buffers.uniform import (
     BaseReplayBuffer,
     batch,
@@ -46,17 +47,6 @@ class GoalSelectionStrategy(str, Enum):
     RANDOM = "random"
 
 
-GoalStrategy = Callable[[np.random.Generator, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""A goal strategy of your own: ``strategy(rng, time, first, last) -> times``.
-
-All arrays have one entry for each relabeled transition, ``int64 (n,)``. Times count the observations of one environment over
-the whole run, so only their differences matter: ``time`` is that of the transition's observation, ``time + 1`` that of its
-next observation. The result says at which time of the same episode the achieved goal is taken, from ``first`` to ``last``.
-``first`` is the observation after the oldest one of the episode that is stored, ``last`` the newest one. ``future`` is
-``rng.integers(time + 1, last + 1)``, ``final`` is ``last``. A strategy that depends on the goals themselves
-overrides :meth:`HerReplayBuffer.goal_index` instead."""
-
-
 @dataclass(frozen=True)
 class HindsightConfig:
     """Settings of hindsight replay (Stable-Baselines3's ``replay_buffer_kwargs``)."""
@@ -64,24 +54,24 @@ class HindsightConfig:
     n_sampled_goal: int = 4
     """Relabeled transitions per original one. Raising it learns more from failures and less from the real goals."""
     goal_selection_strategy: str | GoalStrategy = "future"
-    """``future``, ``final``, ``episode`` or ``random``, a ``GoalSelectionStrategy``, or a function
-    ``(rng, time, first, last) -> times``: see ``rejeu.buffers.hindsight.GoalStrategy``."""
+    """``future``, ``final``, ``episode`` or ``random``, a ``GoalSelectionStrategy``, or a strategy of your own: a function
+    ``(steps) -> times``, or its registered name (see ``rejeu.buffers.strategies.GoalStrategy``)."""
     copy_info_dict: bool = False
     """Accepted for Stable-Baselines3's sake; rejeu computes rewards without info, so only False is possible."""
 
     def __post_init__(self) -> None:
         if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
             raise ValueError(f"n_sampled_goal={self.n_sampled_goal!r} must be a whole number of at least 0")
-        if not callable(self.goal_selection_strategy):
-            try:
-                strategy = GoalSelectionStrategy(self.goal_selection_strategy)
-            except ValueError:
-                known = ", ".join(s.value for s in GoalSelectionStrategy)
-                raise ValueError(
-                    f"goal_selection_strategy={self.goal_selection_strategy!r} must be one of {known}, or a function "
-                    "(rng, time, first, last) -> times. The name of a function is not enough: give the function itself"
-                ) from None
-            object.__setattr__(self, "goal_selection_strategy", strategy.value)
+        strategy = name_of(self.goal_selection_strategy)
+        if isinstance(strategy, GoalSelectionStrategy):
+            strategy = strategy.value
+        known = [*dict.fromkeys([*(one.value for one in GoalSelectionStrategy), *STRATEGIES])]
+        if not callable(strategy) and strategy not in known:
+            raise ValueError(
+                f"goal_selection_strategy={strategy!r} must be one of {', '.join(known)}, or a function (steps) -> times; the "
+                "name of a function of yours is enough if it was registered before (register_goal_strategy)"
+            )
+        object.__setattr__(self, "goal_selection_strategy", strategy)
         if self.copy_info_dict:
             raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
 
@@ -92,10 +82,10 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     >>> counters(HindsightConfig(goal_selection_strategy="future"))
     ('until_end',)
     """
-    if config is None or config.goal_selection_strategy == "random":
+    strategy = None if config is None else config.goal_selection_strategy
+    if strategy is None or strategy == "random":
         return ()
-    of_episode = callable(config.goal_selection_strategy) or config.goal_selection_strategy == "episode"
-    return ("since_start", "until_end") if of_episode else ("until_end",)
+    return ("until_end",) if strategy in ("future", "final") else ("since_start", "until_end")
 
 
 class HerReplayBuffer(BaseReplayBuffer):
@@ -174,19 +164,30 @@ class HerReplayBuffer(BaseReplayBuffer):
                 ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
         """
         ring, strategy = self.ring, self.config.goal_selection_strategy
-        if callable(strategy):
-            return custom_goal_index(strategy, ring, rng, env, time, step)
         if strategy == "random":
             other = ring.draw(rng, len(step))
             return ring.index(other.env, other.time + 1)
-        until_end = step["until_end"]
-        ahead = np.where(until_end, until_end, ring.head[env] - time)
-        if strategy == "final":
-            return ring.index(env, time + ahead)
-        if strategy == "episode":
-            behind = np.minimum(step["since_start"], time - ring.oldest()[env])
-            time, ahead = time - behind, ahead + behind
-        return ring.index(env, time + 1 + (rng.random(len(time)) * ahead).astype(np.int64))
+        until_end, names = step["until_end"], step.dtype.names or ()
+        last = time + np.where(until_end, until_end, ring.head[env] - time)
+        first = (
+            time - np.minimum(step["since_start"], time - ring.oldest()[env]) + 1 if "since_start" in names else None
+        )
+        if takes_generator(strategy):
+            with_generator: Any = strategy
+            return ring.index(env, checked(with_generator(rng, time, first, last), first, last))
+
+        def achieved(times: np.ndarray) -> np.ndarray:
+            of = env.reshape(-1, *[1] * (times.ndim - 1))
+            return ring.read_leaf(self.achieved, ring.index(of, times))
+
+        def integers(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+            u = rng.random(np.broadcast_shapes(np.shape(low), np.shape(high)))
+            return low + (u * (high - low)).astype(np.int64)
+
+        desired = lambda: ring.read_leaf(self.desired, ring.index(env, time))  # noqa: E731
+        choose = STRATEGIES[strategy] if isinstance(strategy, str) else strategy
+        times = choose(HindsightSteps(np, time, first, last, achieved, desired, integers))
+        return ring.index(env, times if strategy in BUILT_IN else checked(times, first, last))
 
     def _n_step(
         self, rows: Rows, relabeled: slice | np.ndarray, goal: np.ndarray
@@ -219,24 +220,20 @@ def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     return np.flatnonzero(chosen)
 
 
-def custom_goal_index(
-    strategy: GoalStrategy, ring: Ring, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray
-) -> np.ndarray:
-    """Returns what :meth:`HerReplayBuffer.goal_index` does, by the user's function.
+def checked(times: Any, first: Any, last: np.ndarray) -> np.ndarray:
+    """Returns the times that a strategy of the user's own chose.
 
     Raises:
-        ValueError: if a time is outside of the episode.
+        ValueError: if one is outside of the episode.
     """
-    first = time - np.minimum(step["since_start"], time - ring.oldest()[env]) + 1
-    last = time + np.where(step["until_end"], step["until_end"], ring.head[env] - time)
-    times = np.asarray(strategy(rng, time, first, last))
-    if times.shape != time.shape or times.dtype.kind not in "iu" or ((times < first) | (times > last)).any():
+    times = np.asarray(times)
+    if times.shape != last.shape or times.dtype.kind not in "iu" or ((times < first) | (times > last)).any():
         received = f"{times.dtype} of shape {times.shape}"
-        if times.shape == time.shape and times.dtype.kind in "iu":
+        if times.shape == last.shape and times.dtype.kind in "iu":
             wrong = np.flatnonzero((times < first) | (times > last))[0]
             received = f"{times[wrong]} where first is {first[wrong]} and last is {last[wrong]}"
         raise ValueError(
             f"goal_selection_strategy must return whole numbers from first to last, one for each transition, of shape "
-            f"{time.shape}; it returned {received}"
+            f"{last.shape}; it returned {received}"
         )
-    return ring.index(env, times)
+    return times

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from rejeu.buffers.row_batch import layout_of
-from rejeu.io.memory import physical_memory
+from rejeu.hardware import free_memory
 from rejeu.spaces import Leaf, flat_keys
 
 STEP, TERMINATED, LAST = 0, 1, 2
@@ -382,14 +382,14 @@ def record_dtype(
 
 
 def check_memory(nbytes: int, capacity: int, name: str = "buffer_size") -> None:
-    """Raises ``MemoryError``, with the numbers, if ``nbytes`` exceed the machine's physical memory.
+    """Raises ``MemoryError``, with the numbers, if ``nbytes`` exceed the memory that this process can still get.
 
     ``name`` is that of the setting with which the user chose ``capacity``.
     """
-    memory = physical_memory()
+    memory = free_memory()
     if memory is not None and nbytes > memory:
         fits = int(capacity * 0.5 * memory / nbytes)
         raise MemoryError(
-            f"{name}={capacity} takes {nbytes / 2**30:.1f} GiB for this environment and the machine has "
-            f"{memory / 2**30:.1f} GiB; try {name}={fits}"
+            f"{name}={capacity} takes {nbytes / 2**30:.1f} GiB for this environment and {memory / 2**30:.1f} GiB of memory "
+            f"are free; try {name}={fits}"
         )

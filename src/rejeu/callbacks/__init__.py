@@ -5,9 +5,8 @@ only ``False`` stops training. A :class:`TrainingCallback` is also called when t
 are in environment steps, over all environments.
 """
 
-from rejeu.callbacks.base import Callback, TrainingCallback
+from rejeu.callbacks.base import Callback, TrainingCallback, crossed, step_before
 from rejeu.callbacks.checkpoint import Checkpoint
-from rejeu.callbacks.due import crossed, step_before
 from rejeu.callbacks.evaluate import EVALUATED, EVALUATION, Evaluate, Evaluated, better, merit
 from rejeu.callbacks.progress_bar import (
     LINE_SECONDS,
@@ -19,8 +18,7 @@ from rejeu.callbacks.progress_bar import (
     time_spent,
 )
 from rejeu.callbacks.record_video import Film, RecordVideo
-from rejeu.callbacks.records import print_records
-from rejeu.callbacks.stopping import stop_on_return, stop_on_success
+from rejeu.callbacks.stopping import print_records, stop_on_return, stop_on_success
 
 __all__ = [
     "EVALUATED",

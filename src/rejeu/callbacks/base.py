@@ -35,6 +35,9 @@ class TrainingCallback(ABC):
     def __call__(self, agent: Any, progress: Progress) -> bool | None:
         """Called after every step of the environments; ``False`` stops training."""
 
+    def resumed(self, agent: Any) -> None:  # noqa: B027 - optional
+        """Called by ``learn`` in a resumed run before the first step, when the state of all callbacks was restored."""
+
     def after_training(self, agent: Any, error: BaseException | None) -> None:  # noqa: B027 - optional
         """Called by ``learn`` at its end; ``error`` is the exception that ended it, None if there is none."""
 
@@ -110,3 +113,18 @@ class TrainedAgent(Protocol):
 
     def run_folder(self, folder: str | Path) -> RunFolder:
         """Returns the folder of its checkpoints."""
+
+
+def crossed(before: int, now: int, every: int) -> bool:
+    """Returns whether a multiple of ``every`` lies in ``(before, now]``.
+
+    >>> [now for now in range(8, 41, 8) if crossed(now - 8, now, 10)]
+    [16, 24, 32, 40]
+    """
+    return now // every > before // every
+
+
+def step_before(agent: TrainedAgent, progress: Progress, n_steps: int | None = None) -> int:
+    """Returns the total environment steps before the first turn of a ``learn`` of ``n_steps`` (None: of more than a turn)."""
+    taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
+    return max(progress.step - taken, 0)

@@ -9,6 +9,7 @@ from typing import Any
 
 from rejeu.callbacks.base import Callback, Stateful, TrainingCallback
 from rejeu.errors import CheckpointError
+from rejeu.interrupt import Stopped
 from rejeu.io.records import WRONG, brief, shown
 from rejeu.loops.run import Progress
 
@@ -38,9 +39,14 @@ def stateful(callbacks: Iterable[Any]) -> list[Stateful]:
 
 
 def called(callback: Callback, agent: Any, turn: Progress) -> bool | None:
-    """Returns the answer of a callback; an error because it looked at a single step of a chunk says so."""
+    """Returns the answer of a callback, ``False`` if Ctrl-C or SIGTERM ended it.
+
+    An error because it looked at a single step of a chunk says so.
+    """
     try:
         return callback(agent, turn)
+    except Stopped:
+        return False
     except (AttributeError, TypeError) as error:
         if turn.result is None and "NoneType" in str(error):
             error.add_note(HIDDEN)
@@ -61,6 +67,9 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
             if saved is not None and isinstance(callback, Stateful):
                 restore_one(callback, saved)
         agent.saved_callbacks = None
+        if saved is not None:
+            for one in started:
+                one.resumed(agent)
         if saved:
             names = shown(", ".join(name for name, _ in saved))
             warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=6)

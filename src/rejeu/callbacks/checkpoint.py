@@ -9,8 +9,7 @@ from typing import ClassVar
 
 import jax
 
-from rejeu.callbacks.base import RunFolder, TrainedAgent, TrainingCallback
-from rejeu.callbacks.due import crossed
+from rejeu.callbacks.base import RunFolder, TrainedAgent, TrainingCallback, crossed
 from rejeu.errors import NonFiniteError
 from rejeu.io.failed_writes import RETRY_SECONDS
 from rejeu.loops.run import Progress

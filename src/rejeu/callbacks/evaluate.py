@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from rejeu.callbacks.base import TrainedAgent
-from rejeu.callbacks.due import crossed, step_before
+from rejeu.callbacks.base import TrainedAgent, TrainingCallback, crossed, step_before
 from rejeu.envs.make import VectorEnv, make_vector
 from rejeu.loops.run import Progress
 from rejeu.reporting.evaluation import Evaluation
@@ -32,10 +31,11 @@ class Evaluated(NamedTuple):
     """Its result."""
 
 
-class Evaluate:
+class Evaluate(TrainingCallback):
     """Evaluates the deterministic policy at an interval of steps, in separate environments, and keeps the best model.
 
-    ``agent.restore_best()`` restores the best weights.
+    ``agent.restore_best()`` restores the best weights. An evaluation that Ctrl-C ends has no result; the resumed run
+    repeats it.
 
     >>> import rejeu
     >>> evaluate = Evaluate("Pendulum-v1", every=200, episodes=2, seed=0)
@@ -76,6 +76,7 @@ class Evaluate:
         self.env = make_vector(env, min(self.episodes, 16) if self._made_here else 1, seed=seed)
         self.seed = seed
         self._last_step: int | None = None
+        self._is_due = False
 
     def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
         """Evaluates if an evaluation is due."""
@@ -84,18 +85,26 @@ class Evaluate:
         if crossed(before, progress.step, self.every):
             self.run(agent, progress.step)
 
+    def resumed(self, agent: TrainedAgent) -> None:
+        """Repeats the evaluation at which the run was stopped."""
+        if self._is_due:
+            self.run(agent, agent.run.step)
+
     def run(self, agent: TrainedAgent, step: int) -> Evaluated:
         """Evaluates now, regardless of ``every``; keeps and returns the result.
 
         Raises:
             ValueError: if the environments are those that the agent trains on.
+            Stopped: if Ctrl-C or SIGTERM asks training to stop.
         """
         if agent.env is not None and agent.env.identities() & self.env.identities():
             raise ValueError("Evaluate was given the environments that the agent trains on; give it others, or an id")
+        self._is_due = True
         root = agent.seed if self.seed is None else self.seed
         seed = int(np.random.SeedSequence([root, step, EVALUATION]).generate_state(1)[0])
         result = Evaluated(step, agent.evaluate(self.episodes, env=self.env, seed=seed))
         self.results.append(result)
+        self._is_due = False
         is_best = self.best is None or better(result.evaluation, self.best.evaluation)
         if is_best:
             self.best = result
@@ -116,6 +125,7 @@ class Evaluate:
             "counts": np.array([len(part.returns) for part in parts], np.int64),
             **{key: np.concatenate([np.zeros(0), *arrays]) for key, arrays in columns.items()},
             "best": None if self.best is None else self.results.index(self.best),
+            "due": self._is_due,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -125,6 +135,7 @@ class Evaluate:
         parts = zip(state["steps"].tolist(), returns, lengths, successes, strict=False)
         self.results = [Evaluated(step, Evaluation(r, n.astype(int), s)) for step, r, n, s in parts]
         self.best = None if state["best"] is None else self.results[state["best"]]
+        self._is_due = state.get("due", False)
 
     def close(self) -> None:
         """Closes the environments, unless they were given as objects."""

@@ -8,8 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple, Self
 
-from rejeu.callbacks.base import TrainedAgent, TrainingCallback
-from rejeu.callbacks.due import step_before
+from rejeu.callbacks.base import TrainedAgent, TrainingCallback, step_before
 from rejeu.loops.run import Progress
 from rejeu.loops.timing import time_shares
 from rejeu.loops.training_call import TrainingCall

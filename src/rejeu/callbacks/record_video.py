@@ -9,8 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from rejeu.callbacks.base import TrainedAgent
-from rejeu.callbacks.due import crossed, step_before
+from rejeu.callbacks.base import TrainedAgent, crossed, step_before
 from rejeu.loops.run import Progress
 from rejeu.reporting.video import record_video
 from rejeu.validation import whole

@@ -19,12 +19,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tyro.extras import subcommand_cli_from_dict
-
 import rejeu
 from rejeu import errors, interrupt, supervised
 from rejeu.cli import parsing
-from rejeu.cli.commands import COMMANDS, MODULES
+from rejeu.cli.commands import COMMANDS, MODULES, of_task
+from rejeu.runs import task as tasks
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
 
@@ -63,12 +62,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_command(argv: Sequence[str]) -> int:
     """Parses a command line, runs the command and returns the exit status."""
     try:
-        argv = parsing.checked(argv, COMMANDS)
-        arguments = subcommand_cli_from_dict(COMMANDS, prog="rejeu", description=DESCRIPTION, args=argv)
+        is_task = [*argv[:1]] == ["--task"] and len(argv) == 2
+        command, arguments = (
+            of_task(tasks.read(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, DESCRIPTION)
+        )
         importlib.import_module("rejeu.cli.settings").check_values(arguments)
         for name in getattr(arguments, "imports", ()):
             importlib.import_module("rejeu.cli.importing").import_source(name)
-        return importlib.import_module(f"rejeu.cli.{MODULES.get(argv[0], argv[0])}").run(arguments)
+        return importlib.import_module(f"rejeu.cli.{MODULES.get(command, command)}").run(arguments)
     except KeyboardInterrupt as error:
         print("rejeu: interrupted", file=sys.stderr)
         return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)

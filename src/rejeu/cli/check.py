@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import inspect
-import sysconfig
+import random
+import sys
+import warnings
 from contextlib import closing
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 
 from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Check
-from rejeu.envs.checker import findings
+from rejeu.cli.environment import Environment
+from rejeu.cli.importing import module_of
+from rejeu.errors import BadEnvironmentError
 
 
 def run(arguments: Check) -> int:
     """Prints the findings, errors first, and returns the exit status: 1 if there are errors, else 0."""
+    from rejeu.envs import checker  # Gymnasium's checker, which it imports, is for environments of one's own only
+
     with (
         jsonout.messages(arguments.json) as output,
         closing(environment.from_arguments(arguments.env, arguments).make()) as env,
     ):
-        found = sorted(findings(env))
+        found = sorted(checker.findings(env))
         package = None if arguments.all else installed_package(env)
     n_notes = 0
     if package is not None:
@@ -44,16 +50,57 @@ def run(arguments: Check) -> int:
     return int(n_errors > 0)
 
 
+def before_training(made: Environment) -> None:
+    """Prints the errors of an environment of one's own, and warns of episodes that never end.
+
+    A new environment takes some steps; random numbers of NumPy and Python are as before.
+
+    Raises:
+        BadEnvironmentError: if there are errors.
+    """
+    if not is_own(made):
+        return
+    from rejeu.envs import checker
+
+    states = random.getstate(), np.random.get_state()  # noqa: NPY002 - of other code
+    with closing(made.make()) as env:
+        found = sorted(checker.quick_findings(env))
+    random.setstate(states[0])
+    np.random.set_state(states[1])  # noqa: NPY002
+    errors = [finding.text for finding in found if finding.level == "error"]
+    for finding in found:
+        if finding.level == "warning":
+            warnings.warn(finding.text, UserWarning, stacklevel=2)
+    for text in errors:
+        print(f"error: {text}", file=sys.stderr)
+    if errors:
+        raise BadEnvironmentError(
+            f"{made.typed} has {counted(len(errors), 'error')}, so nothing is trained; rejeu check shows its warnings too"
+        )
+
+
+def is_own(made: Environment) -> bool:
+    """Returns whether the code of an environment or of a wrapper is not that of an installed package."""
+    spec = gym.registry.get(made.env_id)
+    parts = [] if spec is None else [spec.entry_point, *(one.entry_point for one in spec.additional_wrappers)]
+    modules = [module_of(one) for one in (*parts, *made.wrappers)]
+    return any(module is not None and not is_installed(module) for module in modules)
+
+
+def is_installed(module: str) -> bool:
+    """Returns whether a module is part of an installed package, or not imported yet, which those of one's own are."""
+    package = module.partition(".")[0]
+    found = sys.modules.get(package)
+    if found is None or package == "rejeu":
+        return True
+    places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
+    return any({"site-packages", "dist-packages"} & {*Path(place).resolve().parts} for place in places if place)
+
+
 def installed_package(env: gym.Env) -> str | None:
     """Returns the installed package that defines an environment's class, or None for the user's own code."""
-    kind = type(env.unwrapped)
-    folders = {Path(sysconfig.get_path(name)).resolve() for name in ("purelib", "platlib")}
-    package = kind.__module__.partition(".")[0]
-    try:
-        file = Path(inspect.getfile(kind)).resolve()
-    except (TypeError, OSError):  # a class without a file, such as one of a notebook
-        return None
-    return package if package == "rejeu" or any(file.is_relative_to(folder) for folder in folders) else None
+    module = type(env.unwrapped).__module__
+    return module.partition(".")[0] if is_installed(module) else None
 
 
 def counted(n: int, what: str) -> str:

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import warnings
-from itertools import chain
+from pathlib import Path
 
 from gymnasium import spaces
 
 from rejeu import devices, presets, validation
 from rejeu.agents import AGENTS, agent_of_file
 from rejeu.algorithms import config as configs
-from rejeu.cli import run_folder, settings
 from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
-from rejeu.cli.run_folder import RunConfig
 from rejeu.envs.make import VectorEnv, WorkerOptions
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.io.records import shown
 from rejeu.presets import Preset
 from rejeu.reporting.logging import check_logs, require
-from rejeu.reporting.video import ffmpeg
+from rejeu.reporting.video_file import ffmpeg
+from rejeu.runs.config import DecidedRun
+from rejeu.runs.folder import read_arrivals
+from rejeu.runs.values import merged
+
+MANY = 64
+"""Number of environments from which an algorithm's values for many environments are used."""
 
 
 def installed_logs(arguments: Train) -> tuple[str, ...]:
@@ -29,7 +33,7 @@ def installed_logs(arguments: Train) -> tuple[str, ...]:
         ValueError: for an unknown one.
         MissingExtra: if what they or ``--video-every`` need is not installed, before anything is trained.
     """
-    logs = check_logs("--log", chain.from_iterable(arguments.log))
+    logs = check_logs("--log", arguments.log)
     require(logs)
     if arguments.video_every is not None:
         ffmpeg()
@@ -44,8 +48,8 @@ def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> P
     """
     if arguments.preset is None:
         return presets.find(made.env_id, algorithm)
-    preset = presets.read(arguments.preset)
-    agent_of_file(preset.algorithm, arguments.preset)
+    preset = presets.read(Path(str(arguments.preset)))
+    agent_of_file(preset.algorithm, str(arguments.preset))
     if algorithm not in (None, preset.algorithm):
         raise ValueError(
             f"--algo {algorithm} differs from the algorithm of --preset {arguments.preset}, which is {preset.algorithm}; "
@@ -58,12 +62,12 @@ def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> P
 
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
     """Returns the training environments."""
-    n_envs = arguments.envs or (preset.n_envs if preset else 1)
+    n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
     backend = default_backend(made, preset)
     if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
         backend = "gymnasium"
     backend = arguments.backend or backend
-    order = None if arguments.arrivals is None else run_folder.read_arrivals(arguments.arrivals)
+    order = None if arguments.arrivals is None else read_arrivals(Path(arguments.arrivals))
     ray = None
     if backend == "ray" or arguments.ray is not None:
         ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus}
@@ -108,18 +112,19 @@ def make_config(
     env: VectorEnv,
     seed: int,
     logs: tuple[str, ...],
-) -> RunConfig:
+) -> DecidedRun:
     """Returns the configuration of the run: the arguments, then the preset, then the defaults.
 
     Raises:
         TypeError: for an unknown hyperparameter, with the nearest known one.
         ValueError: for an invalid value.
     """
-    base = presets.default(made.env_id, algorithm) if preset is None else preset
-    hyperparameters = settings.apply(chain.from_iterable(arguments.assignments), base.hyperparameters)
+    for_many = AGENTS[algorithm].algorithm.Config.for_many if env.n_envs >= MANY else {}
+    base = presets.default(made.env_id, algorithm, for_many) if preset is None else preset
+    hyperparameters = merged(arguments.hyperparameters, base.hyperparameters)
     config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
     nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
-    return RunConfig(
+    return DecidedRun(
         env=made.env_id,
         env_argument=made.typed,
         env_kwargs=dict(made.kwargs),

@@ -9,8 +9,7 @@ from pathlib import Path
 from rejeu.cli import tables
 from rejeu.cli.commands import Compare
 from rejeu.cli.jsonout import emit
-from rejeu.reporting.comparison import Comparison, Group, compare
-from rejeu.reporting.tabular import improvement_row, number
+from rejeu.reporting.comparison import Comparison, compare
 
 
 def run(arguments: Compare) -> int:
@@ -59,39 +58,17 @@ def references(words: Iterable[str]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def row_of(group: Group) -> list[str]:
-    """Returns the cells of a group."""
-    value, low, high = map(number, group.score)
-    reached = f"{number(group.reached[1])} ({group.reached[0]} of {len(group.runs)})"
-    cells = [group.label, group.env_id, str(len(group.runs)), value, f"{low} to {high}"]
-    return [*cells, number(group.mean), number(group.median), reached]
-
-
 def show(comparison: Comparison) -> None:
     """Prints the tables and the notes."""
     from rich.console import Console
     from rich.markup import escape
 
-    head = [
-        "group",
-        "environment",
-        "runs",
-        "IQM",
-        "95 % interval",
-        "mean",
-        "median",
-        f"{comparison.axis} to\nthreshold",
-    ]
-    tables.show(head, map(row_of, comparison.groups), 2)
+    head, *rows = comparison.text_table()
+    tables.show(head, rows, 2)
     console = Console(highlight=False)
     console.print(comparison.definition, soft_wrap=True)
-    levels = {group.env_id or "an unknown environment": number(group.reached[2]) for group in comparison.groups}
-    console.print(
-        f"threshold: {', '.join(f'{level} on {escape(env)}' for env, level in levels.items())}",
-        soft_wrap=True,
-    )
     for one in comparison.improvements:
-        better, other, env, text = map(escape, improvement_row(one))
+        better, other, env, text = map(escape, one.cells)
         console.print(f"{better} scores higher than {other} on {env} with probability {text}", soft_wrap=True)
     for note in comparison.notes:
         console.print(f"note: {escape(note)}", soft_wrap=True)

@@ -16,14 +16,16 @@ from typing import Any
 
 import gymnasium as gym
 
-from rejeu.cli import settings
-from rejeu.cli.commands import EnvironmentOptions, RunOptions
+from rejeu.cli.commands import RunOptions
 from rejeu.cli.importing import find_id, find_wrapper, imports
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import are_plain, maker, register
+from rejeu.envs.rendering import make_rendering_env
 from rejeu.errors import CheckpointError
-from rejeu.reporting.text import quoted
-from rejeu.reporting.video import make_rendering_env
+from rejeu.io import checkpoint
+from rejeu.runs.config import DecidedRun, EnvironmentOptions
+from rejeu.runs.folder import RunFolder, read_config
+from rejeu.runs.values import assignment_words, merged, quoted
 
 DEFAULT_WORKERS = WorkerOptions()
 """All environments step together; lost workers are not restarted."""
@@ -119,8 +121,7 @@ class Wrapped:
 def options(typed: str, kwargs: Mapping[str, Any], wrapper_names: Iterable[str]) -> str:
     """Returns an environment as options of a command line, with a space before each."""
     words = ["--env", typed]
-    if kwargs:
-        words += ["--env-kwargs", *(f"{key}={settings.written(value)}" for key, value in kwargs.items())]
+    words += assignment_words("--env-kwargs", kwargs)
     words += chain.from_iterable(("--wrapper", name) for name in wrapper_names)
     return "".join(f" {quoted(word)}" for word in words)
 
@@ -132,9 +133,9 @@ def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
         ValueError: if there is none, with the nearest; or for an invalid wrapper or keyword argument.
         ImportError: if a module cannot be imported.
     """
-    kwargs = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
-    wrappers = tuple(find_wrapper(name) for name in given.wrapper)
-    return Environment(find_id(env), env, kwargs, given.wrapper, wrappers, given.imports)
+    kwargs = merged(given.env_kwargs, {}, "--env-kwargs")
+    wrappers = tuple(find_wrapper(name) for name in given.wrappers)
+    return Environment(find_id(env), env, kwargs, given.wrappers, wrappers, given.imports)
 
 
 def from_run(
@@ -166,14 +167,46 @@ def from_run(
             f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "
             "--env ID"
         )
-    own = settings.apply(chain.from_iterable(given.env_kwargs), {}, "--env-kwargs")
+    own = merged(given.env_kwargs, {}, "--env-kwargs")
     kept = {key: value for key, value in kwargs.items() if key not in own}
-    wrapper_names = tuple(given.wrapper or wrapper_names)
-    if imports(env_argument or env_id) or (wrapper_names and not given.wrapper) or not are_plain(kept):
+    wrapper_names = tuple(given.wrappers or wrapper_names)
+    if imports(env_argument or env_id) or (wrapper_names and not given.wrappers) or not are_plain(kept):
         again = options(env_argument or env_id, {**kept, **own}, wrapper_names)
         raise CheckpointError(
             f"{run} was trained on an environment that is imported or made with more than numbers, which no file may ask "
             f"for; if you trust it, name it again:{again if len(again) < 500 and again.isprintable() else ' --env ENV'}"
         )
-    wrappers = tuple(find_wrapper(name) for name in given.wrapper)
-    return Environment(env_id, env_id, {**kept, **own}, given.wrapper, wrappers, given.imports)
+    wrappers = tuple(find_wrapper(name) for name in given.wrappers)
+    return Environment(env_id, env_id, {**kept, **own}, given.wrappers, wrappers, given.imports)
+
+
+def environment_of(model: Path, given: RunOptions) -> Environment:
+    """Returns the environment for a model: what the command line says, else what the file and its run folder say.
+
+    Raises:
+        CheckpointError: if they do not say, if it must be typed again, or if the file is not a model.
+        ValueError: if there is no such environment.
+    """
+    if given.env is not None:
+        return from_arguments(given.env, given)
+    env_id = recorded_id(model)
+    folder = RunFolder(model.parent)
+    if model in (folder.best, folder.agent) and folder.config.is_file():
+        config = read_config(folder)
+        if config.env == env_id:
+            return of_run(folder, config, given)
+    return from_run(env_id, "", {}, (), model, given)
+
+
+def recorded_id(model: Path) -> Any:
+    """Returns the id of the environment of a model file, unchecked; None if it has none.
+
+    Raises:
+        CheckpointError: if the file is not a model.
+    """
+    return checkpoint.read_header(model, "agent").get("env_id")
+
+
+def of_run(folder: RunFolder, config: DecidedRun, given: RunOptions) -> Environment:
+    """Returns the environment of a run: what the command line says, else what its configuration says."""
+    return from_run(config.env, config.env_argument, config.env_kwargs, config.wrappers, folder.path, given)

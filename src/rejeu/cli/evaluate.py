@@ -6,8 +6,10 @@ from contextlib import closing
 
 from rejeu import devices
 from rejeu.agents import load
-from rejeu.cli import jsonout, run_folder
+from rejeu.cli import jsonout
 from rejeu.cli.commands import Evaluate
+from rejeu.cli.environment import environment_of
+from rejeu.runs.folder import find_model
 
 
 def run(arguments: Evaluate) -> int:
@@ -16,8 +18,8 @@ def run(arguments: Evaluate) -> int:
     episodes, minutes = arguments.episodes, arguments.minutes
     if minutes is None and episodes is None:
         episodes = 100
-    model = run_folder.find_model(arguments.run, arguments.which)
-    environment = run_folder.environment_of(model, arguments)
+    model = find_model(arguments.run, arguments.which)
+    environment = environment_of(model, arguments)
     agent = load(model, device=arguments.device)
     n_envs = 16 if episodes is None else min(episodes, 16)
     with (

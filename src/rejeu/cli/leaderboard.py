@@ -34,6 +34,8 @@ def run(arguments: Class) -> int:
             episodes,
             arguments.seed,
             60 * arguments.minutes,
+            arguments.success_threshold,
+            arguments.language,
             partial(print, flush=True),
         )
         text = formats[out.suffix](board)

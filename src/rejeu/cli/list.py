@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rejeu import presets
-from rejeu.agents import AGENTS
 from rejeu.cli import jsonout
 from rejeu.cli.commands import List
 from rejeu.presets import Preset
 
+FOLDER = Path(presets.__file__).parents[1] / "agents"
+
 
 def run(arguments: List) -> int:
     """Prints the lists and returns the exit status."""
-    algorithms = {name: (agent.__doc__ or "").partition("\n")[0] for name, agent in AGENTS.items()}
+    algorithms = described(is_extended=bool(arguments.imports))
     if arguments.json:
         jsonout.emit({"algorithms": algorithms, "presets": [as_dict(preset) for preset in presets.every()]})
         return 0
@@ -33,6 +36,22 @@ def run(arguments: List) -> int:
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
     return 0
+
+
+def described(is_extended: bool) -> dict[str, str]:
+    """Returns the first lines of the docstrings of all agents by name.
+
+    Args:
+        is_extended: whether imported modules may have registered others; else nothing is imported, which would take seconds.
+    """
+    if is_extended:
+        from rejeu.agents import AGENTS
+
+        return {name: (agent.__doc__ or "").partition("\n")[0] for name, agent in AGENTS.items()}
+    texts = [(FOLDER / f"{kind}_policy.py").read_text("utf-8") for kind in ("off", "on")]
+    classes = [one for text in texts for one in ast.parse(text).body if isinstance(one, ast.ClassDef)]
+    docs = {one.name: (ast.get_docstring(one) or "").partition("\n")[0] for one in classes}
+    return {name: text for name, text in docs.items() if not name.endswith("Agent")}
 
 
 def as_dict(preset: Preset) -> dict[str, Any]:

@@ -17,11 +17,13 @@ from rejeu import xla
 from rejeu.agents import Agent
 from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.cli.environment import Environment
-from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.interrupt import NAMES
 from rejeu.io import atomic
+from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Sink
-from rejeu.reporting.text import counted, quoted
+from rejeu.runs.config import DecidedRun
+from rejeu.runs.folder import RunFolder
+from rejeu.runs.values import quoted
 
 echo = partial(print, flush=True)
 
@@ -37,7 +39,7 @@ class Stopwatch:
         return time.perf_counter() - self._began, xla.seconds() - self._compiled
 
 
-def header(config: RunConfig, environment: Environment, backend: str, folder: RunFolder) -> str:
+def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
     """Returns the first lines of a run; ``backend`` describes the backend."""
     what = "preset" if config.preset else "default hyperparameters"
     length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"

@@ -7,19 +7,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rejeu.agents import modules_of
 from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Pbt, Resume
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
-from rejeu.cli.run_folder import check_free
-from rejeu.cli.tune import shared
+from rejeu.cli.tune import common, shared
+from rejeu.experiments import population as populations
+from rejeu.experiments.population import Members
+from rejeu.experiments.process import default_workers
 from rejeu.interrupt import NAMES, Interrupt
-from rejeu.reporting.text import quoted
-from rejeu.sweeps.processes import default_workers, environment as variables, threads_of
-from rejeu.tuning import members as trained, population as populations
-from rejeu.tuning.members import Members
-from rejeu.tuning.training import Command, env_options
+from rejeu.runs.folder import check_free
+from rejeu.runs.values import quoted
 
 FILE = "population.json"
 """File that makes a folder one of a population."""
@@ -39,7 +37,7 @@ def pbt(arguments: Pbt) -> tuple[int, dict[str, Any]]:
         arguments.rounds, arguments.round_steps, arguments.members, env_id=made.env_id, **shared(arguments, made)
     )
     name = re.sub(r"[^\w.-]+", "-", f"pbt-{made.env_id}-{population.plan.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}")
-    members = trained.create(arguments.out or Path("runs") / name, population)
+    members = populations.create(arguments.out or Path("runs") / name, population)
     return train(members, made, arguments.workers)
 
 
@@ -49,9 +47,9 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     Raises:
         ValueError: for options of a run, or an environment that is not that of the population.
     """
-    if arguments.steps is not None or arguments.minutes is not None or arguments.assignments:
+    if arguments.steps is not None or arguments.minutes is not None or arguments.hyperparameters:
         raise ValueError(f"{arguments.run} is a population of rejeu pbt; leave out --steps, --minutes and --set")
-    members = Members(arguments.run, populations.read(arguments.run / FILE))
+    members = populations.read(arguments.run)
     plan = members.population.plan
     made = environment.from_run(plan.env_id, plan.env_argument, plan.env_kwargs, plan.wrappers, members.path, arguments)
     if made.env_id != plan.env_id:
@@ -69,10 +67,8 @@ def train(members: Members, made: Environment, workers: int | None) -> tuple[int
     for i, (name, dimension) in enumerate(plan.search_space.items()):
         echo(f"{'changing' if i == 0 else '':<14}{name}: {dimension}")
     echo(f"folder        {members.path}")
-    options = env_options(made.kwargs, made.wrapper_names, modules_of(plan.algorithm, made.modules))
-    command = Command(made.typed, options, variables(threads_of(at_once)))
     with members.lock(), Interrupt() as stop:
-        complete = trained.train(members, command, at_once, stop, echo)
+        complete = populations.train(members, common(made, plan.algorithm), at_once, stop, echo)
     result = as_dict(members, complete, stop.signal)
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(members.path)}{made.options()} continues")
@@ -88,7 +84,7 @@ def as_dict(members: Members, complete: bool, signal: int | None) -> dict[str, A
     plan, history = members.population.plan, members.history()
     best = None
     if complete:
-        member = trained.best_member(members)
+        member = members.best()
         best = next(row for row in reversed(history) if row["member"] == member)
     return {
         "population": members.path,

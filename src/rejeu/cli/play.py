@@ -7,11 +7,13 @@ from itertools import chain
 from typing import Any
 
 from rejeu.agents import load
-from rejeu.cli import environment, jsonout, run_folder, settings
+from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Play
 from rejeu.play import Game, play
 from rejeu.play.known import full_name
-from rejeu.reporting.text import counted
+from rejeu.reporting.formatting import counted
+from rejeu.runs.folder import find_model
+from rejeu.runs.values import value
 
 
 def run(arguments: Play) -> int:
@@ -19,8 +21,8 @@ def run(arguments: Play) -> int:
     made = environment.from_arguments(full_name(arguments.env), arguments)
     agent = None
     if arguments.against is not None:
-        model = run_folder.find_model(arguments.against, arguments.which)
-        trained_on = run_folder.recorded_id(model)
+        model = find_model(arguments.against, arguments.which)
+        trained_on = environment.recorded_id(model)
         if trained_on != made.env_id:
             raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {made.env_id}")
         agent = load(model)
@@ -57,7 +59,7 @@ def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
         keys, equals, text = assignment.rpartition("=")
         if not equals or not keys:
             raise ValueError(f"--keys {assignment!r} must be keys=action, such as a=0 or a+w=[1,-1]")
-        result[keys.strip()] = settings.value(text)
+        result[keys.strip()] = value(text)
     return result
 
 

@@ -8,13 +8,13 @@ from contextlib import closing
 from pathlib import Path
 
 from rejeu.agents import load
-from rejeu.cli import run_folder
 from rejeu.cli.commands import Report
-from rejeu.cli.run_folder import RunFolder
+from rejeu.cli.environment import environment_of
 from rejeu.interrupt import leaving
 from rejeu.io import atomic
 from rejeu.reporting.report import write_report
 from rejeu.reporting.report.live import make_server
+from rejeu.runs.folder import RunFolder, find_model
 from rejeu.validation import whole
 
 SUFFIXES = (".html", ".htm")
@@ -54,10 +54,10 @@ def replay(path: Path, arguments: Report) -> None:
     """
     assert arguments.replay is not None
     folder = RunFolder(path)
-    model = run_folder.find_model(path, "best")
+    model = find_model(path, "best")
     agent = load(model)
     rows = ["seed,return,length,success"]
-    with closing(run_folder.environment_of(model, arguments).make()) as env:
+    with closing(environment_of(model, arguments).make()) as env:
         for seed in range(whole("--replay", arguments.replay, least=1)):
             played = agent.evaluate(1, env=env, seed=seed)
             rows.append(f"{seed},{played.mean_return},{played.mean_length:.0f},{played.success_rate}")

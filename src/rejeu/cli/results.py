@@ -12,13 +12,12 @@ import gymnasium
 from rejeu import errors
 from rejeu.agents import Agent, load
 from rejeu.callbacks import Evaluate
-from rejeu.cli import run_folder
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
-from rejeu.cli.run_folder import RunFolder
 from rejeu.reporting import plots, report, video
 from rejeu.reporting.logging import RetryingSink
 from rejeu.reporting.trackers import Background
+from rejeu.runs.folder import RunFolder, write_arrivals as write_order
 
 VIDEO_EPISODES = 3
 VIDEO_STEPS = 600
@@ -45,7 +44,7 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
 def write_arrivals(agent: Agent, folder: RunFolder) -> None:
     """Writes the order in which the results of environments were taken, if they did not wait for each other."""
     if agent.env is not None and (arrivals := agent.env.arrivals) is not None:
-        write = partial(run_folder.write_arrivals, folder, arrivals)
+        write = partial(write_order, folder, arrivals)
         agent.failed_writes.attempt(f"order of arrival {folder.arrivals}", write)
 
 

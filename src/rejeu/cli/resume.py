@@ -5,23 +5,27 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from contextlib import closing
-from itertools import chain
+from pathlib import Path
 from typing import Any
 
 from rejeu import devices
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
-from rejeu.cli import jsonout, pbt, run_folder, settings, sweep, tune
+from rejeu.cli import environment as environments, jsonout, pbt, sweep, tune
 from rejeu.cli.commands import Resume
 from rejeu.cli.output import Stopwatch, echo
-from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.cli.session import Limits, Session, has_reached_goal, make_evaluation_env
 from rejeu.envs.make import WorkerOptions
+from rejeu.experiments.folder import is_sweep
+from rejeu.experiments.population import FILE
+from rejeu.experiments.study import StudyFolder
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
-from rejeu.reporting.text import quoted
-from rejeu.sweeps.folder import is_sweep
-from rejeu.tuning.study import StudyFolder
+from rejeu.reporting.tables import read_table
+from rejeu.runs import config as configs_of_runs
+from rejeu.runs.config import DecidedRun
+from rejeu.runs.folder import RunFolder, read_config
+from rejeu.runs.values import merged, quoted
 
 
 def run(arguments: Resume) -> int:
@@ -34,7 +38,7 @@ def run(arguments: Resume) -> int:
         return jsonout.run(sweep.resume, arguments)
     if StudyFolder(arguments.run).plan.is_file():
         return jsonout.run(tune.resume, arguments)
-    if (arguments.run / pbt.FILE).is_file():
+    if (arguments.run / FILE).is_file():
         return jsonout.run(pbt.resume, arguments)
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
@@ -45,23 +49,23 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
     folder = RunFolder(arguments.run)
-    config = run_folder.read_config(folder)
+    config = read_config(folder)
     if config.backend != "ray" and (arguments.ray is not None or arguments.env_cpus is not None):
         raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray and --env-cpus are for these")
     require(config.log)
     device = arguments.device or ("cpu" if config.device == "cpu" else "auto")  # a GPU may not be here
     devices.start_with("--device", device)
     kind = agent_of_file(config.algorithm, folder.config)
-    environment = run_folder.of_run(folder, config, arguments)
+    environment = environments.of_run(folder, config, arguments)
     ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
     workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=config.wait_for, ray=ray)
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
             agent = kind.resume(folder.checkpoints, env, device=device, **changes(arguments, config))
-        if arguments.assignments:
+        if arguments.hyperparameters:
             config = dataclasses.replace(config, hyperparameters=configs.to_json(agent.config))
-            run_folder.write_config(folder, config)
+            configs_of_runs.write(folder.config, config)
         limits = choose_limits(agent, arguments)
         echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
         echo(f"checkpoint    {agent.resumed}")
@@ -80,11 +84,16 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
             return session.run(stop, stopwatch)
 
 
-def changes(arguments: Resume, config: RunConfig) -> dict[str, Any]:
+def changes(arguments: Resume, config: DecidedRun) -> dict[str, Any]:
     """Returns the hyperparameters that ``--set`` changes."""
-    given = [*chain.from_iterable(arguments.assignments)]
-    names = {assignment.partition("=")[0].strip().split(".")[0] for assignment in given}
-    return {name: value for name, value in settings.apply(given, config.hyperparameters).items() if name in names}
+    names = {name.split(".")[0] for name in arguments.hyperparameters}
+    changed = merged(arguments.hyperparameters, config.hyperparameters)
+    return {name: value for name, value in changed.items() if name in names}
+
+
+def is_evaluated(run: Path, agent: Agent) -> bool:
+    """Returns whether the evaluation at the end of a run was not interrupted."""
+    return agent.num_timesteps in read_table(RunFolder(run).evaluations, ("step",)).column("step")
 
 
 def choose_limits(agent: Agent, arguments: Resume) -> Limits:
@@ -95,7 +104,7 @@ def choose_limits(agent: Agent, arguments: Resume) -> Limits:
     """
     steps, minutes = arguments.steps, arguments.minutes
     if has_reached_goal(agent):
-        if arguments.finish:
+        if arguments.finish or (steps is None and minutes is None and not is_evaluated(arguments.run, agent)):
             return Limits()
         if steps is None and minutes is None:
             raise ValueError(

@@ -16,14 +16,16 @@ from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo, calling
 from rejeu.cli import results
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
-from rejeu.cli.run_folder import RunConfig, RunFolder
 from rejeu.envs.make import VectorEnv
 from rejeu.interrupt import Interrupt, leaving
 from rejeu.loops.run import Progress
+from rejeu.reporting.formatting import counted
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
-from rejeu.reporting.text import quoted
 from rejeu.reporting.trackers import Background
+from rejeu.runs.config import DecidedRun
+from rejeu.runs.folder import RunFolder
+from rejeu.runs.values import quoted
 
 
 class Limits(NamedTuple):
@@ -60,7 +62,7 @@ class Session(NamedTuple):
     """One ``rejeu train`` or ``rejeu resume`` of a run."""
 
     agent: Agent
-    config: RunConfig
+    config: DecidedRun
     folder: RunFolder
     environment: Environment
     evaluation_env: VectorEnv
@@ -174,16 +176,21 @@ class Session(NamedTuple):
         evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
         is_pause_due = pause(agent, self.limits)
 
+        def save(agent: Agent, turn: Progress) -> None:
+            if has_reached_goal(agent):  # before the last evaluation, which may take longer than training
+                results.save(agent, folder.agent)
+                echo(f"{self.label}evaluating the final policy on {counted(episodes, 'episode')}; Ctrl-C ends it")
+
         def finish(agent: Agent, turn: Progress) -> bool:
             if not stop.requested and has_reached_goal(agent):
                 evaluate_now(evaluate, agent)  # here, and not after learn, so that the last checkpoint contains it
             return not (stop.requested or is_pause_due(turn))
 
-        callbacks: list[Any] = [evaluate, finish]
+        callbacks: list[Any] = [save, evaluate, finish]
         if config.video_every is not None:
             render = self.environment.rendering
             callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=results.VIDEO_STEPS))
-        if config.checkpoint_minutes is not None:
+        if config.checkpoint_minutes:
             callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
         return evaluate, callbacks
 
@@ -193,7 +200,7 @@ class Session(NamedTuple):
             results.write_report(self.folder)
 
 
-def make_evaluation_env(config: RunConfig, environment: Environment) -> VectorEnv:
+def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:
     """Returns up to 16 environments like those of training, with other seeds."""
     seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
     backend = config.backend if config.backend in ("envpool", "jax") else "gymnasium"

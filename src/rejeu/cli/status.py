@@ -10,8 +10,8 @@ import numpy as np
 from rejeu.cli.commands import Status
 from rejeu.cli.jsonout import emit
 from rejeu.reporting import run_list
+from rejeu.reporting.formatting import counted
 from rejeu.reporting.runs import Run, best_row
-from rejeu.reporting.text import counted
 
 WINDOW = 100
 """Last episodes that are averaged."""
@@ -98,7 +98,9 @@ def lines(facts: dict[str, Any]) -> list[str]:
         rest = f", about {left:,.0f} s left" if left is not None and math.isfinite(left) else ""
         found.append(f"time          {facts['seconds']:,.1f} s, {facts['steps_per_second']:,.0f} steps/s{rest}")
     if math.isfinite(facts["mean_return"]):
-        found.append(f"training      return {facts['mean_return']:,.2f} over the last {counted(WINDOW, 'episode')}")
+        n = min(facts["episodes"], WINDOW)
+        latest = f"over the last {counted(n, 'episode')}" if n else "in the latest row of metrics.csv"
+        found.append(f"training      return {facts['mean_return']:,.2f} {latest}")
     found.append(f"best          {best_text(facts['best'])}")
     found += [f"warning       {one}" for one in facts["warnings"]]
     return [*found, *(f"note          {one}" for one in facts["notes"])]

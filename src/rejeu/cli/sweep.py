@@ -8,15 +8,16 @@ from typing import Any
 from rejeu.cli import jsonout
 from rejeu.cli.commands import Resume, Sweep
 from rejeu.errors import MissingExtra
+from rejeu.experiments.coordinator import Coordinator, Outcome
+from rejeu.experiments.folder import SweepFolder, read_folder
+from rejeu.experiments.jobs import again
+from rejeu.experiments.scheduler import Launcher
+from rejeu.experiments.sweep import SweepResult, make_launcher, prepare
+from rejeu.experiments.table import closing_lines, echo, shown
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.comparison import By, Comparison, compare
-from rejeu.reporting.tabular import interval_text
-from rejeu.reporting.text import quoted
-from rejeu.sweeps.coordinator import Coordinator
-from rejeu.sweeps.folder import SweepFolder, read_folder
-from rejeu.sweeps.jobs import Code, again
-from rejeu.sweeps.sweep import SweepResult, make_launcher, prepare
-from rejeu.sweeps.table import closing_lines, echo, shown
+from rejeu.runs.config import RunConfig
+from rejeu.runs.values import quoted
 
 
 def run(arguments: Sweep) -> int:
@@ -26,9 +27,9 @@ def run(arguments: Sweep) -> int:
 
 def begin(arguments: Sweep) -> tuple[int, dict[str, Any]]:
     """Begins or joins a sweep; returns the exit status and the result."""
-    code = Code(imports=arguments.imports)
-    folder = prepare(arguments.plan, arguments.out, arguments.workers, code, arguments.ray)
-    return complete(folder, code, arguments.workers, arguments.ray, retry=False)
+    typed = RunConfig(env="", imports=arguments.imports)
+    folder = prepare(arguments.plan, arguments.out, arguments.workers, typed, arguments.ray)
+    return complete(folder, typed, arguments.workers, arguments.ray, retry=False)
 
 
 def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
@@ -41,35 +42,50 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
         raise ValueError(
             f"{arguments.run} is a sweep, which trains to its goals; --steps and --minutes are for a single run"
         )
-    code = Code(env=arguments.env, wrappers=arguments.wrapper, imports=arguments.imports)
-    folder = read_folder(arguments.run, code)
-    return complete(folder, code, arguments.workers, arguments.ray, retry=True)
+    given = {key: getattr(arguments, key) for key in ("env_kwargs", "wrappers", "imports")}
+    typed = RunConfig(env=arguments.env or "", **given)
+    return complete(read_folder(arguments.run, typed), typed, arguments.workers, arguments.ray, retry=True)
 
 
 def complete(
-    folder: SweepFolder, code: Code, workers: int | None, ray: str | None, retry: bool
+    folder: SweepFolder, typed: RunConfig, workers: int | None, ray: str | None, retry: bool
 ) -> tuple[int, dict[str, Any]]:
     """Trains what is missing in a folder, compares the runs, and returns the exit status and the result."""
-    with Interrupt() as stop:
-        launcher = make_launcher(folder, workers, ray)
-        echo(f"sweep         {folder.path}, {len(folder.jobs)} runs, {launcher.capacity} at once")
-        with shown(folder) as (watch, say):
-            coordinator = Coordinator(folder, launcher, stop, code, retry, say)
-            coordinator.run(watch)
+    launcher = make_launcher(folder, workers, ray)
+    echo(f"sweep         {folder.path}, {len(folder.jobs)} runs, {launcher.capacity} at once")
+    status, outcomes, comparison = train(folder, launcher, typed, retry)
+    result = SweepResult(folder.path, tuple(outcomes))
+    return status, {"folder": folder.path, **result.counts(), "runs": result.table(), "comparison": comparison}
+
+
+def train(
+    folder: SweepFolder, launcher: Launcher, typed: RunConfig, retry: bool = False, replaces: tuple[str, str] = ("", "")
+) -> tuple[int, list[Outcome], list[dict[str, Any]] | None]:
+    """Trains what is missing in a folder and compares the runs.
+
+    Args:
+        folder: of the runs.
+        launcher: what starts them.
+        typed: what the command line named for import.
+        retry: whether failed runs are tried again.
+        replaces: part of the names of runs, and what stands in its place in lines about them.
+
+    Returns the exit status, the outcomes, and the rows of the comparison, None if there is none.
+    """
+    with Interrupt() as stop, shown() as (watch, say):
+        coordinator = Coordinator(folder, launcher, stop, typed, retry, lambda text: say(text.replace(*replaces, 1)))
+        coordinator.run(watch)
     for line in closing_lines(coordinator):
         echo(line)
     comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
-    result = SweepResult(folder.path, tuple(coordinator.outcomes()))
-    content = {
-        "folder": folder.path,
-        **result.counts(),
-        "runs": result.table(),
-        "comparison": None if comparison is None else comparison.table(),
-    }
+    outcomes = coordinator.outcomes()
+    status = 2 if any(one.state == "failed" for one in outcomes) else 0
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(folder.path)}{again(folder.jobs, code)} continues")
-        return 128 + stop.signal, content
-    return (2 if result.failed else 0), content
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)} continues"
+        )
+        status = 128 + stop.signal
+    return status, outcomes, None if comparison is None else comparison.table()
 
 
 def summarize(folder: Path, by: By | None = None) -> Comparison | None:
@@ -80,7 +96,7 @@ def summarize(folder: Path, by: By | None = None) -> Comparison | None:
         echo(f"no comparison: {error}")
         return None
     for group in comparison.groups:
-        echo(f"{group.label} on {group.env_id}: {interval_text(group)}")
+        echo(f"{group.label} on {group.env_id}: {group.interval}")
     echo(comparison.definition)
     for note in comparison.notes:
         echo(f"note: {note}")

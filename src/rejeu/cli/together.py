@@ -11,18 +11,19 @@ from rejeu import devices
 from rejeu.agents import training
 from rejeu.agents.device import reason_against, require_memory
 from rejeu.agents.together import learn_together, sibling, start_device
-from rejeu.cli import run_folder, seeds, sweep
+from rejeu.cli import seeds, sweep
 from rejeu.cli.commands import Train
 from rejeu.cli.importing import find_id
 from rejeu.cli.output import Stopwatch, echo, header
-from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Session, make_evaluation_env
 from rejeu.envs.functional.registry import is_functional
+from rejeu.experiments.folder import Sweep, SweepFolder, open_folder
+from rejeu.experiments.jobs import again
+from rejeu.experiments.process import threads_of
 from rejeu.interrupt import NAMES, Interrupt
-from rejeu.reporting.text import quoted
-from rejeu.sweeps.folder import Sweep, SweepFolder, open_folder
-from rejeu.sweeps.jobs import Code, again
-from rejeu.sweeps.processes import threads_of
+from rejeu.runs import config as configs
+from rejeu.runs.folder import RunFolder
+from rejeu.runs.values import quoted
 
 Begin = Callable[[Train, int, ExitStack], Session]
 """Makes the session of a seed; see :func:`rejeu.cli.train.begin`."""
@@ -33,7 +34,7 @@ def is_possible(arguments: Train) -> bool:
 
     Imports the environment if it is one of the user's own.
     """
-    return arguments.jobs is None and not arguments.wrapper and is_functional(find_id(arguments.env))
+    return arguments.jobs is None and not arguments.wrappers and is_functional(find_id(arguments.env))
 
 
 def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
@@ -51,8 +52,7 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
             echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
             return seeds.train_all(arguments)
         require_memory(first.agent, len(jobs))
-        code = Code(env=arguments.env, wrappers=arguments.wrapper, imports=arguments.imports)
-        folder = open_folder(path, Sweep(jobs=jobs, threads=threads_of(1)), None, code)
+        folder = open_folder(path, Sweep(jobs=jobs, threads=threads_of(1)), None, arguments)
         sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
         sessions = [named(session, folder, job) for session, job in zip(sessions, jobs, strict=True)]
         echo(
@@ -71,13 +71,13 @@ def train_all(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
                 folder.write_exit(job, status)
     comparison = sweep.summarize(path)
     runs = [
-        {"seed": job.seed, "path": folder.run(job), "exit_status": status}
+        {"seed": job.run.seed, "path": folder.run(job), "exit_status": status}
         for job, status in zip(jobs, statuses, strict=True)
     ]
     result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
     if stop.signal is not None:
         echo(
-            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, code)} continues, each seed in a "
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, arguments)} continues, each seed in a "
             "process of its own"
         )
         return 128 + stop.signal, result
@@ -96,8 +96,8 @@ def named(session: Session, folder: SweepFolder, job: Any) -> Session:
     """Returns a session with its new run folder."""
     path = folder.run(job)
     path.mkdir(parents=True, exist_ok=True)
-    session = session._replace(folder=RunFolder(path), label=f"seed {job.seed}: ")
-    run_folder.write_config(session.folder, session.config)
+    session = session._replace(folder=RunFolder(path), label=f"seed {job.run.seed}: ")
+    configs.write(session.folder.config, session.config)
     return session
 
 

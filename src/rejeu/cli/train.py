@@ -10,12 +10,13 @@ import numpy as np
 
 from rejeu import devices
 from rejeu.agents import AGENTS, find_agent
-from rejeu.cli import choices, environment, jsonout, run_folder, seeds, together
+from rejeu.cli import check, choices, environment, jsonout, seeds, together
 from rejeu.cli.commands import Train
 from rejeu.cli.output import Stopwatch, echo, header
-from rejeu.cli.run_folder import RunFolder
 from rejeu.cli.session import Limits, Session, make_evaluation_env
 from rejeu.interrupt import Interrupt
+from rejeu.runs import config as configs
+from rejeu.runs.folder import RunFolder, check_free, create
 
 
 def run(arguments: Train) -> int:
@@ -31,13 +32,13 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
     devices.start_with("--device", arguments.device)
-    run_folder.check_free(arguments.out)
+    check_free(arguments.out)
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with ExitStack() as stack:
         session, stop = begin(arguments, seed, stack), stack.enter_context(Interrupt())
-        folder = run_folder.create(arguments.out, session.config.env, session.config.algorithm, seed)
+        folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
         session = session._replace(folder=folder)
-        run_folder.write_config(folder, session.config)
+        configs.write(folder.config, session.config)
         echo(header(session.config, session.environment, session.backend, folder))
         return session.run(stop, stopwatch)
 
@@ -45,7 +46,7 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
 def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
     """Returns the session of a new run, for which there is no folder yet; ``stack`` closes its environments."""
     logs = choices.installed_logs(arguments)
-    algorithm = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
+    algorithm = None if arguments.algorithm is None else find_agent(arguments.algorithm).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
     preset = choices.find_preset(arguments, made, algorithm)
     env = stack.enter_context(closing(choices.make_env(arguments, made, preset, seed)))
@@ -53,6 +54,8 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
     config = choices.make_config(arguments, made, preset, algorithm, env, seed, logs)
     general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
+    if env.backend not in ("envpool", "jax"):
+        check.before_training(made)
     return Session(
         agent,
         config,

@@ -11,24 +11,25 @@ from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from rejeu import presets, tuning
+from rejeu import presets
 from rejeu.agents import AGENTS, agent_of_file, find_agent, modules_of
 from rejeu.algorithms.search import Dimension
-from rejeu.cli import environment, jsonout, settings
+from rejeu.cli import environment, jsonout
 from rejeu.cli.commands import Pbt, Resume, Tune
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
+from rejeu.experiments import space, study as studies, study_plan as plans, tune as tuning
+from rejeu.experiments.search import Watch
+from rejeu.experiments.study import Outcome, Study, StudyFolder
+from rejeu.experiments.study_plan import Plan
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.presets import Preset
 from rejeu.reporting import notebook
+from rejeu.reporting.formatting import counted, number
 from rejeu.reporting.report.sections import duration
-from rejeu.reporting.tabular import number
-from rejeu.reporting.text import counted, quoted
-from rejeu.tuning import plan as plans, space, study as studies
-from rejeu.tuning.plan import Plan
-from rejeu.tuning.search import Watch
-from rejeu.tuning.study import Outcome, Study, StudyFolder
-from rejeu.tuning.training import env_options
+from rejeu.runs import values
+from rejeu.runs.config import RunConfig
+from rejeu.runs.values import quoted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -90,7 +91,7 @@ def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
         "env_kwargs": made.kwargs,
         "wrappers": made.wrapper_names,
         "preset": preset,
-        "fixed": settings.apply(chain.from_iterable(arguments.assignments), {}),
+        "fixed": values.apply(chain.from_iterable(arguments.assignments), {}),
         "search": read_search(chain.from_iterable(arguments.search), algorithm_of(arguments, made, preset)),
         "only": tuple(chain.from_iterable(arguments.only)),
         "n_envs": arguments.envs,
@@ -122,9 +123,8 @@ def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, 
 def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
-    options = env_options(made.kwargs, made.wrapper_names, modules_of(study.plan.algorithm, made.modules))
     with Interrupt() as stop, display(study) as watch:
-        result = tuning.run(study, made.typed, options, workers, stop, watch, echo)
+        result = tuning.run(study, common(made, study.plan.algorithm), workers, stop, watch, echo)
     echo()
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.options()} continues")
@@ -132,6 +132,12 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()
     return (0 if result.complete and result.best is not None else 2), result.to_dict()
+
+
+def common(made: Environment, algorithm: str) -> RunConfig:
+    """Returns what all trainings have in common: the environment and what they import, which the command line named."""
+    imports = tuple(modules_of(algorithm, made.modules))
+    return RunConfig(env=made.typed, env_kwargs=dict(made.kwargs), wrappers=made.wrapper_names, imports=imports)
 
 
 @contextmanager
@@ -204,5 +210,6 @@ def header(study: Study, made: Environment) -> list[str]:
         + f"; {done} have ended"
         * bool(done),
         *(f"{'search' if i == 0 else '':<14}{name}: {one}" for i, (name, one) in enumerate(plan.search_space.items())),
+        *([f"at the end    the best trial and the default: {tuning.announcement(plan)}"] if plan.final_seeds else []),
         f"study folder  {study.folder.path}",
     ]

@@ -1,4 +1,4 @@
-"""Courses as text notebooks: exercises and solutions, in English and French, from one source each.
+"""Courses as notebooks: exercises and solutions, in English and French, from one source each.
 
 :mod:`rejeu.courses.notebooks` describes how to write one, :mod:`rejeu.courses.checks` how answers are checked.
 """

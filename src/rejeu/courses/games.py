@@ -7,6 +7,7 @@ import sys
 import tempfile
 from typing import Any
 
+from rejeu.courses.checks.base import SESSION
 from rejeu.errors import MissingExtra
 
 
@@ -26,7 +27,7 @@ def by_hand(env: str, episodes: int, seed: int | None = None, against: Any = Non
     try:
         game = play(env, episodes=episodes, seed=seed, against=against)
     except (MissingExtra, OSError) as error:
-        print(error)
+        print(SESSION.say("no_game" if isinstance(error, MissingExtra) else "no_window", what=error))
         return []
     for opponent in game.players[1:]:
         print(opponent.name, opponent.scores)

@@ -7,6 +7,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -19,8 +20,8 @@ from rejeu.envs import batching, validation
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain
 
-MOST_STEPS = 10_000
-"""Random steps after which episodes are assumed never to end."""
+MOST_STEPS = 2_000
+"""Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""
 ENOUGH_STEPS, ENOUGH_EPISODES = 100, 2
 """Random steps and complete episodes that are checked, if they do not take too long."""
 MOST_SECONDS = 5.0
@@ -28,6 +29,24 @@ MOST_SECONDS = 5.0
 MOST_GOALS = 32
 """Steps whose goals are checked."""
 SEED = 0
+
+
+SCALED = "; rejeu scales actions itself, so nothing needs to be changed for it"
+"""What is added to Gymnasium's advice on the range of actions."""
+
+
+class Effort(NamedTuple):
+    """How long an environment is checked."""
+
+    most_steps: int = MOST_STEPS
+    enough_steps: int = ENOUGH_STEPS
+    seconds: float = MOST_SECONDS
+    is_patient: bool = True
+    """Whether ``most_steps`` are taken, and not only those of ``seconds``, where no episode ends and none has to."""
+
+
+QUICK = Effort(500, 20, 1.0, is_patient=False)
+"""The check before training."""
 
 
 class Finding(NamedTuple):
@@ -88,26 +107,37 @@ def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
     >>> findings(gym.make("Acrobot-v1"))
     []
     """
-    if not isinstance(env, gym.Env):
-        raise TypeError(f"env must be a gymnasium.Env, got {type(env).__name__}; derive its class from gymnasium.Env")
-    try:
-        leaves(env.observation_space)
-        check_action_space(env.action_space)
-    except TypeError as error:
-        return [Finding("error", str(error))]
-    found: dict[str, Finding] = {}
-    seen = _play(env, found)
-    if seen is not None:
+    found, has_steps = _played(env, Effort(seconds=MOST_SECONDS))
+    if has_steps:
         _check_repeats(env, found)
-        if isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
-            for finding in goal_findings(env, seen):
-                found[finding.text] = finding
     if all(finding.level == "warning" for finding in found.values()):
         for text in _gymnasium_messages(env, skip_render_check):
             found[text] = Finding("warning", text)
     for text in advice_on_observations(env.observation_space):
         found[text] = Finding("warning", text)
     return [*found.values()]
+
+
+def quick_findings(env: gym.Env) -> list[Finding]:
+    """Returns the errors that :func:`findings` returns, and whether episodes never end, from few steps."""
+    found, _ = _played(env, QUICK)
+    return [finding for key, finding in found.items() if finding.level == "error" or key == "endless"]
+
+
+def _played(env: gym.Env, effort: Effort) -> tuple[dict[str, Finding], bool]:
+    """Returns what random steps show, by kind, and whether the environment could be stepped."""
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"env must be a gymnasium.Env, got {type(env).__name__}; derive its class from gymnasium.Env")
+    try:
+        leaves(env.observation_space)
+        check_action_space(env.action_space)
+    except TypeError as error:
+        return {"space": Finding("error", str(error))}, False
+    found: dict[str, Finding] = {}
+    seen = _play(env, found, effort)
+    if seen and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
+        found |= {finding.text: finding for finding in goal_findings(env, seen)}
+    return found, seen is not None and not {"reset", "seed"} & found.keys()
 
 
 def check_action_space(space: gym.Space) -> None:
@@ -118,28 +148,31 @@ def check_action_space(space: gym.Space) -> None:
         )
 
 
-def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
+def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen] | None:
     """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
-    obs = _reset(env, found, SEED)
+    if (fault := validation.seed_fault(env)) is not None:
+        found["seed"] = Finding("error", fault)
+        env = env.unwrapped  # wrappers pass a seed on
+    obs = _reset(env, found, None if fault else SEED)
     if obs is None:
+        with suppress(Exception):  # whatever step raises after a wrong reset
+            _check_step(env.step(env.action_space.sample()), space, found)
         return None
     seen: list[Seen] = []
     limit, length = known_limit(env), 0
     lengths: list[int] = []
     at_limit: list[bool] = []
     kept = _copied(space, obs)
-    until = time.monotonic() + MOST_SECONDS
-    while len(seen) < MOST_STEPS and not (len(seen) >= ENOUGH_STEPS and len(lengths) >= ENOUGH_EPISODES):
-        if len(seen) >= ENOUGH_STEPS and time.monotonic() > until:
+    until = time.monotonic() + effort.seconds
+    while len(seen) < effort.most_steps and not (len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES):
+        is_endless = effort.is_patient and not lengths and limit is None
+        if len(seen) >= effort.enough_steps and time.monotonic() > until and not is_endless:
             break
         answer = env.step(env.action_space.sample())
-        fault = validation.step_fault(answer, space)
-        if fault is not None:
-            found.setdefault("step", Finding("error", fault))
+        if not _check_step(answer, space, found):
             return None
-        _check_step(answer, space, found)
         if _rewritten(space, obs, kept, answer[0]):
             text = (
                 "step returns the same array each time and writes the next observation into it; rejeu copies "
@@ -166,10 +199,10 @@ def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
             "learned to have no value"
         )
         found["limit"] = Finding("warning", text)
-    if len(seen) >= MOST_STEPS and not lengths and limit is None:
+    if len(seen) >= effort.most_steps and not lengths and limit is None:
         text = (
-            f"no episode ended in {MOST_STEPS:,} steps; give it a time limit: gymnasium.register(..., "
-            "max_episode_steps=1000), or gymnasium.wrappers.TimeLimit(env, 1000)"
+            f"no episode ended in {effort.most_steps:,} steps; it declares no time limit, so give it one: "
+            "gymnasium.register(..., max_episode_steps=1000), or gymnasium.wrappers.TimeLimit(env, 1000)"
         )
         found["endless"] = Finding("warning", text)
     return seen
@@ -177,32 +210,44 @@ def _play(env: gym.Env, found: dict[str, Finding]) -> list[Seen] | None:
 
 def _reset(env: gym.Env, found: dict[str, Finding], seed: int | None = None) -> Any:
     """Resets the environment and checks its observation, which is returned; None if it is unusable."""
-    try:
-        obs = batching.reset_env(env, seed)[0]
-    except BadEnvironmentError as error:
-        found.setdefault("reset", Finding("error", str(error)))
+    space = env.observation_space
+    answer = env.reset() if seed is None else env.reset(seed=seed)
+    if (fault := validation.reset_fault(answer, space)) is not None:
+        found.setdefault("reset", Finding("error", fault))
+    has_info = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict)
+    obs = answer[0] if has_info else answer
+    if validation.observation_fault(space, obs) is not None:
         return None
-    _check_observation(obs, env.observation_space, found, "reset")
+    _check_observation(obs, space, found, "reset")
     return obs
 
 
-def _check_step(answer: tuple[Any, ...], space: gym.Space, found: dict[str, Finding]) -> None:
-    """Checks the values of a step."""
+def _check_step(answer: Any, space: gym.Space, found: dict[str, Finding]) -> bool:
+    """Checks the values of a step, and returns whether training could go on after it."""
+    fault = validation.step_fault(answer, space)
+    if not isinstance(answer, tuple) or len(answer) != 5:
+        found.setdefault("step", Finding("error", str(fault)))
+        return False
     obs, reward, terminated, truncated, info = answer
-    _check_observation(obs, space, found, "step")
-    for kind, fault in (
+    if (wrong := validation.observation_fault(space, obs)) is None:
+        _check_observation(obs, space, found, "step")
+    else:
+        found.setdefault("step", Finding("error", f"step returned {wrong}"))
+    for kind, wrong in (
         ("reward", validation.reward_fault(reward, strict=True)),
         ("terminated", validation.flag_fault("terminated", terminated, strict=True)),
         ("truncated", validation.flag_fault("truncated", truncated, strict=True)),
+        ("info", validation.info_fault(info)),
     ):
-        if fault is not None:
-            found.setdefault(kind, Finding("error", f"step returned {fault}"))
-    if info.get("TimeLimit.truncated") and not truncated:
+        if wrong is not None:
+            found.setdefault(kind, Finding("error", f"step returned {wrong}"))
+    if isinstance(info, dict) and info.get("TimeLimit.truncated") and not truncated:
         text = (
             f"step returned info['TimeLimit.truncated']={info['TimeLimit.truncated']!r} with terminated={terminated} and "
             "truncated=False; return truncated=True where a time limit ended the episode"
         )
         found.setdefault("folded", Finding("error", text))
+    return fault is None
 
 
 def _check_observation(obs: Any, space: gym.Space, found: dict[str, Finding], said: str) -> None:
@@ -286,7 +331,7 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
             refused = [f"{error}"]
     said = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(one.message)) for one in caught] + refused
     return [
-        f"gymnasium.utils.env_checker: {' '.join(one.split())}"
+        f"gymnasium.utils.env_checker: {' '.join(one.split())}{SCALED if 'symmetric and normalized' in one else ''}"
         for one in dict.fromkeys(said)
         if "different from the unwrapped version" not in one
     ]

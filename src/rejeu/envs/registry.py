@@ -25,6 +25,8 @@ MAKES_OWN = frozenset(("id", "env_id", "render_mode", "disable_env_checker", "ve
 """Arguments of ``gymnasium.make`` itself."""
 ENVPOOL_SIZE = "about 770 MB with its assets"
 """Disk space of EnvPool 1.2.5, including the asset packages that it depends on."""
+MIRRORED = frozenset(("gymnasium", "ale_py", "highway_env", "gymnasium_robotics", "minigrid", "vizdoom"))
+"""Packages whose environments EnvPool has."""
 MOST_KWARGS = 100
 """Maximum number of keyword arguments of an environment from a file."""
 
@@ -206,7 +208,15 @@ def is_envpool_installed() -> bool:
 
 
 def in_envpool(env_id: str) -> bool:
-    """Returns whether EnvPool is installed and has an environment of this id."""
+    """Returns whether EnvPool is installed and has an environment of this id.
+
+    An id of the user's own code is not looked up, which would take a second.
+    """
+    spec = gym.registry.get(env_id)
+    source = None if spec is None else spec.entry_point
+    package = (source if isinstance(source, str) else getattr(source, "__module__", "")).partition(".")[0]
+    if source is not None and package not in MIRRORED:
+        return False
     try:
         return env_id in import_envpool().list_all_envs()
     except MissingExtra:

@@ -11,6 +11,8 @@ Seed = int | Sequence[int] | None
 """A number ``seed``, so that environment i is seeded with ``seed + i``; one number for each environment; or None."""
 END = 2**31 - 1
 """Exclusive upper bound of the seeds of single environments, because EnvPool uses 31 bits."""
+ENVIRONMENTS = 0x454E
+"""Added to the seed of a run, so that the seeds of its environments differ from all others."""
 
 
 def checked(seed: Any, n_envs: int) -> Seed:
@@ -29,6 +31,15 @@ def checked(seed: Any, n_envs: int) -> Seed:
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or seeds.max() >= END:
         raise ValueError(f"seed={seed!r} must have whole numbers from 0 to 2**31 - 2")
     return tuple(seeds.tolist())
+
+
+def of_run(seed: int) -> int:
+    """Returns the seed of a run's environments, from 0 to 2**31 - 1, for the seed of the run.
+
+    Environment i takes the i-th number after it. Without this, runs with the seeds 0 and 1 would share all their
+    environments but one.
+    """
+    return int(np.random.SeedSequence([seed, ENVIRONMENTS]).generate_state(1)[0] >> 1)
 
 
 def for_each(seed: Seed, n_envs: int) -> list[int | None]:

@@ -149,8 +149,7 @@ def step_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | 
         or flag_fault("terminated", terminated, strict)
         or flag_fault("truncated", truncated, strict)
     )
-    if fault is None and not isinstance(info, dict):
-        fault = f"the info {describe_value(info)}, expected a dict; return {{}} if there is nothing to say"
+    fault = fault or info_fault(info)
     return None if fault is None else f"step returned {fault}"
 
 
@@ -174,6 +173,13 @@ def reward_fault(reward: Any, strict: bool = False) -> str | None:
     if strict and not np.isfinite(number):
         return f"the reward {reward}, {fix}, and look for divisions by zero"
     return None
+
+
+def info_fault(info: Any) -> str | None:
+    """Describes what is wrong with an info."""
+    if isinstance(info, dict):
+        return None
+    return f"the info {describe_value(info)}, expected a dict; return {{}} if there is nothing to say"
 
 
 def flag_fault(name: str, flag: Any, strict: bool = False) -> str | None:

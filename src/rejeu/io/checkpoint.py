@@ -24,8 +24,8 @@ from safetensors import SafetensorError
 
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError
+from rejeu.hardware import physical_memory
 from rejeu.io import atomic, tensors
-from rejeu.io.memory import physical_memory
 from rejeu.io.records import Malformed, parse_json, shown
 from rejeu.io.tensors import Spec, TensorFile
 

@@ -20,6 +20,23 @@ VDOT_SIZE = 2**13
 """Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
 
 
+def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None) -> Step:
+    """Steps the environments, or those that are ``active``, and checks what they return.
+
+    Where environments do not wait for each other, the result is that of the first ``wait_for``.
+
+    Raises:
+        BadEnvironmentError, NonFiniteError, NonFiniteUpdate: as :func:`check_step`.
+    """
+    if run.env.wait_for is None:
+        step = run.env.step(action, active)
+    else:
+        run.env.send(action)
+        step = run.env.receive()
+    check_step(run, step)
+    return step
+
+
 def check_step(run: Run, step: Step) -> None:
     """Checks the rewards and observations of a step, and from time to time the bounds of the observations.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,6 @@ from rejeu.exploration.noise import Noise
 from rejeu.loops import nonfinite
 from rejeu.loops.packing import PackedState, Packing, Readings
 from rejeu.prng import nth
-
-
-class Several(NamedTuple):
-    """The functions of a :class:`Learner` for several states at once."""
-
-    act: Any
-    update: Any
-    observe: Any
 
 
 class Learner:
@@ -51,12 +43,8 @@ class Learner:
         self.exploit, self.recall = jax.jit(self._exploit), jax.jit(self._recall)
         self.action_values, self.state_value = jax.jit(self._action_values), jax.jit(self._state_value)
         self.copy = jax.jit(copy)
-
-    def several(self) -> Several:
-        """Returns the functions for several states at once, each argument and result with a leading axis of states."""
-        mapped = lambda function, **options: jax.jit(jax.vmap(function), **options)  # noqa: E731
-        observe = None if self.observe is None else mapped(self._observe, donate_argnums=0)
-        return Several(mapped(partial(self._act, self.explorer)), mapped(self._update, donate_argnums=0), observe)
+        self.programs: dict[Any, Any] = {}
+        """Compiled programs of training on the device, by what they are compiled for."""
 
     def _act(
         self, explorer: Explorer, state: PackedState, carry: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock

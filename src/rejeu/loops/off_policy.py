@@ -12,6 +12,10 @@
 So environments and updates do not wait for each other. The results still depend on the seed only, because the action at
 a step always follows the update of the step before the last. With ``overlap=False`` actions are requested after the
 updates are started, and wait for them.
+
+With ``env.wait_for`` one turn takes the results of so many environments that have them first, ``step.which``, and gives these
+new actions, while the others still step. Arrays of a turn have a row for each environment; only the rows of ``which`` are
+new. The results depend on the seed and on the order of arrival, which ``env.arrivals`` records.
 """
 
 from __future__ import annotations
@@ -24,11 +28,12 @@ import numpy as np
 from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.core import Clock
-from rejeu.loops.checks import check_obs, check_state, check_step, checked_reset
+from rejeu.core import Clock, PyTree
+from rejeu.envs.base import Step
+from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import gradient_steps
-from rejeu.loops.run import Progress, Run, clock_of, record_step, restart
+from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart
 from rejeu.loops.timing import Timer
 from rejeu.spaces import action_scaler, random_action
 
@@ -50,54 +55,41 @@ def off_policy(
         NonFiniteError: if the state is not finite when training begins.
         NonFiniteUpdate: if an update leaves numbers that are not finite.
     """
-    env, n_envs, scale = run.env, run.env.n_envs, action_scaler(run.env.action_space)
+    env, scale = run.env, action_scaler(run.env.action_space)
     first, last = run.step, None if n_steps is None else run.step + n_steps
     check_state(run, learner)
     timer = Timer(run.seconds)
     while last is None or run.step < last:
-        run.monitor.follow(run.state)
         if run.obs is None or env.must_reset:
             begin_episodes(run)
         if run.action is None:
-            run.action = np.asarray(choose(run, learner, config, clock_of(run, progress(run.step - first))))
-        n_kept = n_envs if last is None else min(n_envs, last - run.step)
-        kept = None if n_kept == n_envs else np.arange(n_kept)
-        timer.lap()
-        action = scale(run.action)
-        step = env.step(action)
-        timer.lap("env")
-        check_step(run, step)
-        if learner.observe is not None:
-            run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
-        run.replay.add(run.action, step.reward, step.terminated, step.obs, kept)
-        run.step += n_kept
-        episodes = record_step(run, step, None if kept is None else np.arange(n_envs) < n_kept)
-        timer.lap("replay")
-        run.obs, last_obs = step.obs, None
-        if np.count_nonzero(run.ended):
-            last_obs = jax.tree.map(np.copy, step.obs)
-            run.obs = checked_reset(run, run.ended)
-        timer.lap("env")
-        if last_obs is not None:
-            run.replay.begin(run.obs, np.flatnonzero(run.ended))
-        if learner.observe is not None:
-            observe(run, learner)
-        done = progress(run.step - first)
-        n_updates = due(run, config, n_kept, len(episodes))
-        timer.lap("replay")
-        clock = clock_of(run, done)
-        if config.overlap:
-            chosen = choose(run, learner, config, clock)
-        timer.lap("update")
-        samples = [run.replay.draw(run.rng, shape, done) for shape in batch_shapes(n_updates, config, n_envs)]
-        timer.lap("replay")
-        n_unread = len(run.monitor)
-        update(run, learner, samples, clock)
-        if not config.overlap:
-            chosen, n_unread = choose(run, learner, config, clock), len(run.monitor)
-        run.action = np.asarray(chosen)
-        run.monitor.read(n_unread)  # those are done, since the actions came after them
-        timer.lap("update")
+            run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)), None))
+        with timer("env"):
+            action = scale(run.action)
+            step = checked_step(run, action)
+        with timer("replay"):
+            n_kept, episodes = store(run, learner, config, step, last)
+        with timer("env"):
+            last_obs = begin_where_ended(run, step)
+        with timer("replay"):
+            if last_obs is not None:
+                run.replay.begin(run.obs, np.flatnonzero(run.ended))
+            observe(run, learner, step.which)
+            done = progress(run.step - first)
+            clock = clock_of(run, done)
+            n_updates = due(run, config, n_kept, len(episodes))
+        with timer("update"):
+            chosen = choose(run, learner, config, clock, step.which) if config.overlap else None
+        with timer("replay"):
+            shapes = batch_shapes(n_updates, config, env.wait_for or env.n_envs)
+            samples = [run.replay.draw(run.rng, shape, done) for shape in shapes]
+        with timer("update"):
+            n_unread = len(run.monitor)
+            update(run, learner, samples, clock)
+            if chosen is None:
+                chosen, n_unread = choose(run, learner, config, clock, step.which), len(run.monitor)
+            run.action = merged(run.action, np.asarray(chosen), step.which)
+            run.monitor.read(n_unread)  # those are done, since the actions came after them
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, n_kept, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 
@@ -108,26 +100,85 @@ def begin_episodes(run: Run) -> None:
     run.replay.begin(run.obs)
 
 
-def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock) -> np.ndarray | Array:
+def store(
+    run: Run, learner: Learner, config: OffPolicyConfig, step: Step, last: int | None
+) -> tuple[int, list[Episode]]:
+    """Adds a step to the replay buffer and to the running episodes.
+
+    Returns how many environments' steps were kept, so that there are ``last`` in all, and the episodes that ended.
+    """
+    n_envs = run.env.n_envs
+    which = np.arange(n_envs) if step.which is None else step.which
+    n_kept = len(which) if last is None else min(len(which), last - run.step)
+    kept = None if n_kept == n_envs else which[:n_kept]
+    if learner.observe is not None:
+        before = np.where(run.ended, np.float32(0), run.running_return)
+        run.running_return = merged(before, config.gamma * before + step.reward, step.which)
+    run.replay.add(run.action, step.reward, step.terminated, step.obs, kept)
+    run.step += n_kept
+    return n_kept, record_step(run, step, mask(kept, n_envs), mask(step.which, n_envs))
+
+
+def begin_where_ended(run: Run, step: Step) -> PyTree:
+    """Starts new episodes where the step ended some.
+
+    ``run.obs`` are then the observations to act on next. Returns a copy of the last ones; None if no episode ended.
+    """
+    run.obs = step.obs
+    if not np.count_nonzero(run.ended):
+        return None
+    last_obs = jax.tree.map(np.copy, step.obs)
+    run.obs = checked_reset(run, run.ended)
+    return last_obs
+
+
+def merged(old: np.ndarray, new: np.ndarray, which: np.ndarray | None) -> np.ndarray:
+    """Returns ``old`` with the rows ``which`` of ``new``, which has all rows or only these; ``new`` where that is None."""
+    if which is None:
+        return new
+    old = old.copy()
+    old[which] = new if len(new) == len(which) else new[which]
+    return old
+
+
+def mask(which: np.ndarray | None, n_envs: int) -> np.ndarray | None:
+    """Returns indices as a mask, ``bool (n_envs,)``; None, which stands for all, as it is."""
+    return None if which is None else np.bincount(which, minlength=n_envs) > 0
+
+
+def choose(
+    run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock, which: np.ndarray | None
+) -> np.ndarray | Array:
     """Returns random actions at first, then those of the exploring policy, which the device may still be computing.
 
-    ``run.obs`` must not change before they are read.
+    ``run.obs`` must not change before they are read. ``which`` are the environments; None stands for all. Noise and other
+    state of exploration advance in these only. What they share, arrays without an axis of environments, advances with every
+    call.
     """
     if run.step < config.learning_starts:
-        return random_action(run.env.action_space, run.env.n_envs, run.rng)
-    action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+        return random_action(run.env.action_space, run.env.n_envs if which is None else len(which), run.rng)
+    if which is None:
+        action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+        return action
+    carry = jax.tree.map(lambda leaf: leaf[which] if leaf.ndim else leaf, run.carry)
+    action, carry = learner.act(run.state, carry, rows(run.obs, which), run.ended[which], run.key, clock)
+    run.carry = jax.tree.map(lambda old, new: old.at[which].set(new) if old.ndim else new, run.carry, carry)
     return action
 
 
-def observe(run: Run, learner: Learner) -> None:
-    """Adds the observations to the statistics of the state.
+def rows(obs: PyTree, which: np.ndarray | None) -> PyTree:
+    """Returns a copy of the observations of the environments ``which``; None stands for all."""
+    return jax.tree.map(np.copy if which is None else (lambda leaf: leaf[which]), obs)
+
+
+def observe(run: Run, learner: Learner, which: np.ndarray | None) -> None:
+    """Adds the new observations to the statistics of the state, if it has some.
 
     They are copied: the device may read an array after the environments have written the next step to it.
     """
-    assert learner.observe is not None
-    seen = jax.tree.map(np.copy, run.obs)
-    run.state = learner.observe(run.state, seen, run.running_return)
-    run.monitor.record(run.state, learner.observe, seen, run.running_return)
+    if learner.observe is not None:
+        returns = run.running_return if which is None else run.running_return[which]
+        run.state = run.monitor.follow(learner.observe, run.state, rows(run.obs, which), returns)
 
 
 def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Clock) -> None:
@@ -135,8 +186,7 @@ def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Cl
     run.replay.update_priorities(run.td_errors)
     run.td_errors = []
     for batch, drawn in samples:
-        run.state, run.metrics, td_error = learner.update(run.state, batch, clock)
-        run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics, n_updates=run.n_updates)
+        run.state, run.metrics, td_error = run.monitor.update(learner.update, run.state, batch, clock, run.n_updates)
         run.n_updates += gradient_steps(batch.reward)
         if td_error is not None:
             run.td_errors.append((drawn, td_error))

@@ -17,11 +17,11 @@ import jax
 import numpy as np
 
 from rejeu.algorithms.rollout_config import RolloutConfig
-from rejeu.core import GRADIENT_STEPS, PyTree
+from rejeu.core import GRADIENT_STEPS, Clock, PyTree
 from rejeu.envs.base import Step
-from rejeu.loops.checks import check_obs, check_state, check_step, checked_reset
+from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
-from rejeu.loops.run import Progress, Run, clock_of, record_step, restart
+from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart
 from rejeu.loops.timing import Timer
 from rejeu.spaces import action_scaler
 
@@ -53,45 +53,52 @@ def on_policy(
     while last is None or run.step < last:
         if run.obs is None or (env.must_reset and not rollout.length):
             begin_episodes(run, config)
-        timer.lap()
-        clock = clock_of(run, progress(run.step - first))
-        chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
-        run.action = np.asarray(chosen)
-        run.monitor.read()  # before the rollout of the last update is overwritten
-        rollout.observe(run.obs)
-        timer.lap("update")
-        stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
-        action = scale(run.action)
-        step = env.step(action, stepped)
-        timer.lap("env")
-        check_step(run, step)
-        counts = which_count(run, stepped, last)
-        run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
-        valid = True if counts is None else counts
-        rollout.add(run.action, step.reward, step.terminated, step.truncated, step.obs, run.running_return, valid)
-        run.step += n_envs if counts is None else int(counts.sum())
-        episodes = record_step(run, step, counts, stepped)
-        rollout.cut(run.ended)
-        if config.n_episodes is not None:
-            run.playing -= run.ended
-        is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
-        is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
-        timer.lap("replay")
-        last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
-        run.obs = next_obs(run, step, config, is_done)
-        timer.lap("env")
-        if is_done:
-            clock, batch = clock_of(run, progress(run.step - first)), rollout.rollout()
-            run.monitor.follow(run.state)
-            run.state, run.metrics, _ = learner.update(run.state, batch, clock)
-            run.monitor.record(run.state, learner.update, batch, clock, readings=run.metrics, n_updates=run.n_updates)
-            n_updates: float = config.gradient_steps(rollout.size())
-            if config.stops_early:  # NaN of an update that was undone
-                n_updates = float(np.nan_to_num(run.metrics[GRADIENT_STEPS], nan=n_updates))
-            run.n_updates += int(n_updates)
-            begin(run, config)
-        timer.lap("update")
+        with timer("update"):
+            clock = clock_of(run, progress(run.step - first))
+            chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+            run.action = np.asarray(chosen)
+            run.monitor.read()  # before the rollout of the last update is overwritten
+            rollout.observe(run.obs)
+        with timer("env"):
+            stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
+            action = scale(run.action)
+            step = checked_step(run, action, stepped)
+        with timer("replay"):
+            episodes = store(run, config, step, stepped, last)
+            is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
+            is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
+        with timer("env"):
+            last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
+            run.obs = next_obs(run, step, config, is_done)
+        with timer("update"):
+            if is_done:
+                update(run, learner, config, clock_of(run, progress(run.step - first)))
+                begin(run, config)
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
+
+
+def store(run: Run, config: RolloutConfig, step: Step, stepped: np.ndarray | None, last: int | None) -> list[Episode]:
+    """Adds a step to the rollout and to the running episodes, and returns the episodes that ended."""
+    counts = which_count(run, stepped, last)
+    run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
+    valid = True if counts is None else counts
+    run.replay.add(run.action, step.reward, step.terminated, step.truncated, step.obs, run.running_return, valid)
+    run.step += run.env.n_envs if counts is None else int(counts.sum())
+    episodes = record_step(run, step, counts, stepped)
+    run.replay.cut(run.ended)
+    if config.n_episodes is not None:
+        run.playing -= run.ended
+    return episodes
+
+
+def update(run: Run, learner: Learner, config: RolloutConfig, clock: Clock) -> None:
+    """Starts the update on the rollout, and counts its gradient steps."""
+    n_updates: float = config.gradient_steps(run.replay.size())
+    rollout = run.replay.rollout()
+    run.state, run.metrics, _ = run.monitor.update(learner.update, run.state, rollout, clock, run.n_updates)
+    if config.stops_early:  # NaN of an update that was undone
+        n_updates = float(np.nan_to_num(run.metrics[GRADIENT_STEPS], nan=n_updates))
+    run.n_updates += int(n_updates)
 
 
 def begin_episodes(run: Run, config: RolloutConfig) -> None:

@@ -16,6 +16,7 @@ from jax import Array
 
 from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree
+from rejeu.envs import seeds
 from rejeu.envs.base import Step, VectorEnv
 from rejeu.loops.learner import Learner, is_finite
 from rejeu.loops.nonfinite import NonFiniteMonitor
@@ -178,5 +179,5 @@ def initial_run(
         carry=learner.initial_carry(1 if env is None else env.n_envs),
         monitor=NonFiniteMonitor(learner.copy, is_finite, learner.skips),
         learn_from=learn_from,
-        seed=seed,
+        seed=seeds.of_run(seed),
     )

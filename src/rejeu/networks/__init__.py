@@ -23,7 +23,7 @@ from rejeu.networks.encoder import (
 )
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
 from rejeu.networks.network import Network, QNetwork, action_values, values_by_critics
-from rejeu.networks.own import OwnModule, own_module
+from rejeu.networks.own import ENCODERS, OwnModule, own_module, register_encoder
 from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled, split_net_arch
 from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_head, make_torso
 
@@ -31,6 +31,7 @@ __all__ = [
     "ACTIVATIONS",
     "BRANCHES",
     "CNN",
+    "ENCODERS",
     "MLP",
     "NATURE",
     "SMALL",
@@ -62,6 +63,7 @@ __all__ = [
     "own_module",
     "product",
     "reads_image",
+    "register_encoder",
     "settled",
     "split_net_arch",
     "values_by_critics",

@@ -13,7 +13,7 @@ from jax import Array
 
 from rejeu.core import PyTree
 from rejeu.networks.layers import LayerNorm, Linear
-from rejeu.networks.own import own_module
+from rejeu.networks.own import find_encoder, own_module
 from rejeu.networks.shape import PolicyConfig
 from rejeu.spaces import Leaf
 
@@ -194,7 +194,7 @@ class OwnEncoder(eqx.Module):
 def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:
     """Returns the encoder of these leaves: rejeu's own, or the module of the user's."""
     if shape.encoder is not None:
-        return OwnEncoder(key, leaves, shape.encoder)
+        return OwnEncoder(key, leaves, find_encoder(shape.encoder))
     return Encoder(leaves, key, shape.cnn_layer_norm)
 
 

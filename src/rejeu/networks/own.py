@@ -1,8 +1,9 @@
-"""Modules of the user's own as encoder, torso or head."""
+"""Modules of the user's own as encoder, torso or head, and encoders by name."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,6 +11,45 @@ import jax.numpy as jnp
 from jax import Array, ShapeDtypeStruct
 
 from rejeu.core import PyTree
+
+M = TypeVar("M", bound=Callable[..., Any])
+ENCODERS: dict[str, Callable[..., Any]] = {}
+"""Encoders by name; :func:`register_encoder` adds to it."""
+
+
+def register_encoder(name: str) -> Callable[[M], M]:
+    """Returns a decorator that makes an encoder known by a name, which ``policy_kwargs`` and model files can contain.
+
+    A later registration of the same name replaces the earlier one.
+
+    >>> @register_encoder("numbers")
+    ... def numbers(key, leaves):
+    ...     return eqx.nn.Linear(leaves[0].n_features, 8, key=key)
+    >>> import rejeu
+    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"encoder": "numbers"})
+    """
+
+    def register(make: M) -> M:
+        ENCODERS[name] = make
+        return make
+
+    return register
+
+
+def find_encoder(encoder: Any) -> Any:
+    """Returns the encoder of a name; anything but a name is returned unchanged.
+
+    Raises:
+        ValueError: if the name is not registered.
+    """
+    if not isinstance(encoder, str):
+        return encoder
+    if encoder not in ENCODERS:
+        raise ValueError(
+            f"encoder={encoder!r} is not registered; import the module that registers it (--import MODULE); there are "
+            f"{', '.join(ENCODERS) or 'none'}"
+        )
+    return ENCODERS[encoder]
 
 
 class OwnModule(eqx.Module):

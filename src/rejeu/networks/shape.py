@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 from jax import Array
 
 from rejeu.networks.layers import ACTIVATIONS
+from rejeu.networks.own import find_encoder
 from rejeu.spaces import Leaf
 from rejeu.validation import assign, choice, coerce, flag, whole
 
@@ -60,9 +61,10 @@ class PolicyConfig:
     """Widths between the common layers and the critics' values."""
     actor_layers: tuple[int, ...] = ()
     """Widths between the common layers and the actor's outputs."""
-    encoder: Callable[[Array, tuple[Leaf, ...]], Any] | None = None
+    encoder: Callable[[Array, tuple[Leaf, ...]], Any] | str | None = None
     """Encoder of your own in every network, such as another CNN: ``encoder(key, leaves)`` returns an ``equinox.Module``
-    that maps an observation to a vector; see ``docs/networks.md``. A model file keeps its name only."""
+    that maps an observation to a vector; or its name, see ``rejeu.networks.register_encoder``. A model file keeps its name
+    only: give it again to ``load``, unless it is registered."""
     torso: Callable[[Array, int], Any] | None = None
     """Hidden layers of your own in every network: ``torso(key, n_inputs)`` returns an ``equinox.Module`` that maps
     ``(n_inputs,)`` to ``(n_outputs,)``, or batches of these. A model file keeps its name only: give it again to
@@ -84,8 +86,8 @@ class PolicyConfig:
 
     def _check_shape(self) -> None:
         """Raises where settings contradict each other: there is one way to shape a network at a time."""
-        for key in ("encoder", "torso", "head"):
-            if (module := getattr(self, key)) is not None and not callable(module):
+        for key, module in (("encoder", find_encoder(self.encoder)), ("torso", self.torso), ("head", self.head)):
+            if module is not None and not callable(module):
                 raise TypeError(f"{key}={module!r} must be a class or function that returns an equinox.Module")
         arch = [key for key in ("net_arch", "pi", "qf") if getattr(self, key) is not None]
         branches = [key for key in BRANCHES if getattr(self, key)]

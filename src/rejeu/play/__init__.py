@@ -18,6 +18,7 @@ import numpy as np
 from rejeu.agents import Agent
 from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env
+from rejeu.envs.rendering import make_rendering_env, natural_fps
 from rejeu.envs.validation import id_of
 from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Pace, Player
@@ -25,7 +26,6 @@ from rejeu.play.keys import KeyMap
 from rejeu.play.known import full_name, keys_for
 from rejeu.play.recording import Recording
 from rejeu.play.window import Window
-from rejeu.reporting.video import DEFAULT_FPS, make_rendering_env
 from rejeu.validation import number, whole
 
 __all__ = ["Game", "Player", "play", "watch"]
@@ -140,11 +140,6 @@ def rendering(env: str | Callable[..., gym.Env]) -> gym.Env:
         return make_rendering_env(env, "the environment")
     env_id = full_name(env)
     return make_rendering_env(partial(make_env, env_id), env_id)
-
-
-def natural_fps(env: gym.Env) -> float:
-    """Returns the environment's ``render_fps``, or 30."""
-    return float(env.metadata.get("render_fps") or DEFAULT_FPS)
 
 
 def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:

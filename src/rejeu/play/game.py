@@ -12,9 +12,9 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.envs.base import success_of
+from rejeu.envs.rendering import rgb_frame
 from rejeu.play.keys import CONTROLS
 from rejeu.play.recording import Recording
-from rejeu.reporting.video import rgb_frame
 
 Act = Callable[[Any, frozenset[str], int], Any]
 """Maps the observation, the held keys and the step of the episode (from 0) to an action, or None to wait."""

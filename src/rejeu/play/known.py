@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Mapping
+from importlib import resources
 from typing import Any
 
 import gymnasium as gym
@@ -15,53 +17,12 @@ SHORT_NAMES = {"car": "CarRacing-v3", "mountain": "MountainCar-v0", "lunar": "Lu
 """Short names of ids, not case-sensitive."""
 
 KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
-    "CartPole-v1": {
-        "a": (0, "left"),
-        "d": (1, "right"),
-        # There is no action that does nothing. Alternating pushes cancel within 0.04 seconds.
-        "none": ([0, 1], ""),
-    },
-    "MountainCar-v0": {"a": (0, "left"), "d": (2, "right"), "none": (1, "")},
-    "MountainCarContinuous-v0": {"a": ([-1.0], "left"), "d": ([1.0], "right")},
-    # Positive torques turn counterclockwise.
-    "Pendulum-v1": {"a": ([2.0], "counterclockwise"), "d": ([-2.0], "clockwise")},
-    # Gymnasium names the side engines by their position, the keys by the direction of the push.
-    "LunarLander-v3": {"a": (1, "left"), "d": (3, "right"), "w": (2, "main engine"), "none": (0, "")},
-    "LunarLanderContinuous-v3": {
-        "a": ([0.0, -1.0], "left"),
-        "d": ([0.0, 1.0], "right"),
-        "w": ([1.0, 0.0], "main engine"),
-    },
-    # Full brakes lock the wheels.
-    "CarRacing-v3": {
-        "a": ([-1.0, 0.0, 0.0], "left"),
-        "d": ([1.0, 0.0, 0.0], "right"),
-        "w": ([0.0, 1.0, 0.0], "gas"),
-        "s": ([0.0, 0.0, 0.8], "brake"),
-    },
-    # Acceleration and steering. y points down on the screen, so a positive angle is to the right.
-    "parking-v0": {
-        "a": ([0.0, -1.0], "left"),
-        "d": ([0.0, 1.0], "right"),
-        "w": ([1.0, 0.0], "forward"),
-        "s": ([-1.0, 0.0], "backward"),
-    },
-    "rejeu/Ball-v0": {
-        "a": ([-2.0, 0.0], "left"),
-        "d": ([2.0, 0.0], "right"),
-        "w": ([0.0, 2.0], "up"),
-        "s": ([0.0, -2.0], "down"),
-    },
+    env_id: {key: tuple(entry) for key, entry in entries.items()}
+    for env_id, entries in tomllib.loads((resources.files("rejeu.play") / "keys.toml").read_text("utf-8")).items()
 }
 """Actions and descriptions of the keys, by id."""
 KNOWN |= {f"jax/{env_id}": KNOWN[env_id] for env_id in [*KNOWN] if env_id.startswith(("Cart", "Mountain", "Pendulum"))}
 KNOWN |= {"jax/Parking-v0": KNOWN["parking-v0"], "jax/Ball-v0": KNOWN["rejeu/Ball-v0"]}
-KNOWN["jax/PointMaze-v0"] = {
-    "a": ([-1.0, 0.0], "left"),
-    "d": ([1.0, 0.0], "right"),
-    "w": ([0.0, 1.0], "up"),
-    "s": ([0.0, -1.0], "down"),
-}
 OTHER_ACTIONS = {
     "LunarLander-v3": "LunarLanderContinuous-v3",
     "LunarLanderContinuous-v3": "LunarLander-v3",

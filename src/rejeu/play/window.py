@@ -11,7 +11,7 @@ import numpy as np
 from rejeu.errors import MissingExtra
 from rejeu.play.game import Game, Player
 from rejeu.play.keys import KeyMap, equivalent_keys
-from rejeu.reporting.text import counted
+from rejeu.reporting.formatting import counted
 
 Color = tuple[int, int, int]
 Keycap = tuple[str, frozenset[str]]

@@ -1,4 +1,4 @@
-"""Tuned hyperparameters as data, one file for each family of environments, and their measured results.
+"""Tuned hyperparameters as data (``presets.toml``), and their measured results.
 
 >>> find("parking-v0").algorithm
 'SAC'
@@ -7,13 +7,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
-from rejeu.presets import ball, box2d, classic_control, parking, robotics
-from rejeu.presets.files import read, write
-from rejeu.presets.preset import Preset
+from rejeu.presets.preset import Preset, built_in, read, write
 from rejeu.presets.result import Result, find_result, results
 
-ALL: tuple[Preset, ...] = (*parking.PRESETS, *classic_control.PRESETS, *box2d.PRESETS, *ball.PRESETS, *robotics.PRESETS)
+ALL: tuple[Preset, ...] = built_in()
 """Every preset of rejeu. The first one of an environment is the one that ``rejeu train`` uses."""
 
 registered: dict[str, tuple[Preset, ...]] = {}
@@ -22,6 +23,7 @@ registered: dict[str, tuple[Preset, ...]] = {}
 TWINS = {
     "jax/Parking-v0": "parking-v0",
     "jax/Ball-v0": "rejeu/Ball-v0",
+    "jax/Acrobot-v1": "Acrobot-v1",
     "jax/CartPole-v1": "CartPole-v1",
     "jax/Pendulum-v1": "Pendulum-v1",
     "jax/MountainCar-v0": "MountainCar-v0",
@@ -42,12 +44,12 @@ def every() -> tuple[Preset, ...]:
     return (*ALL, *(preset for presets in registered.values() for preset in presets))
 
 
-def default(env_id: str, algorithm: str) -> Preset:
-    """Returns a preset with the algorithm's default hyperparameters, for an environment that has no preset."""
+def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = MappingProxyType({})) -> Preset:
+    """Returns a preset of the algorithm's defaults and ``hyperparameters``, for an environment that has no preset."""
     return Preset(
         env_id=env_id,
         algorithm=algorithm,
-        hyperparameters={},
+        hyperparameters=hyperparameters,
         n_envs=1,
         total_steps=100_000,
         evaluate_every=5_000,

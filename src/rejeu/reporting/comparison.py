@@ -4,44 +4,34 @@ from __future__ import annotations
 
 import html
 import itertools
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import msgspec
 import numpy as np
 
 from rejeu import validation
 from rejeu.io import atomic
 from rejeu.io.records import shown
 from rejeu.reporting import statistics
+from rejeu.reporting.formatting import cell, counted, csv_text, markdown_table, number
 from rejeu.reporting.grouping import By, group_labels, settings
 from rejeu.reporting.run_curves import FINAL, N_POINTS, Axis, Curve, Score, cut_to_shortest, scale
 from rejeu.reporting.run_list import read_all
 from rejeu.reporting.runs import Run
-from rejeu.reporting.tabular import (
-    cell,
-    csv_text,
-    curve_parts,
-    improvement_row,
-    interval_text,
-    markdown_table,
-    number,
-    reached_text,
-    without_nan,
-)
 
 if TYPE_CHECKING:
-    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.plots.picture import Picture
 
 N_LEVELS = 101
 """Levels of a performance profile."""
 CURVE_SAMPLES = 1000
 """Most bootstrap samples of a curve, whose interval is only drawn."""
-FEW = 4
-"""Number of runs up to which a note says that bootstrap intervals are too narrow."""
+BOUNDS = ("value", "low", "high")
+"""The rows of a curve: statistic, and bounds of its interval."""
 FORMATS = ("md", "csv", "json", "png", "html")
 
 
@@ -68,9 +58,15 @@ class Group:
     profile: np.ndarray
     """``(3, N_LEVELS)``: share of runs whose final score is above each level, and the bounds of its interval."""
     levels: np.ndarray
-    reached: tuple[int, float, float]
-    """Number of runs that reached the threshold, the median of the steps (or seconds) that this took, infinite where half of
-    the runs did not, and the threshold."""
+    reached: tuple[int, float] | None
+    """Number of runs that reached the threshold, and the median of the steps (or seconds) that this took, infinite where half
+    of the runs did not; None without a threshold."""
+
+    @property
+    def interval(self) -> str:
+        """The score with its interval as text."""
+        value, low, high = map(number, self.score)
+        return f"IQM {value} (95 % interval {low} to {high}), {counted(len(self.runs), 'run')}"
 
 
 @dataclass(frozen=True)
@@ -84,6 +80,11 @@ class Improvement:
     low: float
     high: float
 
+    @property
+    def cells(self) -> list[str]:
+        """The two labels, the environment and the probability with its interval as text."""
+        return [self.label, self.other, self.env_id, f"{self.probability:.0%} ({self.low:.0%} to {self.high:.0%})"]
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
@@ -95,6 +96,7 @@ class Comparison:
     axis: Axis
     score: Score
     statistic: str
+    threshold: float | None
     notes: tuple[str, ...]
     """What was left out, cut or not comparable, one line each."""
 
@@ -117,36 +119,38 @@ class Comparison:
                 "iqm_high": group.score[2],
                 "mean": group.mean,
                 "median": group.median,
-                "threshold": group.reached[2],
-                "reached": group.reached[0],
-                f"{self.axis}_to_threshold": group.reached[1],
+                "threshold": self.threshold,
+                "reached": None if group.reached is None else group.reached[0],
+                f"{self.axis}_to_threshold": None if group.reached is None else group.reached[1],
             }
             for group in self.groups
         ]
 
+    def text_table(self) -> list[list[str]]:
+        """Returns the table as text, with a row of headings; the first two columns are names."""
+        head = ["group", "environment", "runs", "IQM", "95 % interval", "mean", "median"]
+        if self.threshold is not None:
+            head.append(f"{self.axis} to {number(self.threshold)}")
+        rows = [head]
+        for group in self.groups:
+            value, low, high = map(number, group.score)
+            cells = [group.label, group.env_id, str(len(group.runs)), value, f"{low} to {high}"]
+            cells += [number(group.mean), number(group.median)]
+            if group.reached is not None:
+                cells.append(f"{number(group.reached[1])} ({group.reached[0]} of {len(group.runs)})")
+            rows.append(cells)
+        return rows
+
     def to_markdown(self) -> str:
         """Returns the tables and the notes as Markdown."""
-        head = ["group", "environment", "runs", "IQM (95 % interval)", "mean", "median", f"{self.axis} to threshold"]
-        rows = [
-            [
-                group.label,
-                group.env_id,
-                str(len(group.runs)),
-                f"{number(group.score[0])} ({number(group.score[1])} to {number(group.score[2])})",
-                number(group.mean),
-                number(group.median),
-                reached_text(group),
-            ]
-            for group in self.groups
-        ]
+        head, *rows = self.text_table()
         parts = [markdown_table(head, rows), self.definition]
         if self.improvements:
             names = ["group", "better than", "environment", "probability of improvement (95 % interval)"]
-            parts.append(markdown_table(names, [improvement_row(one) for one in self.improvements]))
-        return (
-            "\n\n".join([*parts, *([] if not self.notes else ["\n".join(f"- {cell(one)}" for one in self.notes)])])
-            + "\n"
-        )
+            parts.append(markdown_table(names, [one.cells for one in self.improvements]))
+        if self.notes:
+            parts.append("\n".join(f"- {cell(one)}" for one in self.notes))
+        return "\n\n".join(parts) + "\n"
 
     def to_csv(self) -> str:
         """Returns :meth:`table` as CSV."""
@@ -154,9 +158,8 @@ class Comparison:
 
     def curves_csv(self) -> str:
         """Returns the curves as CSV, one row for each point of each group."""
-        names = ("value", "low", "high")
         return csv_text(
-            {"group": group.label, "env": group.env_id, self.axis: x, **dict(zip(names, point, strict=True))}
+            {"group": group.label, "env": group.env_id, self.axis: x, **dict(zip(BOUNDS, point, strict=True))}
             for group in self.groups
             for x, point in zip(group.x.tolist(), group.curve.T.tolist(), strict=True)
         )
@@ -174,8 +177,10 @@ class Comparison:
                     "paths": [str(run.path) for run in group.runs],
                     "seeds": [run.seed for run in group.runs],
                     "scores": [one.tolist() for one in group.scores],
-                    "curve": {"x": group.x.tolist(), **curve_parts(group.curve)},
-                    "profile": {"levels": group.levels.tolist(), **curve_parts(group.profile)},
+                    "curve": dict(zip(("x", *BOUNDS), [group.x.tolist(), *group.curve.tolist()], strict=True)),
+                    "profile": dict(
+                        zip(("levels", *BOUNDS), [group.levels.tolist(), *group.profile.tolist()], strict=True)
+                    ),
                 }
                 for row, group in zip(self.table(), self.groups, strict=True)
             ],
@@ -184,8 +189,8 @@ class Comparison:
         }
 
     def to_json(self) -> str:
-        """Returns everything as JSON; unknown numbers are null."""
-        return json.dumps(without_nan(self.to_dict()), indent=1, allow_nan=False) + "\n"
+        """Returns everything as JSON; unknown and infinite numbers are null."""
+        return msgspec.json.format(msgspec.json.encode(self.to_dict()), indent=1).decode() + "\n"
 
     def plot(self, path: str | Path | None = None) -> Picture:
         """Returns a matplotlib figure of the curves; ``path`` is a file to write it to.
@@ -216,29 +221,20 @@ class Comparison:
         """
         path = Path(path)
         suffix = path.suffix.lower().removeprefix(".")
-        if suffix in FORMATS and not path.is_dir():
-            self._write(path, suffix)
-            return [path]
-        if suffix and not path.is_dir():
-            raise ValueError(f"{path.name!r} must end in {', '.join(FORMATS)}, or be a folder")
-        paths = [path / f"compare.{suffix}" for suffix in FORMATS]
-        for one, suffix in zip(paths, FORMATS, strict=True):
-            self._write(one, suffix)
-        curves = path / "curves.csv"
-        write_text(curves, self.curves_csv())
-        return [*paths, curves]
-
-    def _write(self, path: Path, suffix: str) -> None:
+        if path.is_dir() or not suffix:
+            paths = [one for suffix in FORMATS for one in self.save(path / f"compare.{suffix}")]
+            return [*paths, write_text(path / "curves.csv", self.curves_csv())]
         if suffix == "png":
             self.plot(path)
-            return
+            return [path]
         texts = {"md": self.to_markdown, "csv": self.to_csv, "json": self.to_json, "html": self.to_html}
-        write_text(path, texts[suffix]())
+        if suffix not in texts:
+            raise ValueError(f"{path.name!r} must end in {', '.join(FORMATS)}, or be a folder")
+        return [write_text(path, texts[suffix]())]
 
     def __repr__(self) -> str:
         lines = [
-            f"{group.label} on {group.env_id or 'an unknown environment'}: {interval_text(group)}"
-            for group in self.groups
+            f"{group.label} on {group.env_id or 'an unknown environment'}: {group.interval}" for group in self.groups
         ]
         return "\n".join([*lines, self.definition, *(f"note: {one}" for one in self.notes)])
 
@@ -276,7 +272,7 @@ def compare(
         statistic: statistic of the curves over the runs.
         normalize: puts scores of several environments on one scale, so that they can be averaged: ``"range"`` from the lowest
             to the highest final score of each environment, or two reference returns by environment, which become 0 and 1.
-        threshold: return that counts as learned; by default the mean final score of the weakest group.
+        threshold: return that counts as learned; the tables then have the steps (or seconds) until the curves reach it.
         samples: number of bootstrap samples.
         seed: seed of the bootstrap.
 
@@ -383,19 +379,29 @@ def summarize(
     draws = {key: statistics.draw(scores, samples, rng) for key, scores in finals.items()}
     for key in sorted(keyed):
         peers = [finals[other] for other in keyed if other[0] == key[0]]
-        level = min(float(statistics.mean(one)) for one in peers) if threshold is None else threshold
         everything = np.concatenate([one for scores in peers for one in scores])
         levels = np.linspace(everything.min(), everything.max(), N_LEVELS)
-        groups.append(make_group(key, keyed[key], finals[key], draws[key], levels, level, statistic, mixes))
+        groups.append(make_group(key, keyed[key], finals[key], draws[key], levels, threshold, statistic, mixes))
     pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
     improvements = [compared(*pair, finals, draws) for pair in pairs]
-    for few, effect in ((1, "say nothing about luck"), (FEW, "are too narrow")):
-        short = sum(len(group.runs) <= few for group in groups)
-        if short:
-            runs = "one run" if few == 1 else f"fewer than {few + 1} runs"
-            notes.append(f"{short} of {len(groups)} groups have {runs}, so that their intervals {effect}")
-            break
-    return Comparison(tuple(groups), tuple(improvements), by, axis, score, statistic, tuple(notes))
+    notes += coverage_notes([min(map(len, group.scores)) for group in groups])
+    return Comparison(tuple(groups), tuple(improvements), by, axis, score, statistic, threshold, tuple(notes))
+
+
+def coverage_notes(n_runs: Sequence[int]) -> list[str]:
+    """Returns notes on what the intervals of groups of few runs are worth.
+
+    >>> coverage_notes([3, 3, 20])
+    ['intervals of few runs are too narrow: those of 3 runs contain the true score in 75 % of cases, not in 95 %']
+    """
+    single = sum(n == 1 for n in n_runs)
+    notes = [f"{single} of {len(n_runs)} groups have one run, so that their intervals say nothing about luck"]
+    shares = [
+        f"those of {n} runs contain the true score in {statistics.COVERAGE[n]:.0%} of cases".replace("%", " %")
+        for n in sorted({*n_runs} & statistics.COVERAGE.keys())
+    ]
+    few = [f"intervals of few runs are too narrow: {', '.join(shares)}, not in 95 %"]
+    return [*(notes if single else []), *(few if shares else [])]
 
 
 def strata(pairs: Iterable[tuple[str, Any]]) -> tuple[np.ndarray, ...]:
@@ -412,7 +418,7 @@ def make_group(
     scores: tuple[np.ndarray, ...],
     draws: list[np.ndarray],
     levels: np.ndarray,
-    threshold: float,
+    threshold: float | None,
     statistic: str,
     mixed: bool,
 ) -> Group:
@@ -422,10 +428,6 @@ def make_group(
     points = [one.points() for one in members]
     curves = strata(list(zip([one.env for one in members], points, strict=True)))
     grid = np.linspace(0, 1 if mixed else members[0].end, N_POINTS)
-    times = []
-    for one, values in zip(members, points, strict=True):
-        over = np.flatnonzero(values >= threshold)
-        times.append(over[0] / (N_POINTS - 1) * one.end if len(over) else np.inf)
     low, high = statistics.interval(statistics.iqm(samples))
     with np.errstate(invalid="ignore"):  # points before the first episode
         band = statistics.interval(function(statistics.resampled(curves, [rows[:CURVE_SAMPLES] for rows in draws])))
@@ -443,8 +445,17 @@ def make_group(
         x=grid,
         profile=np.stack([statistics.above(scores, levels), *statistics.interval(statistics.above(samples, levels).T)]),
         levels=levels,
-        reached=(int(np.isfinite(times).sum()), float(np.median(times)), threshold),
+        reached=None if threshold is None else reached(members, points, threshold),
     )
+
+
+def reached(members: Sequence[Curve], points: Sequence[np.ndarray], threshold: float) -> tuple[int, float]:
+    """Returns how many curves reach a threshold, and the median of the steps (or seconds) until they do."""
+    times = []
+    for one, values in zip(members, points, strict=True):
+        over = np.flatnonzero(values >= threshold)
+        times.append(over[0] / (N_POINTS - 1) * one.end if len(over) else np.inf)
+    return int(np.isfinite(times).sum()), float(np.median(times))
 
 
 def compared(one: tuple[str, str], other: tuple[str, str], finals: Any, draws: Any) -> Improvement:
@@ -457,7 +468,8 @@ def compared(one: tuple[str, str], other: tuple[str, str], finals: Any, draws: A
     return Improvement(one[1], other[1], one[0], probability, float(low), float(high))
 
 
-def write_text(path: Path, content: str) -> None:
-    """Writes a text file atomically."""
+def write_text(path: Path, content: str) -> Path:
+    """Writes a text file atomically, and returns its path."""
     with atomic.replacing(path) as file:
         file.write(content.encode())
+    return path

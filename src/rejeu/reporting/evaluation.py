@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rejeu import interrupt
 from rejeu.envs.base import VectorEnv
-from rejeu.reporting.text import counted, html_table
+from rejeu.reporting import statistics
+from rejeu.reporting.formatting import counted, html_table
 from rejeu.spaces import scale_action
 
+MOST_STEPS = 30_000
+"""Steps after which an episode is cut off, unless the environment declares a higher time limit; Atari's have up to 27,000."""
+
 if TYPE_CHECKING:
-    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.plots.picture import Picture
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,6 +36,8 @@ class Evaluation:
     successes: np.ndarray
     """1 or 0 for each episode, ``(n,)``: as reported by the environment, else whether the return reached the threshold, else
     NaN."""
+    cut: int = 0
+    """How many of the episodes did not end and were cut off after :data:`MOST_STEPS` steps."""
 
     @property
     def mean_return(self) -> float:
@@ -49,13 +57,8 @@ class Evaluation:
     @property
     def return_interval(self) -> tuple[float, float]:
         """95 % confidence interval of the mean return (Student's t), NaN for a single episode."""
-        n = len(self.returns)
-        if n < 2:
-            return math.nan, math.nan
-        from scipy import stats
-
-        half = float(stats.t.ppf(0.975, n - 1)) * float(np.std(self.returns, ddof=1)) / math.sqrt(n)
-        return self.mean_return - half, self.mean_return + half
+        low, high = statistics.student(self.mean_return, self.std_return, len(self.returns))
+        return float(low), float(high)
 
     @property
     def success_rate(self) -> float:
@@ -65,17 +68,14 @@ class Evaluation:
     @property
     def success_interval(self) -> tuple[float, float]:
         """95 % confidence interval of the success rate (Wilson score), NaN if unknown."""
-        if math.isnan(self.success_rate):
-            return math.nan, math.nan
-        from scipy import stats
-
-        bounds = stats.binomtest(int(self.successes.sum()), len(self.successes)).proportion_ci(method="wilson")
-        return float(bounds.low), float(bounds.high)
+        low, high = statistics.wilson(self.success_rate, len(self.successes))
+        return float(low), float(high)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the statistics by name, as ``rejeu evaluate --json`` prints them."""
         return {
             "episodes": len(self.returns),
+            "cut": self.cut,
             "mean_return": self.mean_return,
             "std_return": self.std_return,
             "return_interval": self.return_interval,
@@ -107,7 +107,7 @@ class Evaluation:
         if not math.isnan(self.success_rate):
             low, high = self.success_interval
             text = f"success {self.success_rate:.1%} (95 % CI {low:.1%} to {high:.1%}), {text}"
-        return text
+        return f"{text}, {self.cut} of them cut off" if self.cut else text
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -140,7 +140,8 @@ def evaluate(
 
     Every environment plays a fixed share of the episodes, because otherwise short episodes would be counted more often. After
     ``seconds`` no episode is started, but running episodes are completed and counted, because otherwise long episodes would
-    be left out.
+    be left out. An episode that does not end is cut off after :data:`MOST_STEPS` steps, with a warning, and counts with its
+    return so far; its environment plays no further one.
 
     Args:
         policy: maps observations ``(n_envs, ...)`` and episode starts ``bool (n_envs,)`` to actions in the algorithm's range.
@@ -151,6 +152,9 @@ def evaluate(
         seed: seed of the environments; None continues their random state.
         seconds: wall time after which no episode is started, None for no limit. Every environment with a share of the
             episodes plays at least one.
+
+    Raises:
+        Stopped: if Ctrl-C or SIGTERM asks training to stop.
     """
     if episodes is None and seconds is None:
         raise ValueError("evaluate needs episodes or seconds")
@@ -160,19 +164,33 @@ def evaluate(
     to_play = np.full(n_envs, most) if episodes is None else (episodes + np.arange(n_envs)) // n_envs
     end = math.inf if seconds is None else time.perf_counter() + seconds
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
+    longest = max(MOST_STEPS, env.max_episode_steps or 0)
     rows: list[tuple[float, int, float]] = []
+    cut = 0
     obs, done = env.reset(seed), np.ones(env.n_envs, bool)
     while to_play.any():
+        if (signal := interrupt.requested()) is not None:
+            raise interrupt.Stopped(signal)
         step = env.step(scale_action(env.action_space, policy(obs, done)))
         total += step.reward
         length += 1
         done = step.terminated | step.truncated
-        for i in np.flatnonzero(done).tolist():
+        endless = ~done & (to_play > 0) & (length >= longest)
+        for i in np.flatnonzero(done | endless).tolist():
             if to_play[i]:
                 value = step.return_of(i, total[i])
                 rows.append((value, length[i], env.judge(step, i, value, success_threshold)))
-                to_play[i] = 0 if time.perf_counter() >= end else to_play[i] - 1
+                to_play[i] = 0 if endless[i] or time.perf_counter() >= end else to_play[i] - 1
             total[i] = length[i] = 0
+        cut += int(endless.sum())
         obs = env.reset_done(done) if done.any() and to_play.any() else step.obs
     returns, lengths, successes = zip(*rows, strict=True)
-    return Evaluation(np.array(returns), np.array(lengths), np.array(successes))
+    if cut:
+        warnings.warn(
+            f"{counted(cut, 'episode')} of an evaluation did not end in {MOST_STEPS:,} steps and "
+            f"{'was' if cut == 1 else 'were'} cut off; give the environment a time limit: "
+            "gymnasium.register(..., max_episode_steps=1000)",
+            UserWarning,
+            stacklevel=2,
+        )
+    return Evaluation(np.array(returns), np.array(lengths), np.array(successes), cut)

@@ -15,11 +15,11 @@ import numpy as np
 
 from rejeu.io import atomic
 from rejeu.loops.run import Episode
-from rejeu.reporting.text import counted, html_table
+from rejeu.reporting.formatting import counted, html_table
 from rejeu.validation import whole
 
 if TYPE_CHECKING:
-    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.plots.picture import Picture
 
 LAST_EPISODES = 20
 """Number of episodes that ``repr`` averages."""

@@ -23,14 +23,18 @@ from rejeu.errors import MissingExtra
 from rejeu.io import atomic
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.reporting import trackers
+from rejeu.reporting.history import csv_lines
 from rejeu.reporting.notebook import Display
+from rejeu.reporting.runs import flat
 from rejeu.reporting.tables import read_bytes
 from rejeu.reporting.trackers import Background, MLflow, Tracker, Trackio, WandB
+from rejeu.runs.config import LOGS
 
-LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
-"""What the argument ``log`` takes."""
+TRACKERS = ("wandb", "mlflow", "trackio")
 MAX_LOG_BYTES = 2**30
 """Upper limit on the size of a log that is continued."""
+NUMBERS = re.compile(rb"[0-9]{1,18}(,[-+.\w]{0,64})*\r?\n", re.ASCII)
+"""A row of a table: a step, and numbers or nothing."""
 
 
 class Sink(Protocol):
@@ -117,12 +121,7 @@ class CsvFile:
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
         self.path = Path(path)
         self._columns: list[str] = []
-        kept = [] if up_to is None or not self.path.exists() else self._rows_up_to(up_to)
-        if kept:
-            self._columns = [*kept[0]]
-        content = self._header() + self._lines(kept)
-        if up_to is None or not self.path.exists() or read_log(self.path) != content:
-            self._replace(content)
+        restart(self.path, [] if up_to is None or not self.path.exists() else self._lines_up_to(up_to), up_to)
 
     def __str__(self) -> str:
         return str(self.path)
@@ -134,50 +133,37 @@ class CsvFile:
             OSError: if writing fails; the file is not changed.
         """
         row = {"step": step, **metrics}
-        if new := [name for name in row if name not in self._columns]:
-            rows = self._read()
-            before, self._columns = self._columns, [*self._columns, *new]
-            try:
-                self._replace(self._header() + self._lines([*rows, row]))
-            except OSError:
-                self._columns = before
-                raise
+        new = [name for name in row if name not in self._columns]
+        columns = [*self._columns, *new]
+        line = csv_lines([[row.get(name, "") for name in columns]])
+        if new:
+            rows = read_log(self.path).splitlines()[1:]
+            with atomic.replacing(self.path) as file:
+                file.write(csv_lines([columns]) + b"".join(one + b"," * len(new) + b"\r\n" for one in rows) + line)
+            self._columns = columns
         else:
-            atomic.append(self.path, self._lines([row]))
+            atomic.append(self.path, line)
 
     def close(self) -> None:
         """Does nothing, because rows are not buffered."""
 
-    def _read(self) -> list[dict[str, str]]:
-        text = read_log(self.path).decode("utf-8", "replace")
-        return list(csv.DictReader(line for line in io.StringIO(text, newline="") if "\0" not in line))
-
-    def _rows_up_to(self, step: int) -> list[dict[str, str]]:
-        """Returns the complete rows up to a step; none, with a warning, if the file is no table with steps."""
+    def _lines_up_to(self, step: int) -> list[bytes]:
+        """Returns the header and the complete rows up to a step; none, with a warning, if the file is no table with steps."""
+        header, *rows = read_log(self.path).splitlines(keepends=True) or [b""]
         try:
-            rows = self._read()
-            is_damaged = bool(rows) and "step" not in rows[0]
+            columns = next(csv.reader([header.decode("utf-8", "replace").strip()]), [])
         except csv.Error:  # such as a cell of 200,000 characters
-            rows, is_damaged = [], True
-        if is_damaged:
+            columns = ["damaged"]
+        if columns and columns[0] != "step":
             aside = self.path.with_name(f"{self.path.name}.damaged")
             self.path.replace(aside)
             warnings.warn(f"{self.path} is damaged and is now {aside.name}; a new table begins", stacklevel=4)
             return []
-        complete = (row for row in rows if None not in row and None not in row.values())
-        return [row for row in complete if re.fullmatch("[0-9]{1,18}", row["step"]) and int(row["step"]) <= step]
-
-    def _header(self) -> bytes:
-        return self._lines([{name: name for name in self._columns}]) if self._columns else b""
-
-    def _lines(self, rows: Iterable[Mapping[str, Any]]) -> bytes:
-        text = io.StringIO()
-        csv.DictWriter(text, self._columns, restval="").writerows(rows)
-        return text.getvalue().encode()
-
-    def _replace(self, content: bytes) -> None:
-        with atomic.replacing(self.path) as file:
-            file.write(content)
+        if not header.endswith(b"\n"):
+            return []
+        self._columns = columns
+        whole = (row for row in rows if NUMBERS.fullmatch(row) and row.count(b",") == len(columns) - 1)
+        return [header, *(row for row in whole if int(row.split(b",")[0]) <= step)]
 
 
 class JsonLines:
@@ -190,13 +176,8 @@ class JsonLines:
 
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
         self.path = Path(path)
-        kept: list[bytes] = []
-        if up_to is not None and self.path.exists():
-            kept = [line for line in read_log(self.path).splitlines(keepends=True) if _has_step(line, up_to)]
-        content = b"".join(kept)
-        if up_to is None or not self.path.exists() or read_log(self.path) != content:
-            with atomic.replacing(self.path) as file:
-                file.write(content)
+        lines = [] if up_to is None or not self.path.exists() else read_log(self.path).splitlines(keepends=True)
+        restart(self.path, [line for line in lines if up_to is not None and _has_step(line, up_to)], up_to)
 
     def __str__(self) -> str:
         return str(self.path)
@@ -212,6 +193,14 @@ class JsonLines:
 
     def close(self) -> None:
         """Does nothing, because rows are not buffered."""
+
+
+def restart(path: Path, lines: Sequence[bytes], up_to: int | None) -> None:
+    """Writes the lines of a log that are kept, unless the file has these and no others, or starts an empty file."""
+    content = b"".join(lines)
+    if up_to is None or not path.exists() or read_log(path) != content:
+        with atomic.replacing(path) as file:
+            file.write(content)
 
 
 def read_log(path: Path) -> bytes:
@@ -268,7 +257,7 @@ class TensorBoard:
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the configuration as a table, in TensorBoard's tab "Text"."""
-        cells = [(name, str(value).replace("|", "\\|")) for name, value in trackers.flat(config).items()]
+        cells = [(name, str(value).replace("|", "\\|")) for name, value in flat(config)]
         table = "\n".join(["| name | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in cells)])
         event = self._event(wall_time=time.time(), step=0)
         value = event.summary.value.add(tag="config/text_summary")
@@ -412,15 +401,11 @@ def require(kinds: Iterable[str]) -> None:
     Raises:
         MissingExtra: if a package is not installed, with the command that installs it.
     """
-    imports = {
-        "tensorboard": import_tensorboard,
-        "wandb": trackers.import_wandb,
-        "mlflow": trackers.import_mlflow,
-        "trackio": trackers.import_trackio,
-    }
     for kind in kinds:
-        if kind in imports:
-            imports[kind]()
+        if kind == "tensorboard":
+            import_tensorboard()
+        elif kind in TRACKERS:
+            trackers.imported(kind)
 
 
 def open_log(

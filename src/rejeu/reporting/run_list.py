@@ -7,10 +7,11 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rejeu.errors import MissingExtra
 from rejeu.io.records import shown
-from rejeu.reporting import foreign
+from rejeu.reporting import other_programs
 from rejeu.reporting.runs import CONFIG, EPISODES, MAX_NAME, METRICS, Run, is_file, read_run
 
 MAX_DEPTH = 4
@@ -31,14 +32,14 @@ def read(path: str | Path, table_only: bool = False) -> Run:
         ValueError: if a file is not what its name says.
     """
     path = Path(path)
-    if path.is_file() and foreign.MONITOR.fullmatch(path.name):
-        return foreign.read_monitor(path)
+    if path.is_file() and other_programs.MONITOR.fullmatch(path.name):
+        return other_programs.read_monitor(path)
     if not path.is_dir() or is_ours(path):
         return read_run(path, ("step", "return", "seconds") if table_only else None)
-    if foreign.monitor_files(path):
-        return foreign.read_monitor(path)
-    if foreign.event_files(path):
-        return foreign.read_tensorboard(path)
+    if other_programs.files(path, other_programs.MONITOR):
+        return other_programs.read_monitor(path)
+    if other_programs.files(path, other_programs.EVENTS):
+        return other_programs.read_tensorboard(path)
     return read_run(path)
 
 
@@ -50,12 +51,10 @@ def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list
     Raises:
         FileNotFoundError: if a path does not exist, or holds no run.
     """
-    found: list[Path | Run] = []
-    notes: list[str] = []
-    seen = set()
+    found: dict[Any, Path | Run] = {}
     for one in [paths] if isinstance(paths, str | Path | Run) else paths:
         if isinstance(one, Run):
-            found.append(one)
+            found[one] = one
             continue
         inside = find(Path(one))
         if not inside:
@@ -63,18 +62,11 @@ def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list
                 f"{shown(one, 300)} holds no run; expected a run folder of rejeu train, a monitor.csv or TensorBoard files"
             )
         for path in inside:
-            if (resolved := path.resolve()) in seen:
-                continue
-            seen.add(resolved)
-            found.append(path)
-    runs = []
+            found.setdefault(path.resolve(), path)
     with ThreadPoolExecutor(2) as pool:  # NumPy computes outside of Python's lock
-        for run in pool.map(read_or_note, found):
-            if isinstance(run, str):
-                notes.append(run)
-                continue
-            runs.append(run)
-    runs = distinct(runs)
+        read = [*pool.map(read_or_note, found.values())]
+    notes = [one for one in read if isinstance(one, str)]
+    runs = distinct([one for one in read if isinstance(one, Run)])
     notes += [f"{run.name}: {note}" for run in runs for note in run.notes if "damaged" in note]
     return runs, notes
 
@@ -140,6 +132,6 @@ def is_ours(folder: Path) -> bool:
 def is_run(folder: Path) -> bool:
     """Returns whether a folder is a run of any known program."""
     try:
-        return is_ours(folder) or bool(foreign.monitor_files(folder) or foreign.event_files(folder))
+        return is_ours(folder) or any(other_programs.files(folder, kind) for kind in other_programs.FILES)
     except OSError:
         return False

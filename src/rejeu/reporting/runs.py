@@ -6,15 +6,14 @@ evaluated, and whatever is missing or damaged becomes a note. A folder can be re
 
 from __future__ import annotations
 
-import json
+import dataclasses
 import math
 import os
 import stat
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -23,9 +22,12 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rejeu import presets
-from rejeu.io.records import Malformed, is_deep, parse_json, shown
+from rejeu.errors import CheckpointError
+from rejeu.io.records import Malformed, convert, is_deep, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
-from rejeu.reporting.text import quoted
+from rejeu.runs.config import MAX_BYTES, RunConfig, parse
+from rejeu.runs.folder import RunFolder, newest_inside
+from rejeu.runs.values import quoted
 
 RENAMED = {
     "time/seconds": "time/time_elapsed",
@@ -34,13 +36,9 @@ RENAMED = {
 }
 """Names of metrics in older run folders, and their present names."""
 CONFIG, EPISODES, METRICS, EVALUATIONS = "config.json", "episodes.csv", "metrics.csv", "evaluations.csv"
-REPLAYS = "replays.csv"
-"""Episodes of the trained agent from known seeds, which ``rejeu report --replay`` writes."""
 WARNINGS = "warnings.txt"
-"""Warnings of the training, and the error that ended it, one a line."""
 MAX_DEPTH = 20
 """Upper limit on the levels of a ``config.json``."""
-MAX_CONFIG_BYTES = 2**20
 MAX_WARNINGS = 100
 MAX_WARNINGS_BYTES = 2**16
 MAX_VIDEOS = 1000
@@ -95,8 +93,8 @@ class Run:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     seed: int | None = None
     n_envs: int | None = None
-    config: Mapping[str, Any] = field(default_factory=dict)
-    """The content of ``config.json``: JSON values, not checked."""
+    config: RunConfig | None = None
+    """The description of the run in ``config.json``; None if that is missing or damaged."""
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     """All hyperparameters, as JSON values."""
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -136,40 +134,15 @@ class Run:
         default, value = dict(flat(defaults)), dict(flat(self.hyperparameters))
         return {name: (value[name], default.get(name)) for name in value if value[name] != default.get(name)}
 
-    @property
-    def env_argument(self) -> str:
-        """The environment as it was named on the command line."""
-        return text(self.config.get("env_argument")) or self.env_id
-
-    @property
-    def env_words(self) -> list[str]:
-        """The options of a command line that make the environment: keyword arguments and wrappers."""
-        pairs = [f"{name}={assigned(value)}" for name, value in self.env_kwargs.items()]
-        wrappers = self.config.get("wrappers")
-        named = [["--wrapper", text(one)] for one in (wrappers if isinstance(wrappers, list) else ())]
-        return [*(["--env-kwargs", *pairs] if pairs else []), *chain.from_iterable(named)]
-
-    @property
-    def import_words(self) -> list[str]:
-        """The options of a command line that import what the run imported."""
-        imports = self.config.get("imports")
-        return [*chain.from_iterable(("--import", text(one)) for one in (imports if isinstance(imports, list) else ()))]
+    def environment_words(self) -> list[str]:
+        """Returns the options with which commands about the run make its environment again; empty if its id is enough."""
+        return [] if self.config is None else self.config.environment_words(option=True)
 
     @cached_property
     def command(self) -> str:
         """The command that repeats the run, made from its configuration; empty if that is not known."""
-        if self.format != "rejeu" or not (self.config and self.env_id and self.algorithm):
+        if self.config is None or not self.algorithm:
             return ""
-        config = self.config
-        words = ["rejeu", "train", self.env_argument, "--algo", self.algorithm]
-        limit = ["--minutes", f"{self.minutes_asked:g}"] if self.minutes_asked else ["--steps", str(self.steps_asked)]
-        words += limit if self.minutes_asked or self.steps_asked else []
-        options = {"seed": self.seed, "envs": self.n_envs, "backend": config.get("backend")}
-        others = ("evaluate_every", "evaluate_episodes", "success_threshold", "video_every")
-        options |= {name: config.get(name) for name in others}
-        for name, value in options.items():
-            words += [] if value is None else [f"--{name.replace('_', '-')}", text(value)]
-        words += [*self.env_words, *self.import_words]
         preset = presets.find(self.env_id, self.algorithm)
         usual = default_hyperparameters(self.algorithm, preset.hyperparameters if preset else {})
         taken = dict(flat(usual))  # by rejeu train if nothing is set
@@ -179,10 +152,10 @@ class Run:
             for name in values
             if usual and name not in self.changed and taken.get(name, values[name]) == values[name]
         }
-        names = [name for name in values if name not in same]
-        if names:
-            words += ["--set", *(f"{name}={assigned(values[name])}" for name in names)]
-        return " ".join(quoted(shown(word, MAX_WORD)) for word in words)
+        given = {name: value for name, value in values.items() if name not in same}
+        minutes = self.config.checkpoint_minutes or 0.0
+        words = dataclasses.replace(self.config, hyperparameters=given, checkpoint_minutes=minutes).words()
+        return " ".join(quoted(shown(word, MAX_WORD)) for word in ["rejeu", *words])
 
 
 def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
@@ -201,13 +174,14 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
         said = f"{shown(folder, 300)} is no folder" if is_something else f"there is no run folder {shown(folder, 300)}"
         raise FileNotFoundError(said)
     folder = folder.resolve()
+    files = RunFolder(folder)
     if not any((folder / name).is_file() for name in (CONFIG, EPISODES, METRICS, EVALUATIONS)):
         raise FileNotFoundError(f"{shown(folder, 300)} is no run folder: it holds no {CONFIG}{newest_inside(folder)}")
-    config, notes = read_config(folder / CONFIG)
+    config, versions, notes = read_config(files.config)
     metrics, evaluations = (ordered(read_table(folder / name)) for name in (METRICS, EVALUATIONS))
     metrics = statistics_rows(metrics)
     table = ordered(read_table(folder / EPISODES, columns))
-    replays = read_table(folder / REPLAYS) if is_file(folder / REPLAYS) else EMPTY
+    replays = read_table(files.replays) if is_file(files.replays) else EMPTY
     names = ("step", "env", "return", "length", "success", "seconds")
     episodes = Episodes(*(table.column(name) for name in names))
     for part in (table, metrics, evaluations, replays):
@@ -218,23 +192,23 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
         *metrics.column("time/time_elapsed")[-1:],
         *evaluations.column("seconds")[-1:],
     ]
-    asked = whole(config.get("steps"), 1), positive(config.get("minutes"))
+    asked = (None, None) if config is None else (config.steps, config.minutes)
     total = max((one for one in seconds if math.isfinite(one)), default=math.nan)
     models = tuple(name for name in ("best.safetensors", "agent.safetensors") if is_file(folder / name))
     return Run(
         path=folder,
         name=shown(folder.name, MAX_NAME),
-        algorithm=text(config.get("algorithm")),
-        env_id=text(config.get("env")),
-        env_kwargs=mapping(config.get("env_kwargs")),
-        seed=whole(config.get("seed")),
-        n_envs=whole(config.get("n_envs"), 1),
+        algorithm="" if config is None else shown(config.algorithm or "", MAX_NAME),
+        env_id="" if config is None else shown(config.env, MAX_NAME),
+        env_kwargs={} if config is None else config.env_kwargs,
+        seed=None if config is None else config.seed,
+        n_envs=None if config is None else config.n_envs,
         config=config,
-        hyperparameters=mapping(config.get("hyperparameters")),
-        versions={
-            text(key): text(value) for key, value in mapping(config.get("versions")).items() if value is not None
-        },
-        state=state_of(folder, "agent.safetensors" in models, steps, total, *asked),
+        hyperparameters={} if config is None else config.hyperparameters,
+        versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
+        state=state_of(
+            folder, "agent.safetensors" in models, steps in evaluations.column("step"), steps, total, *asked
+        ),
         steps=steps,
         steps_asked=asked[0],
         minutes_asked=asked[1],
@@ -243,21 +217,29 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
         evaluations=evaluations,
         metrics=metrics,
         replays=replays,
-        warnings=read_warnings(folder / WARNINGS),
-        videos=tuple(find_videos(folder)),
+        warnings=read_warnings(files.warnings),
+        videos=tuple(find_videos(files)),
         models=models,
         notes=tuple(notes),
     )
 
 
-def newest_inside(folder: Path) -> str:
-    """Returns the part of a message that names the newest run in a folder of runs; empty if there is none."""
-    runs = [path.parent for path in folder.glob(f"*/{CONFIG}")] if folder.is_dir() else []
-    if not runs:
-        return ""
-    return (
-        f"; the newest of the {len(runs)} in it is {quoted(max(runs, key=lambda run: (run / CONFIG).stat().st_mtime))}"
-    )
+def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes = NO_EPISODES) -> Table:
+    """Returns evaluations as the table of a run, at the times that training episodes ended at.
+
+    Args:
+        evaluations: steps and :class:`rejeu.Evaluation`.
+        episodes: of training; without any the times are unknown.
+    """
+    pairs = list(evaluations)
+    steps = np.array([step for step, _ in pairs], np.float64)
+    results = [result for _, result in pairs]
+    names = ("success_rate", "mean_return", "std_return", "mean_length")
+    columns = {name: np.array([getattr(one, name) for one in results], np.float64) for name in names}
+    columns["episodes"] = np.array([len(one.returns) for one in results], np.float64)
+    if len(episodes):
+        columns["seconds"] = np.interp(steps, episodes.step, episodes.seconds)
+    return Table({"step": steps, **columns})
 
 
 def best_row(evaluations: Table) -> int | None:
@@ -279,22 +261,20 @@ def statistics_rows(table: Table) -> Table:
     return Table({name: values[known] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
 
 
-def read_config(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """Returns the content of a ``config.json``, and notes; empty if it is missing or damaged."""
+def read_config(path: Path) -> tuple[RunConfig | None, dict[str, str | None], list[str]]:
+    """Returns the description of a run, the versions of what ran, and notes; None and none if they are missing or damaged."""
     try:
-        data = read_bytes(path, MAX_CONFIG_BYTES + 1)
-        if len(data) > MAX_CONFIG_BYTES:
-            raise Malformed(f"it has more than {MAX_CONFIG_BYTES:,} bytes")
+        data = read_bytes(path, MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
         content = parse_json(data)
-        if not isinstance(content, dict):
-            raise Malformed("it is not a JSON object")
         if is_deep(content, MAX_DEPTH):
             raise Malformed("it is nested too deeply")
-        return content, []
+        return parse(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
     except FileNotFoundError:
-        return {}, [f"there is no {CONFIG}, so the configuration is not known"]
-    except (OSError, Malformed) as error:
-        return {}, [f"{CONFIG} is damaged: {shown(error)}"]
+        return None, {}, [f"there is no {CONFIG}, so the configuration is not known"]
+    except (OSError, Malformed, CheckpointError) as error:
+        return None, {}, [f"{CONFIG} is damaged: {shown(error)}"]
 
 
 def ordered(table: Table) -> Table:
@@ -317,7 +297,13 @@ def ordered(table: Table) -> Table:
 
 
 def state_of(
-    folder: Path, has_model: bool, steps: int, seconds: float, steps_asked: int | None, minutes_asked: float | None
+    folder: Path,
+    has_model: bool,
+    is_evaluated: bool,
+    steps: int,
+    seconds: float,
+    steps_asked: int | None,
+    minutes_asked: float | None,
 ) -> State:
     """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
     locks = [is_locked(path) for path in (folder / "lock", folder / "checkpoints" / "lock") if is_file(path)]
@@ -325,7 +311,7 @@ def state_of(
         return "running"
     reached_steps = steps_asked is not None and steps >= steps_asked
     reached_minutes = minutes_asked is not None and seconds >= 0.98 * 60 * minutes_asked
-    if has_model and (reached_steps or reached_minutes):
+    if has_model and is_evaluated and (reached_steps or reached_minutes):
         return "finished"
     return "interrupted" if has_model else "crashed"
 
@@ -370,16 +356,13 @@ def read_warnings(path: Path) -> tuple[str, ...]:
     return tuple(shown(line, 1000) for line in lines[:MAX_WARNINGS] if line.strip())
 
 
-def find_videos(folder: Path) -> Iterator[Path]:
+def find_videos(folder: RunFolder) -> Iterator[Path]:
     """Yields the mp4 files of a run folder that are not symbolic links and not in linked folders."""
-    for videos in (folder / "videos", folder / "films"):
-        if videos.is_dir() and not videos.is_symlink():
-            found = [
-                path for path in videos.iterdir() if path.suffix == ".mp4" and path.name[0] != "." and is_file(path)
-            ]
-            yield from sorted(found)[:MAX_VIDEOS]
-    if is_file(folder / "video.mp4"):
-        yield folder / "video.mp4"
+    if folder.videos.is_dir() and not folder.videos.is_symlink():
+        found = [one for one in folder.videos.iterdir() if one.suffix == ".mp4" and one.name[0] != "." and is_file(one)]
+        yield from sorted(found)[:MAX_VIDEOS]
+    if is_file(folder.video):
+        yield folder.video
 
 
 def is_file(path: Path) -> bool:
@@ -420,30 +403,3 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield from flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
-
-
-def assigned(value: Any) -> str:
-    """Returns a value as ``--set`` takes it."""
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def text(value: Any) -> str:
-    """Returns a value of a configuration as short text, empty for None."""
-    if value is None:
-        return ""
-    return shown(value if isinstance(value, str) else json.dumps(value), MAX_NAME)
-
-
-def mapping(value: Any) -> dict[str, Any]:
-    """Returns a value if it is a JSON object, else an empty one."""
-    return value if isinstance(value, dict) else {}
-
-
-def whole(value: Any, least: int = 0) -> int | None:
-    """Returns a value if it is an integer in a sensible range, else None."""
-    return value if type(value) is int and least <= value <= MAX_STEP else None
-
-
-def positive(value: Any) -> float | None:
-    """Returns a value if it is a positive number, else None."""
-    return float(value) if type(value) in (int, float) and 0 < value < 1e9 else None

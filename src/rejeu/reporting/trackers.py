@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, Protocol, runtime_checkable
 
 from rejeu.errors import MissingExtra
 from rejeu.io.failed_writes import MAX_ROWS, RETRY_SECONDS, FailedWrites
+from rejeu.reporting.runs import flat
 
 PROJECT = "rejeu"
 """Project or experiment where the environment variable of the tracker names none."""
@@ -54,7 +56,7 @@ class WandB:
         folder: str | Path | None = None,
         project: str | None = None,
     ) -> None:
-        self._wandb = import_wandb()
+        self._wandb = imported("wandb")
         self.name, self.run_id, self.folder = name, run_id, folder
         self.project = project or os.environ.get("WANDB_PROJECT") or PROJECT
         self._run: Any = None
@@ -107,7 +109,7 @@ class MLflow:
     """
 
     def __init__(self, name: str | None = None, run_id: str | None = None, experiment: str | None = None) -> None:
-        self._mlflow = import_mlflow()
+        self._mlflow = imported("mlflow")
         self.name, self.run_id = name, run_id
         self.experiment = experiment or os.environ.get("MLFLOW_EXPERIMENT_NAME") or PROJECT
         self._client: Any = None
@@ -127,7 +129,7 @@ class MLflow:
         client = self._started()
         known = client.get_run(self._id).data.params
         param = self._mlflow.entities.Param
-        params = [param(name, str(value)[:500]) for name, value in flat(config).items() if name not in known]
+        params = [param(name, str(value)[:500]) for name, value in flat(config) if name not in known]
         for i in range(0, len(params), 100):  # the most that MLflow takes at once
             client.log_batch(self._id, params=params[i : i + 100])
 
@@ -166,7 +168,7 @@ class Trackio:
     """
 
     def __init__(self, name: str | None = None, project: str = PROJECT) -> None:
-        self._trackio = import_trackio()
+        self._trackio = imported("trackio")
         self.name, self.project = name, project
         self._run: Any = None
 
@@ -179,7 +181,7 @@ class Trackio:
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the configuration of the run, if that has no row yet."""
-        self._started(flat(config))
+        self._started(dict(flat(config)))
 
     def write_video(self, step: int, path: Path) -> None:
         """Adds a video."""
@@ -212,8 +214,7 @@ class Background:
     def __init__(self, tracker: Tracker, failed: FailedWrites, closes: bool) -> None:
         self.tracker, self.closes = tracker, closes
         self._failed = failed
-        self._jobs: deque[Callable[[], object]] = deque()
-        self._changed = threading.Condition()
+        self._jobs: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
         self._closing = threading.Event()
         self._error: Exception | None = None
         self._n_dropped = 0
@@ -234,23 +235,21 @@ class Background:
 
     def close(self) -> None:
         """Waits up to ``CLOSE_SECONDS`` for what is queued, after one more attempt if it failed, and ends the thread."""
-        with self._changed:
-            if self.closes:
-                self._jobs.append(self.tracker.close)
-            self._closing.set()
-            self._changed.notify()
+        if self.closes:
+            self._jobs.put(self.tracker.close)
+        self._jobs.put(None)
+        self._closing.set()
         self._thread.join(CLOSE_SECONDS)
         if self._thread.is_alive() and self._error is None:
             self._error = TimeoutError(f"not done {CLOSE_SECONDS:.0f} seconds after the end of training")
         self._report()
 
     def _put(self, job: Callable[[], object]) -> None:
-        with self._changed:
-            if len(self._jobs) > MAX_ROWS:
-                del self._jobs[1]  # the first may be running
+        if self._jobs.qsize() >= MAX_ROWS:
+            with suppress(Empty):
+                self._jobs.get_nowait()
                 self._n_dropped += 1
-            self._jobs.append(job)
-            self._changed.notify()
+        self._jobs.put(job)
         self._report()
 
     def _report(self) -> None:
@@ -262,74 +261,36 @@ class Background:
         if self._n_dropped:
             raise OSError(f"{self._n_dropped:,} were dropped: at most {MAX_ROWS:,} can wait")
 
-    def _next(self) -> Callable[[], object] | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._jobs or self._closing.is_set())
-            return self._jobs[0] if self._jobs else None
-
     def _work(self) -> None:
-        while job := self._next():
-            try:
-                job()
-            except Exception as error:  # of any kind, as each library has its own
-                self._error = error
+        while (job := self._jobs.get()) is not None:
+            while not self._is_done(job):
                 if self._closing.is_set():
                     return
                 self._closing.wait(RETRY_SECONDS)
-            else:
-                self._error = None
-                self._jobs.popleft()
+
+    def _is_done(self, job: Callable[[], object]) -> bool:
+        try:
+            job()
+        except Exception as error:  # of any kind, as each library has its own
+            self._error = error
+            return False
+        self._error = None
+        return True
 
 
-def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Returns a nested mapping with dotted names.
+def imported(kind: str) -> Any:
+    """Returns the package of a tracker: ``"wandb"``, ``"mlflow"`` or ``"trackio"``.
 
-    >>> flat({"gamma": 0.9, "policy_kwargs": {"net_arch": [64]}})
-    {'gamma': 0.9, 'policy_kwargs.net_arch': [64]}
+    Raises:
+        MissingExtra: if it is not installed.
     """
-    result: dict[str, Any] = {}
-    for name, value in config.items():
-        if isinstance(value, Mapping) and value:
-            result |= flat(value, f"{prefix}{name}.")
+    try:
+        if kind == "wandb":
+            import wandb as package
+        elif kind == "mlflow":
+            import mlflow as package
         else:
-            result[f"{prefix}{name}"] = value
-    return result
-
-
-def import_wandb() -> Any:
-    """Returns the package.
-
-    Raises:
-        MissingExtra: if it is not installed.
-    """
-    try:
-        import wandb
+            import trackio as package
     except ImportError:
-        raise MissingExtra("logging to Weights & Biases", "wandb", "wandb") from None
-    return wandb
-
-
-def import_mlflow() -> Any:
-    """Returns the package.
-
-    Raises:
-        MissingExtra: if it is not installed.
-    """
-    try:
-        import mlflow
-    except ImportError:
-        raise MissingExtra("logging to MLflow", "mlflow", "mlflow") from None
-    return mlflow
-
-
-def import_trackio() -> Any:
-    """Returns the package.
-
-    Raises:
-        MissingExtra: if it is not installed.
-    """
-    try:
-        import trackio
-    except ImportError:
-        raise MissingExtra("logging to Trackio", "trackio", "trackio") from None
-    return trackio
+        raise MissingExtra(f"the log {kind!r}", kind, kind) from None
+    return package

@@ -12,7 +12,7 @@ from rejeu.envs.checker import findings
 from rejeu.envs.functional import make
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.functional.registry import REGISTRY
-from rejeu.reporting.video import display_for_pygame
+from rejeu.envs.rendering import display_for_pygame
 
 IDS = [*REGISTRY]
 

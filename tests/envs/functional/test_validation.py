@@ -122,8 +122,11 @@ def test_a_wrong_reset_is_named(begin, said):
     ("mask", "said"),
     [
         (lambda x: jnp.ones(3) if x[0] > 0 else None, "Walk.action_mask cannot be compiled"),
-        (lambda x: jnp.ones((2, 1), bool), r"Walk.action_mask returned bool\[2, 1\], expected a bool for each"),
-        (lambda x: jnp.ones(3), r"Walk.action_mask returned float32\[3\], expected a bool for each"),
+        (
+            lambda x: jnp.ones((2, 1), bool),
+            r"Walk.action_mask returned the mask as bool\[2, 1\], expected a bool for each",
+        ),
+        (lambda x: jnp.ones(3), r"Walk.action_mask returned the mask as float32\[3\], expected a bool for each"),
     ],
 )
 def test_a_wrong_mask_is_named(mask, said):

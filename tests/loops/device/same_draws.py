@@ -36,14 +36,16 @@ class SameDraws:
         """Returns the random actions of other spaces."""
         return np.asarray(self._random_action(size if isinstance(size, int) else size[0]), dtype)
 
-    def random(self, n: int) -> np.ndarray:
+    def random(self, shape: int | tuple[int, ...]) -> np.ndarray:
         """Returns numbers in [0, 1) that stand for rows: at first those of a batch, then of rows that are drawn again."""
         if self.step != self.run.step:
             self.step, self.batches = self.run.step, 0
         key = jax.random.fold_in(self._root(), self.batches)
         key = jax.random.fold_in(jax.random.fold_in(key, self.part), self.calls)
         self.calls += 1
-        size = self.sizes[self.part]
+        if isinstance(shape, tuple) and len(shape) > 1:
+            return np.asarray(jax.random.bits(key, shape, jnp.uint32), np.float64) / 2.0**32
+        size, n = self.sizes[self.part], shape[0] if isinstance(shape, tuple) else shape
         return np.asarray(jax.random.bits(key, (size,), jnp.uint32), np.float64)[:n] / 2.0**32
 
     def shuffle(self, index: np.ndarray) -> None:

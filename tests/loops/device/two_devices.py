@@ -20,7 +20,6 @@ from tests.agents.test_together import ON_POLICY, SMALL, assert_same_runs
 CASES: dict[str, Any] = {
     "replay on the device": (rejeu.DQN, "jax/CartPole-v1", SMALL),
     "rollouts on the device": (rejeu.PPO, "jax/CartPole-v1", ON_POLICY),
-    "environments on the host, one device": (rejeu.TD3, "Pendulum-v1", {**SMALL, "action_noise": 0.1}),
 }
 
 

@@ -14,9 +14,11 @@ from rejeu.agents.outputs import record
 from rejeu.cli import main
 from rejeu.errors import MissingExtra
 from rejeu.loops.run import Episode
+from rejeu.reporting import charts
 from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.report import curves, page, write_report
+from rejeu.reporting.report import page, write_report
 from rejeu.reporting.runs import Episodes
+from rejeu.reporting.tables import EMPTY
 from tests.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
 
@@ -45,7 +47,7 @@ def test_page_of_a_run(tmp_path):
     assert "50.0 %" in text
     assert "return 160.00 (155.68 to 164.32)" in text  # 160 +- 2.093 * 9 / sqrt(19)
     assert "Final evaluation, step 3,000" in text
-    assert "rejeu train CartPole-v1 --algo DQN --steps 3000 --seed 3" in text
+    assert "rejeu train CartPole-v1 --algo DQN --steps 3000 --envs 2 --backend gymnasium --seed 3" in text
     assert "default 0.99" in text
     assert "linear: start 0.001, end 0.0" in text
     data = data_of(text)
@@ -157,12 +159,12 @@ def test_million_episodes_are_binned(tmp_path):
     episodes = Episodes(
         np.arange(n) * 10.0, np.zeros(n), returns, np.full(n, 10.0), np.full(n, np.nan), np.arange(n) / 1e4
     )
-    curve = curves.smooth(episodes, returns)
-    assert len(curve.step) == curves.MAX_POINTS
+    curve = charts.smooth(episodes, returns)
+    assert len(curve.step) == charts.MAX_POINTS
     np.testing.assert_allclose(curve.mean[0], returns[:2500].mean())
-    histogram = curves.histogram(returns, {"episode": np.arange(n)})
+    histogram = charts.histogram(returns, {"episode": np.arange(n)})
     assert sum(histogram["counts"]) == n
-    assert max(map(len, histogram["rows"])) == curves.LISTED
+    assert max(map(len, histogram["rows"])) == charts.LISTED
 
 
 def test_commands_of_a_page_make_the_environment_again(tmp_path):
@@ -176,13 +178,17 @@ def test_commands_of_a_page_make_the_environment_again(tmp_path):
 
 
 def test_legend_and_note_name_the_same_number_of_episodes():
-    assert f"about {curves.window_of(4571)}" in curves.binned_note(4571)
+    n = 45_710
+    episodes = Episodes(*[np.arange(n) * 1.0] * 6)
+    chart = charts.episode_chart(episodes, EMPTY, "length")
+    assert chart["series"][-1]["name"] == "mean of 114 episodes"
+    assert chart["note"].endswith(" 114")
 
 
 def test_moving_average_and_its_interval():
     values = np.array([1.0, 3.0, 2.0, 6.0, np.nan, 4.0])
     episodes = Episodes(np.arange(6.0), *[np.zeros(6)] * 5)
-    curve = curves.smooth(episodes, values)  # a window of 3
+    curve = charts.smooth(episodes, values)  # a window of 3
     np.testing.assert_allclose(curve.mean, [1, 2, 2, 11 / 3, 4])
     deviation = np.std([2.0, 6.0, 4.0], ddof=1) / np.sqrt(3)
     np.testing.assert_allclose(curve.high[-1] - curve.mean[-1], 1.959964 * deviation)
@@ -191,7 +197,7 @@ def test_moving_average_and_its_interval():
 
 def test_interval_of_a_single_episode_is_unknown_and_large_returns_keep_their_deviation():
     values = 1e9 + np.array([0.0, 1.0, 0.0, 1.0])
-    curve = curves.smooth(Episodes(np.arange(4.0), *[np.zeros(4)] * 5), values)
+    curve = charts.smooth(Episodes(np.arange(4.0), *[np.zeros(4)] * 5), values)
     assert np.isnan(curve.low[0])
     np.testing.assert_allclose(
         (curve.high - curve.mean)[2], 1.959964 * np.std([0, 1, 0], ddof=1) / np.sqrt(3), rtol=1e-5
@@ -199,7 +205,7 @@ def test_interval_of_a_single_episode_is_unknown_and_large_returns_keep_their_de
 
 
 def test_episodes_behind_a_bar_have_their_exact_steps():
-    histogram = curves.histogram(np.array([0.5]), {"episode": np.array([1.0]), "step": np.array([12_345_678.0])})
+    histogram = charts.histogram(np.array([0.5]), {"episode": np.array([1.0]), "step": np.array([12_345_678.0])})
     (row,) = [row for rows in histogram["rows"] for row in rows]
     assert row == [1, 12_345_678]
 

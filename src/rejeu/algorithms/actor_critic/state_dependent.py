@@ -14,6 +14,9 @@ from rejeu.core import Clock, Explorer, PyTree
 def sde_explorer(n_steps: int) -> Explorer:
     """Returns exploration by state-dependent noise (gSDE), whose matrix is sampled every ``n_steps``, or -1: in every episode.
 
+    An episode that continues after an update keeps its matrix with -1, which was drawn with the standard deviation from
+    before the update, while the update's log-probabilities use the new one.
+
     The carry is each environment's matrix ``(n_envs, width, action_dim)`` and its age in steps ``int32 (n_envs,)``.
     """
 

@@ -3,8 +3,16 @@
 from gymnasium import spaces
 
 from rejeu.algorithms.ddpg import continuous, discrete
-from rejeu.algorithms.ddpg.continuous import action_value, actor_loss, critic_loss, policy, td_target
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State
+from rejeu.algorithms.ddpg.continuous import (
+    HIDDEN_LAYERS,
+    Config,
+    State,
+    action_value,
+    actor_loss,
+    critic_loss,
+    policy,
+    td_target,
+)
 from rejeu.core import Algorithm
 
 __all__ = [

@@ -21,7 +21,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import network_inputs
-from rejeu.algorithms.ddpg.state import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
+from rejeu.algorithms.ddpg.continuous import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
 from rejeu.algorithms.sac.discrete import exploit, explore
 from rejeu.core import (
     Algorithm,
@@ -43,7 +43,7 @@ ENTROPY_COEFFICIENT = 0.01
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
     """Returns DDPG for Discrete actions."""
     obs_leaves, shape = network_inputs(config, observation_space)
-    n_actions, optimizer = int(action_space.n), optimizers.make(config.optimizer)
+    n_actions, optimizer = int(action_space.n), optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)

@@ -3,8 +3,17 @@
 from gymnasium import spaces
 
 from rejeu.algorithms.sac import continuous, discrete
-from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, Config, State, actor_loss, critics_loss, policy, td_target
-from rejeu.algorithms.sac.temperature import initial_temperature, temperature_loss
+from rejeu.algorithms.sac.continuous import (
+    LOG_STD_RANGE,
+    Config,
+    State,
+    actor_loss,
+    critics_loss,
+    initial_temperature,
+    policy,
+    td_target,
+    temperature_loss,
+)
 from rejeu.core import Algorithm
 
 __all__ = [

@@ -7,16 +7,19 @@ critics ``Q'_i``, temperature ``alpha`` and discount ``d`` (0 where the MDP term
     y           = r + d (min_i Q'_i(s', a') - alpha log pi(a' | s')),       a' ~ pi(. | s')
     J_Q         = mean_i mean (Q_i(s, a) - y)^2 / 2
     J_pi        = mean (alpha log pi(a | s) - min_i Q_i(s, a)),             a ~ pi(. | s), reparameterized
-    J_alpha     = -mean log_alpha (log pi(a | s) + target_entropy)
+    J_alpha     = -mean log_alpha (log pi(a | s) + target_entropy)      unless the temperature is fixed
     Q'_i       <- Q'_i + tau (Q_i - Q'_i)
 
 One update takes these steps in this order: critics, actor (against the new critics), temperature, targets. The actor and
 the temperature share one sample of actions, and the losses use the temperature from before the update, as in
-Stable-Baselines3. The critics' losses are summed over the critics, which gives each the gradient of its own ``J_Q``.
+Stable-Baselines3. The critics' losses are summed over the critics, which gives each the gradient of its own ``J_Q``. As in
+Stable-Baselines3, the temperature's loss is written in ``log alpha`` rather than ``alpha``. TQC and CrossQ share the
+temperature.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -24,21 +27,22 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.sac import temperature
-from rejeu.algorithms.sac.temperature import EntropyConfig, metrics_of
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import (
     AVERAGED,
+    TD_ERROR,
     Algorithm,
     Clock,
     Metrics,
+    Optimizer,
     PyTree,
     Transition,
     copy,
+    descend,
     ensemble,
     minimize,
     polyak,
@@ -51,7 +55,7 @@ from rejeu.networks import Network, QNetwork, action_values, values_by_critics
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import coerce, whole
+from rejeu.validation import coerce, number, whole
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
@@ -59,6 +63,37 @@ LOG_STD_RANGE = (-20.0, 2.0)
 
 HIDDEN_LAYERS = (256, 256)
 """Default widths of actor and critics."""
+ALPHA_OPTIMIZER = optimizers.make("adam")
+"""Of the temperature, whatever the optimizer of the networks is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EntropyConfig(OffPolicyConfig):
+    """The hyperparameters of algorithms with an entropy bonus and several critics. Abstract."""
+
+    ent_coef: float | str = "auto"
+    """Temperature of the entropy bonus: ``"auto"`` learns it from 1, ``"auto_0.1"`` from 0.1, a number fixes it. A larger
+    value explores more."""
+    target_entropy: float | str = "auto"
+    """Target entropy in nats for learning the temperature. ``"auto"`` is minus the number of action dimensions; for n
+    Discrete actions 0.3 log n (the paper's 0.98 log n keeps the policy nearly uniform)."""
+    n_critics: int = 2
+    """Number of critics."""
+
+    def __post_init__(self) -> None:
+        OffPolicyConfig.__post_init__(self)
+        initial_temperature(self.ent_coef)
+        coerce(self, "target_entropy", lambda key, value: value if value == "auto" else number(key, value))
+        coerce(self, "n_critics", whole, least=1)
+
+    def entropy_target(self, automatic: float) -> float:
+        """Returns the target entropy in nats, ``automatic`` for ``"auto"``."""
+        return automatic if self.target_entropy == "auto" else float(self.target_entropy)
+
+    @property
+    def learns_temperature(self) -> bool:
+        """Whether the temperature is learned."""
+        return isinstance(self.ent_coef, str)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +132,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, shape = leaves(observation_space), config.policy_kwargs
     target_entropy = config.entropy_target(-float(action_dim))
-    optimizer = optimizers.make(config.optimizer)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array) -> QNetwork:
         return QNetwork(key, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
@@ -131,14 +166,14 @@ def initial_state(
     n_outputs: int,
     make_critic: Callable[[Array], Any],
     config: EntropyConfig,
-    optimizer: optax.GradientTransformation,
+    optimizer: Optimizer,
 ) -> State:
     """Returns the state before the first update: an actor of ``n_outputs``, and ``config.n_critics`` critics."""
     actor_key, critics_key, update_key = jax.random.split(key, 3)
     shape = config.policy_kwargs
     actor = Network(actor_key, obs_leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape)
     critics = ensemble(make_critic, critics_key, config.n_critics)
-    log_alpha, alpha_optimizer = temperature.initial(config)
+    log_alpha, alpha_optimizer = initial_alpha(config)
     return State(
         actor=actor,
         critics=critics,
@@ -172,7 +207,7 @@ def temperature_and_targets(
         config: gives ``tau`` and ``target_update_interval``.
         rate: the learning rate.
     """
-    log_alpha, alpha_optimizer = temperature.temperature_step(
+    log_alpha, alpha_optimizer = temperature_step(
         state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
     )
     n_updates = state.n_updates + 1
@@ -224,3 +259,65 @@ def actor_loss(actor: Network, critics: QNetwork, alpha: Array, obs: PyTree, key
     action, log_prob = policy(actor, obs).sample_and_log_prob(key)
     value = jnp.min(action_values(critics, obs, action), axis=0)
     return jnp.mean(alpha * log_prob - value), log_prob
+
+
+def initial_temperature(ent_coef: float | str) -> float:
+    """Returns the initial temperature: 1 for ``"auto"``, x for ``"auto_x"`` and for x.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(ent_coef, str):
+        rest = ent_coef.removeprefix("auto").removeprefix("_")
+        try:
+            value = float(rest) if rest else 1.0
+        except ValueError:
+            value = -1.0
+        if ent_coef.startswith("auto") and 0 < value < math.inf:
+            return value
+    elif not isinstance(ent_coef, bool) and isinstance(ent_coef, int | float) and 0 < ent_coef < math.inf:
+        return float(ent_coef)
+    raise ValueError(f"ent_coef={ent_coef!r} must be 'auto', 'auto_0.1' or a positive number")
+
+
+def initial_alpha(config: EntropyConfig) -> tuple[Array, PyTree]:
+    """Returns the initial logarithm of the temperature, and the state of its optimizer."""
+    log_alpha = jnp.log(jnp.float32(initial_temperature(config.ent_coef)))
+    return log_alpha, ALPHA_OPTIMIZER.init(log_alpha)
+
+
+def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Array:
+    """Returns the loss that raises the temperature while the policy's entropy is below its target."""
+    return -jnp.mean(log_alpha * (jax.lax.stop_gradient(log_prob) + target_entropy))
+
+
+def temperature_step(
+    log_alpha: Array, optimizer_state: PyTree, log_prob: Array, target_entropy: float, config: EntropyConfig, rate: Any
+) -> tuple[Array, PyTree]:
+    """Returns the temperature's logarithm and optimizer state after one step, unchanged if the temperature is fixed."""
+    if not config.learns_temperature:
+        return log_alpha, optimizer_state
+    gradient = jax.grad(temperature_loss)(log_alpha, log_prob, target_entropy)
+    return descend(log_alpha, gradient, optimizer_state, ALPHA_OPTIMIZER, rate)
+
+
+def metrics_of(
+    critic_loss: Array,
+    actor_loss: Array,
+    alpha: Array,
+    entropy: Array,
+    values: Array,
+    target: Array,
+    target_entropy: float,
+    config: EntropyConfig,
+) -> Metrics:
+    """Returns the metrics of an update, from the values ``(n_critics, batch)`` and their targets ``(batch,)``."""
+    loss = {"ent_coef_loss": jnp.log(alpha) * (entropy - target_entropy)} if config.learns_temperature else {}
+    return loss | {
+        "critic_loss": critic_loss,
+        "actor_loss": actor_loss,
+        "ent_coef": alpha,
+        "entropy": entropy,
+        "q_value": jnp.mean(values),
+        TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
+    }

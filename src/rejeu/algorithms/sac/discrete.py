@@ -22,8 +22,14 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.sac.continuous import HIDDEN_LAYERS, Config, State, initial_state, temperature_and_targets
-from rejeu.algorithms.sac.temperature import metrics_of
+from rejeu.algorithms.sac.continuous import (
+    HIDDEN_LAYERS,
+    Config,
+    State,
+    initial_state,
+    metrics_of,
+    temperature_and_targets,
+)
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
 from rejeu.networks import Network
 from rejeu.schedules import at
@@ -37,7 +43,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     """Returns SAC for Discrete actions."""
     obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
     target_entropy = config.entropy_target(TARGET_ENTROPY_SHARE * math.log(n_actions))
-    optimizer = optimizers.make(config.optimizer)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array) -> Network:
         return Network(key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)

@@ -1,14 +1,16 @@
-"""What the checks of all courses share: languages, calling the student's code, comparing numbers."""
+"""What the checks of all courses share: messages, calling the student's code, comparing numbers."""
 
 from __future__ import annotations
 
 import copy
 import sysconfig
+import tomllib
 import traceback
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
+from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,19 +27,18 @@ NOT_COMPILED = (
 """Errors of code that JAX cannot compile."""
 
 
-class Text(NamedTuple):
-    """A message in every language."""
-
-    en: str
-    fr: str
-
-
 class Wrong(Exception):
-    """The student's answer is not right; the message says what was seen."""
+    """The student's answer is not right.
 
-    def __init__(self, en: str, fr: str) -> None:
-        super().__init__(en)
-        self.text = Text(en, fr)
+    Args:
+        key: name of the message, which says what was seen. It is in the section of the exercise, or in ``[shared]``.
+        values: what replaces the names in braces in the message.
+    """
+
+    def __init__(self, key: str, **values: Any) -> None:
+        super().__init__(key)
+        self.key = key
+        self.values = values
 
 
 class NotReady(Exception):
@@ -52,14 +53,31 @@ class Session:
 
     def __init__(self) -> None:
         self.language: Language = "en"
-        self.passed: set[str] = set()
+        self.found: dict[str, str] = {}
+        """What each check found, by its name: nothing if the answer is right, else the message."""
 
-    def say(self, text: Text) -> str:
-        """Returns a text in the language of the notebook."""
-        return text.fr if self.language == "fr" else text.en
+    def say(self, key: str, course: str = "base", exercise: str = "shared", **values: Any) -> str:
+        """Returns a message in the language of the notebook.
+
+        Args:
+            key: name of the message.
+            course: module of the checks.
+            exercise: name of the check; messages of its course, and those of all courses, are found as well.
+            values: what replaces the names in braces.
+        """
+        sections = (messages(course).get(exercise, {}), messages(course).get("shared", {}), messages("base")["shared"])
+        text = next(section[key] for section in sections if key in section)
+        return text[self.language].format(**values)
 
 
 SESSION = Session()
+
+
+@cache
+def messages(course: str) -> dict[str, dict[str, dict[Language, str]]]:
+    """Returns the messages of a course by exercise, name and language, from the file next to its module."""
+    file = resources.files("rejeu.courses.checks") / f"{course}.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8"))
 
 
 def speak(language: Language) -> None:
@@ -71,7 +89,7 @@ def speak(language: Language) -> None:
     if language not in LANGUAGES:
         raise ValueError(f"language {language!r} must be one of {', '.join(LANGUAGES)}")
     SESSION.language = language
-    SESSION.passed.clear()
+    SESSION.found.clear()
 
 
 class Verdict(int):
@@ -83,51 +101,39 @@ class Verdict(int):
 
 def exercise(check: Callable[..., None]) -> Callable[..., Verdict]:
     """Makes a check of a function that raises :class:`Wrong`: it prints one line and returns whether the answer is right."""
-    name = check.__name__
+    name, course = check.__name__, check.__module__.rpartition(".")[2]
 
     @wraps(check)
     def checked(*args: Any, **kwargs: Any) -> Verdict:
         try:
             check(*args, **kwargs)
+        except Wrong as error:
+            found = SESSION.say(error.key, course, name, **error.values)
         except Exception as error:
-            text = error.text if isinstance(error, Wrong) else _unusable(error)
-            SESSION.passed.discard(name)
-            print(f"{SESSION.say(Text('Not yet', 'Pas encore'))} - {name}{_colon()} {SESSION.say(text)}")
-            return Verdict(False)
-        SESSION.passed.add(name)
-        print(f"OK - {name}")
-        return Verdict(True)
+            found = SESSION.say("unusable", what=f"{type(error).__name__}: {short(error)}")
+        else:
+            found = ""
+        SESSION.found[name] = found
+        print(SESSION.say("not_yet", name=name, found=found) if found else f"OK - {name}")
+        return Verdict(not found)
 
     return checked
 
 
-def _unusable(error: Exception) -> Text:
-    """Returns what to say if an answer is of a kind that the check cannot even look at."""
-    what = f"{type(error).__name__}: {_short(error)}"
-    return Text(
-        f"the check cannot use your answer ({what}). Is it of the kind that the exercise asks for?",
-        f"la vérification ne peut pas utiliser votre réponse ({what}). Est-elle de la sorte que demande l'exercice ?",
-    )
-
-
-def require(*names: str) -> None:
+def require(*names: str, **answers: Any) -> None:
     """Stops the notebook with one line unless these checks have been passed.
+
+    Args:
+        *names: names of checks.
+        **answers: values that must have replaced the ``...`` of the exercise, by their names.
 
     Raises:
         NotReady: if one has not.
     """
-    missing = [name for name in names if name not in SESSION.passed]
+    missing = [name for name in names if SESSION.found.get(name, "not run")]
+    missing += [name for name, value in answers.items() if value is ...]
     if missing:
-        listed = ", ".join(missing)
-        raise NotReady(
-            SESSION.say(
-                Text(
-                    f"This cell needs your {listed}: complete it above and run its check first.",
-                    f"Cette cellule a besoin de votre réponse à {listed} : complétez-la plus haut et lancez d'abord sa "
-                    "vérification.",
-                )
-            )
-        )
+        raise NotReady(SESSION.say("missing", names=", ".join(missing)))
 
 
 def call(student: Any, *args: Any, may_return_none: bool = False, copies: bool = True) -> Any:
@@ -143,30 +149,17 @@ def call(student: Any, *args: Any, may_return_none: bool = False, copies: bool =
         Wrong: if it is not a function, raises an exception, changes its arguments, or returns ``None`` or ``...``.
     """
     if not callable(student):
-        raise Wrong(
-            f"a function was expected, not {_short(student)}.", f"il faut une fonction, et non {_short(student)}."
-        )
+        raise Wrong("not_a_function", what=short(student))
     given = copy.deepcopy(args) if copies else args
     try:
         result = student(*given)
     except (Exception, SystemExit) as error:
-        what, where = f"{type(error).__name__}: {_short(error)}", _line(error)
-        raise Wrong(
-            f"your code raises {what}{where and f' in the line: {where}'}",
-            f"votre code lève {what}{where and f' à la ligne : {where}'}",
-        ) from None
+        what, line = f"{type(error).__name__}: {short(error)}", line_of(error)
+        raise Wrong("raises_in_line" if line else "raises", what=what, line=line) from None
     if not _same(args, given):
-        raise Wrong(
-            "the result may be right, but your function changes the arrays it was given. Compute new ones: the "
-            "caller still needs the old ones.",
-            "le résultat est peut-être juste, mais votre fonction modifie les tableaux reçus. Calculez-en de "
-            "nouveaux : l'appelant a encore besoin des anciens.",
-        )
+        raise Wrong("changes_arguments")
     if (result is None and not may_return_none) or result is ...:
-        raise Wrong(
-            f"it returns {_short(result)}. Replace the ... by your code, and do not forget return.",
-            f"elle renvoie {_short(result)}. Remplacez les ... par votre code, et n'oubliez pas return.",
-        )
+        raise Wrong("returns_nothing", what=short(result))
     return result
 
 
@@ -179,13 +172,8 @@ def compiles(student: Any, *args: Any) -> None:
     try:
         jax.jit(student)(*args)
     except NOT_COMPILED as error:
-        line = _line(error)
-        raise Wrong(
-            "the numbers are right, but JAX cannot compile the function for training. Use jnp instead of np, and jnp.where "
-            f"instead of if{line and f': {line}'}",
-            "les nombres sont justes, mais JAX ne peut pas compiler la fonction pour l'entraînement. Utilisez jnp au lieu de "
-            f"np, et jnp.where au lieu de if{line and f' : {line}'}",
-        ) from None
+        line = line_of(error)
+        raise Wrong("not_compiled_line" if line else "not_compiled", line=line) from None
 
 
 def numbers(result: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -197,60 +185,66 @@ def numbers(result: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.asarray(result, float)
     except (TypeError, ValueError):
-        raise Wrong(
-            f"numbers of shape {shape} were expected, not {_short(result)}.",
-            f"il faut des nombres de forme {shape}, et non {_short(result)}.",
-        ) from None
+        raise Wrong("not_numbers", shape=shape, what=short(result)) from None
     n = shape[0] if shape else 0
     if n > 1 and array.shape == (n, n) != shape:
-        raise Wrong(
-            f"the shape is {array.shape}, expected {shape}. A column of shape ({n}, 1) and a row of shape ({n},) "
-            "were combined: NumPy and JAX then combine every element with every other one. Print the shapes of "
-            "both, and remove the extra axis.",
-            f"la forme est {array.shape} au lieu de {shape}. Une colonne de forme ({n}, 1) et une ligne de forme "
-            f"({n},) ont été combinées : NumPy et JAX combinent alors chaque élément avec tous les autres. Affichez "
-            "les deux formes et supprimez l'axe en trop.",
-        )
+        raise Wrong("shape_of_pairs", seen=array.shape, shape=shape, n=n)
     if array.shape != shape:
-        mean = shape == () and array.ndim == 1
-        raise Wrong(
-            f"the shape is {array.shape}, expected {shape}" + (": one number, such as a mean." if mean else "."),
-            f"la forme est {array.shape} au lieu de {shape}"
-            + (" : il faut un seul nombre, par exemple une moyenne." if mean else "."),
-        )
+        is_mean = shape == () and array.ndim == 1
+        raise Wrong("shape_not_mean" if is_mean else "shape", seen=array.shape, shape=shape)
     if not np.isfinite(array).all():
-        raise Wrong(
-            f"the result is not finite: {_rounded(array)}. Is there a division by 0, or the logarithm of 0?",
-            f"le résultat n'est pas fini : {_rounded(array)}. Y a-t-il une division par 0, ou le logarithme de 0 ?",
-        )
+        raise Wrong("not_finite", what=_rounded(array))
     return array
 
 
-def diagnose(result: np.ndarray, right: Any, *mistakes: tuple[Any, Text]) -> None:
-    """Raises :class:`Wrong` unless a result is right, with the text of the first mistake whose result it is.
+def diagnose(result: np.ndarray, right: Any, /, **wrong: Any) -> None:
+    """Raises :class:`Wrong` unless a result is right, with the message of the first mistake whose result it is.
 
     Args:
         result: from :func:`numbers`.
         right: the right result.
-        mistakes: results of typical mistakes, and what to say about them.
+        wrong: results of typical mistakes, by the name of the message.
     """
     if close(result, right):
         return
-    for wrong, text in mistakes:
-        if close(result, wrong):
-            raise Wrong(*text)
-    raise Wrong(
-        f"in a small case it gives {_rounded(result)}, but by hand one finds {_rounded(right)}. Compare your code "
-        "with the equation, term by term.",
-        f"dans un petit cas, elle donne {_rounded(result)}, alors qu'à la main on trouve {_rounded(right)}. Comparez "
-        "votre code à l'équation, terme à terme.",
-    )
+    for key, of_mistake in wrong.items():
+        if close(result, of_mistake):
+            raise Wrong(key)
+    raise Wrong("by_hand", seen=_rounded(result), right=_rounded(right))
+
+
+def mistakes(**seen: Any) -> None:
+    """Raises :class:`Wrong` with the message of the first mistake that was seen.
+
+    Args:
+        seen: whether each mistake was seen, by the name of its message.
+    """
+    for key, is_seen in seen.items():
+        if is_seen:
+            raise Wrong(key)
 
 
 def close(a: Any, b: Any) -> bool:
     """Returns whether two arrays have the same shape and, up to single precision, the same numbers."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-4, atol=1e-5))
+
+
+def short(value: Any) -> str:
+    """Returns a value as text on one line of at most 160 characters."""
+    text = "..." if value is ... else " ".join(str(value).split())
+    return text if len(text) <= 160 else text[:157] + "..."
+
+
+def line_of(error: BaseException) -> str:
+    """Returns the innermost line of the student's code at which an error was raised, empty if it is unknown."""
+    lines = [frame.line or "" for frame in traceback.extract_tb(error.__traceback__) if _is_students(frame.filename)]
+    return lines[-1] if lines else ""
+
+
+def _is_students(file: str) -> bool:
+    """Returns whether a file belongs to no installed package: a cell of a notebook, or a script."""
+    return "site-packages" not in file and not any(Path(file).is_relative_to(folder) for folder in NOT_STUDENTS)
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -263,25 +257,5 @@ def _same(a: Any, b: Any) -> bool:
     return True
 
 
-def _line(error: BaseException) -> str:
-    """Returns the innermost line of the student's code at which an error was raised, empty if it is unknown."""
-    lines = [frame.line or "" for frame in traceback.extract_tb(error.__traceback__) if _is_students(frame.filename)]
-    return lines[-1] if lines else ""
-
-
-def _is_students(file: str) -> bool:
-    """Returns whether a file belongs to no installed package: a cell of a notebook, or a script."""
-    return "site-packages" not in file and not any(Path(file).is_relative_to(folder) for folder in NOT_STUDENTS)
-
-
-def _short(value: Any) -> str:
-    text = "..." if value is ... else " ".join(str(value).split())
-    return text if len(text) <= 160 else text[:157] + "..."
-
-
 def _rounded(values: Any) -> str:
     return " ".join(np.array2string(np.asarray(values, float), precision=3, threshold=12, separator=", ").split())
-
-
-def _colon() -> str:
-    return "\N{NO-BREAK SPACE}:" if SESSION.language == "fr" else ":"

@@ -6,25 +6,27 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.envs.ball.drawing import BallDrawing
+from rejeu.envs.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL, BallDrawing
+from rejeu.envs.canvas import Scene
 
 if TYPE_CHECKING:
-    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.plots.picture import Picture
 
-WALL = 10.0
-"""The box is [-WALL, WALL] in every dimension."""
-STRONGEST_PUSH = 2.0
-"""Actions and initial positions are in [-STRONGEST_PUSH, STRONGEST_PUSH]."""
 N_STEPS = 500
 """Time limit of an episode, in steps."""
-HELD_REWARD, LOST_REWARD = 50.0, -10.0
-"""Rewards of the last step of an episode. The reward of every other step is 1."""
+
+
+class Moment(NamedTuple):
+    """A state of an episode, to be drawn."""
+
+    position: tuple[float, ...]
+    time: int
 
 
 class Ball(gym.Env[np.ndarray, np.ndarray]):
@@ -85,7 +87,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self.sigma = float(sigma)
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-WALL, WALL, (dimension,), np.float32)
-        self.action_space = spaces.Box(-STRONGEST_PUSH, STRONGEST_PUSH, (dimension,), np.float32)
+        self.action_space = spaces.Box(-MAX_PUSH, MAX_PUSH, (dimension,), np.float32)
         self.position: list[float] = []
         """Position of the ball, not clipped to the box. Empty before the first reset."""
         self.n_steps = 0
@@ -101,7 +103,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode. Returns the position and an empty info."""
         super().reset(seed=seed)
-        self.position = self.np_random.uniform(-STRONGEST_PUSH, STRONGEST_PUSH, self.dimension).tolist()
+        self.position = self.np_random.uniform(-MAX_PUSH, MAX_PUSH, self.dimension).tolist()
         self.n_steps = 0
         self.over = False
         self._trail.clear()
@@ -122,7 +124,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         push = np.asarray(action, np.float64)
         if push.shape != (self.dimension,):
             raise ValueError(f"the action has the shape {push.shape}, expected ({self.dimension},)")
-        pushes = [min(max(p, -STRONGEST_PUSH), STRONGEST_PUSH) for p in push.tolist()]
+        pushes = [min(max(p, -MAX_PUSH), MAX_PUSH) for p in push.tolist()]
         kicks = self.np_random.standard_normal(self.dimension).tolist()
         position = [x + p + self.sigma * k for x, p, k in zip(self.position, pushes, kicks, strict=True)]
         lost = not all(-WALL <= x <= WALL for x in position)
@@ -198,8 +200,10 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode is None:
             raise ValueError("nothing is drawn without a render mode: gymnasium.make(..., render_mode='rgb_array')")
         if self._drawing is None:
-            self._drawing = BallDrawing(self.dimension, self.render_mode, self.metadata["render_fps"], WALL, N_STEPS)
-        return self._drawing.draw(self._trail, self._push, self.n_steps, self.over)
+            self._drawing = BallDrawing(self.dimension, N_STEPS, self.render_mode)
+        first = self.n_steps - len(self._trail) + 1
+        states = [Moment(position, first + i) for i, position in enumerate(self._trail)]
+        return self._drawing.draw(Scene(states, self._push or None, self.over))
 
     def close(self) -> None:
         """Closes the window if there is one."""

@@ -12,13 +12,9 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.envs.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.validation import whole
-
-WALL, MAX_PUSH = 10.0, 2.0
-"""The box is [-WALL, WALL] in every dimension; pushes and initial positions are in [-MAX_PUSH, MAX_PUSH]."""
-HELD_REWARD, LOST_REWARD = 50.0, -10.0
-"""Rewards of the last step of an episode. The reward of every other step is 1."""
 
 
 class State(NamedTuple):

@@ -2,46 +2,21 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs import classic_control
 
+from rejeu.envs.ball_drawing import BallDrawing
+from rejeu.envs.canvas import Canvas, Drawing, Scene
 from rejeu.envs.functional.parking import ROW_DISTANCE, spot
 from rejeu.envs.functional.point_maze import RADIUS, TOLERANCE
 from rejeu.envs.registry import make_env
-from rejeu.errors import MissingExtra
 
 PAPER, INK, FAINT = (246, 246, 243), (52, 58, 70), (214, 225, 240)
 AGENT, GOAL = (40, 104, 190), (38, 150, 96)
-
-
-class Scene(NamedTuple):
-    """What there is to draw."""
-
-    states: list[Any]
-    """The states of the episode up to now, as NumPy arrays."""
-    action: Any
-    """The last action; None after a reset."""
-    over: bool
-    """Whether the episode has ended."""
-
-
-class Drawing(ABC):
-    """A picture, or a window, of an environment."""
-
-    fps: float
-    """Frames per second at which an episode is shown."""
-
-    @abstractmethod
-    def draw(self, scene: Scene) -> np.ndarray | None:
-        """Returns ``uint8 (height, width, 3)``, or None if there is a window."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Closes the window if there is one."""
 
 
 class Original(Drawing):
@@ -61,24 +36,19 @@ class Original(Drawing):
         self.env.close()
 
 
-def cart_pole(env: Any, render_mode: str) -> Drawing:
-    """Returns the drawing of CartPole."""
-    return Original(classic_control.CartPoleEnv(render_mode=render_mode))
+def original(kind: Callable[..., gym.Env], *fields: str) -> Callable[[Any, str], Drawing]:
+    """Returns the drawing of an environment by one of Gymnasium, which gets these fields of ours."""
+
+    def make(env: Any, render_mode: str) -> Drawing:
+        return Original(kind(render_mode=render_mode, **{name: getattr(env, name) for name in fields}))
+
+    return make
 
 
-def pendulum(env: Any, render_mode: str) -> Drawing:
-    """Returns the drawing of Pendulum."""
-    return Original(classic_control.PendulumEnv(render_mode=render_mode))
-
-
-def mountain_car(env: Any, render_mode: str) -> Drawing:
-    """Returns the drawing of both MountainCars."""
-    return Original(classic_control.MountainCarEnv(render_mode=render_mode, goal_velocity=env.goal_velocity))
-
-
-def acrobot(env: Any, render_mode: str) -> Drawing:
-    """Returns the drawing of Acrobot."""
-    return Original(classic_control.AcrobotEnv(render_mode=render_mode))
+acrobot = original(classic_control.AcrobotEnv)
+cart_pole = original(classic_control.CartPoleEnv)
+mountain_car = original(classic_control.MountainCarEnv, "goal_velocity")
+pendulum = original(classic_control.PendulumEnv)
 
 
 class ParkingLot(Drawing):
@@ -86,7 +56,7 @@ class ParkingLot(Drawing):
 
     fps = 5.0
 
-    def __init__(self, render_mode: str) -> None:
+    def __init__(self, env: Any, render_mode: str) -> None:
         """Makes the environment.
 
         Raises:
@@ -109,52 +79,9 @@ class ParkingLot(Drawing):
         self.env.close()
 
 
-def parking(env: Any, render_mode: str) -> Drawing:
-    """Returns the drawing of Parking."""
-    return ParkingLot(render_mode)
-
-
-class Canvas(Drawing):
-    """A surface of pygame on which subclasses draw; a window for the render mode ``human``."""
-
-    def __init__(self, size: tuple[int, int], render_mode: str, title: str, fps: float) -> None:
-        """Prepares the surface, ``size`` pixels wide and high.
-
-        Raises:
-            MissingExtra: if pygame is not installed.
-        """
-        try:
-            import pygame
-        except ImportError:
-            raise MissingExtra(f"drawing {title}", "pygame-ce", "play") from None
-        self.pygame: Any = pygame
-        self.fps = fps
-        self.surface = pygame.Surface(size)
-        self.window: Any = None
-        self.clock = pygame.time.Clock()
-        if render_mode == "human":
-            pygame.display.init()
-            pygame.display.set_caption(title)
-            self.window = pygame.display.set_mode(size)
-
-    @abstractmethod
-    def paint(self, scene: Scene) -> None:
-        """Draws on the surface."""
-
-    def draw(self, scene: Scene) -> np.ndarray | None:
-        self.paint(scene)
-        if self.window is None:
-            return np.ascontiguousarray(self.pygame.surfarray.array3d(self.surface).swapaxes(0, 1))
-        self.pygame.event.pump()
-        self.window.blit(self.surface, (0, 0))
-        self.pygame.display.flip()
-        self.clock.tick(self.fps)
-        return None
-
-    def close(self) -> None:
-        if self.window is not None:
-            self.pygame.display.quit()
-            self.window = None
+def ball(env: Any, render_mode: str) -> Drawing:
+    """Returns the drawing of Ball."""
+    return BallDrawing(env.dimension, env.max_episode_steps or 500, render_mode)
 
 
 class Maze(Canvas):

@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from rejeu.envs.canvas import Drawing, Scene
 from rejeu.envs.functional import registry
-from rejeu.envs.functional.drawing import Drawing, Scene
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 
 if TYPE_CHECKING:
-    from rejeu.envs.functional.drawing import Drawing
+    from rejeu.envs.canvas import Drawing
     from rejeu.envs.functional.protocol import FunctionalEnv
 
 OWN = "rejeu.envs.functional"
@@ -44,10 +44,10 @@ REGISTRY: dict[str, Entry] = {
         f"{OWN}.mountain_car:MountainCarContinuous", 999, 90.0, f"{OWN}.drawing:mountain_car"
     ),
     "jax/Acrobot-v1": Entry(f"{OWN}.acrobot:Acrobot", 500, -100.0, f"{OWN}.drawing:acrobot"),
-    "jax/Ball-v0": Entry(f"{OWN}.ball:Ball", None, None, "rejeu.envs.ball.functional:BallScene"),
+    "jax/Ball-v0": Entry(f"{OWN}.ball:Ball", None, None, f"{OWN}.drawing:ball"),
     "jax/PointMaze-v0": Entry(f"{OWN}.point_maze:PointMaze", 200, None, f"{OWN}.drawing:Maze"),
     "jax/BitFlipping-v0": Entry(f"{OWN}.bit_flipping:BitFlipping", None, None, f"{OWN}.drawing:Bits"),
-    "jax/Parking-v0": Entry(f"{OWN}.parking:Parking", 500, None, f"{OWN}.drawing:parking"),
+    "jax/Parking-v0": Entry(f"{OWN}.parking:Parking", 500, None, f"{OWN}.drawing:ParkingLot"),
 }
 """The environments by id."""
 

@@ -37,26 +37,24 @@ def check(env: FunctionalEnv) -> None:
     if limit is not None:
         whole("max_episode_steps", limit.item() if isinstance(limit, np.generic) else limit, least=1)
     key = jax.eval_shape(lambda: jax.random.key(0))
-    state, obs = _unpack(_traced(f"{name}.reset", env.reset, key), 2, f"{name}.reset", "(state, obs)")
-    _check_obs(f"{name}.reset", env.observation_space, obs)
+    action = jax.ShapeDtypeStruct(env.action_space.shape or (), narrow(env.action_space.dtype))
+    said = f"{name}.reset"
+    state, obs = _unpack(_traced(said, env.reset, key), said, ("state", "obs"))
+    _check_obs(said, env.observation_space, obs)
     said = f"{name}.step"
-    after, obs, reward, terminated, truncated = _unpack(
-        _traced(said, env.step, key, state, _action(env.action_space)),
-        5,
-        said,
-        "(state, obs, reward, terminated, truncated)",
-    )
+    values = _traced(said, env.step, key, state, action)
+    after, obs, reward, *flags = _unpack(values, said, ("state", "obs", "reward", "terminated", "truncated"))
     _check_obs(said, env.observation_space, obs)
     _check_state(said, state, after)
-    _check_scalar(said, "reward", reward, "f")
-    _check_scalar(said, "terminated", terminated, "b")
-    _check_scalar(said, "truncated", truncated, "b")
+    _check_array(said, "reward", reward, (), "f")
+    for what, flag in zip(("terminated", "truncated"), flags, strict=True):
+        _check_array(said, what, flag, (), "b")
     success = _traced(f"{name}.success", env.success, after)
     if success is not None:
-        _check_scalar(f"{name}.success", "success", success, "b")
+        _check_array(f"{name}.success", "success", success, (), "b")
     mask = _traced(f"{name}.action_mask", env.action_mask, after)
     if mask is not None:
-        _check_mask(f"{name}.action_mask", mask)
+        _check_array(f"{name}.action_mask", "the mask", mask, getattr(mask, "shape", ())[:1] or (1,), "biu")
     if isinstance(env, GoalEnv):
         _check_goals(env, name)
     elif hasattr(env, "compute_reward"):
@@ -87,25 +85,17 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {reason[:150]}"
 
 
-def _unpack(answer: Any, n: int, said: str, expected: str) -> tuple[Any, ...]:
-    if not isinstance(answer, tuple) or len(answer) != n:
+def _unpack(answer: Any, said: str, names: tuple[str, ...]) -> tuple[Any, ...]:
+    if not isinstance(answer, tuple) or len(answer) != len(names):
         kind = "array" if isinstance(answer, jax.ShapeDtypeStruct) else type(answer).__name__
         what = f"{len(answer)} values" if isinstance(answer, tuple) else f"one {kind}"
-        raise BadEnvironmentError(f"{said} returned {what}, expected {expected}")
+        raise BadEnvironmentError(f"{said} returned {what}, expected ({', '.join(names)})")
     return answer
-
-
-def _action(space: spaces.Space) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(space.shape or (), narrow(space.dtype))
 
 
 def _check_obs(said: str, space: spaces.Space, obs: Any) -> None:
     """Compares an observation with its space, but accepts 64-bit floats, which occur with ``jax_enable_x64``."""
-    if jax.tree.structure(obs) != structure(space):
-        raise BadEnvironmentError(
-            f"{said} returned the observation {_shown(jax.tree.structure(obs))}, expected {_shown(structure(space))} as in "
-            "observation_space"
-        )
+    _check_structure(said, "observation", obs, structure(space), "as in observation_space")
     for leaf, array in zip(leaves(space), jax.tree.leaves(obs), strict=True):
         where = f" under {leaf.path!r}" if leaf.path else ""
         if array.shape != leaf.shape:
@@ -120,41 +110,41 @@ def _check_obs(said: str, space: spaces.Space, obs: Any) -> None:
 
 
 def _check_state(said: str, before: Any, after: Any) -> None:
-    trees: list[Any] = [jax.tree.structure(before), jax.tree.structure(after)]
-    if trees[0] != trees[1]:
-        raise BadEnvironmentError(
-            f"{said} returned the state {_shown(trees[1])}, expected {_shown(trees[0])} as from reset"
-        )
+    _check_structure(said, "state", after, jax.tree.structure(before), "as from reset")
     pairs = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
     for (path, old), new in pairs:
         if (old.shape, old.dtype) != (new.shape, new.dtype):
             raise BadEnvironmentError(
-                f"{said} changed state{jax.tree_util.keystr(path)} from {old.dtype}{list(old.shape)} in reset to "
-                f"{new.dtype}{list(new.shape)}; shapes and dtypes must stay the same"
+                f"{said} changed state{jax.tree_util.keystr(path)} from {_shown(old)} in reset to {_shown(new)}; shapes and "
+                "dtypes must stay the same"
             )
 
 
-def _shown(structure: Any) -> str:
-    """Returns the structure of a tree, in which every array is an asterisk."""
-    text = str(structure).removeprefix("PyTreeDef(").removesuffix(")")
-    return "one array" if text == "*" else f"{text[:200]}"
+def _check_structure(said: str, what: str, tree: Any, expected: Any, source: str) -> None:
+    """Compares the structures of trees, in which every array is an asterisk."""
+    seen = jax.tree.structure(tree)
+    if seen != expected:
+        texts = [str(one).removeprefix("PyTreeDef(").removesuffix(")") for one in (seen, expected)]
+        got, wanted = ("one array" if text == "*" else text[:200] for text in texts)
+        raise BadEnvironmentError(f"{said} returned the {what} {got}, expected {wanted} {source}")
 
 
-def _check_mask(said: str, mask: Any) -> None:
-    shape, dtype = getattr(mask, "shape", ()), getattr(mask, "dtype", None)
-    if len(shape) != 1 or np.dtype(dtype).kind not in "biu":
-        got = type(mask).__name__ if dtype is None else f"{dtype}{list(shape)}"
-        raise BadEnvironmentError(f"{said} returned {got}, expected a bool for each action, with one axis")
-
-
-def _check_scalar(said: str, what: str, value: Any, kind: str) -> None:
-    expected = {"f": "a float", "b": "a bool"}[kind]
+def _check_array(said: str, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:
+    """Checks the shape of an array, and that its dtype is of one of these kinds."""
     array = jax.eval_shape(lambda: value) if isinstance(value, bool | float | int) else value
-    if not hasattr(array, "shape") or array.shape != () or np.dtype(array.dtype).kind != kind:
-        got = f"{array.dtype}{list(array.shape)}" if hasattr(array, "shape") else f"{value!r:.60}"
-        raise BadEnvironmentError(
-            f"{said} returned {what} as {got}, expected {expected} without axes: index or convert it"
+    if getattr(array, "shape", None) != shape or np.dtype(array.dtype).kind not in kinds:
+        kind, axes = (
+            "a float" if kinds == "f" else "a bool",
+            "for each action, with one axis" if shape else "without axes",
         )
+        raise BadEnvironmentError(
+            f"{said} returned {what} as {_shown(array)}, expected {kind} {axes}: index or convert it"
+        )
+
+
+def _shown(value: Any) -> str:
+    """Returns dtype and shape of an array, and other values as text."""
+    return f"{value.dtype}{list(value.shape)}" if hasattr(value, "shape") else f"{value!r:.60}"
 
 
 def _check_goals(env: GoalEnv, name: str) -> None:

@@ -108,19 +108,20 @@ def split(env: FunctionalEnv) -> tuple[Any, Any]:
     return arrays, (tuple(leaves), tree)
 
 
-def _env(static: tuple[tuple[Any, ...], Any], arrays: Any) -> FunctionalEnv:
+def joined(static: tuple[tuple[Any, ...], Any], arrays: Any) -> FunctionalEnv:
+    """Returns the environment whose parts :func:`split` returned."""
     leaves, tree = static
     return eqx.combine(arrays, jax.tree.unflatten(tree, leaves))
 
 
 @partial(jax.jit, static_argnums=0)
 def _reset_streams(static: Any, arrays: Any, keys: Array) -> VectorState:
-    return reset_streams(_env(static, arrays), keys)
+    return reset_streams(joined(static, arrays), keys)
 
 
 @partial(jax.jit, static_argnums=0)
 def _step(static: Any, arrays: Any, vstate: VectorState, action: Any, active: Any) -> Any:
-    after, _, reward, terminated, truncated, success = step_all(_env(static, arrays), vstate, action)
+    after, _, reward, terminated, truncated, success = step_all(joined(static, arrays), vstate, action)
     if active is not None:
         after = select(active, after, vstate)
         reward = jnp.where(active, reward, jnp.zeros_like(reward))
@@ -130,7 +131,7 @@ def _step(static: Any, arrays: Any, vstate: VectorState, action: Any, active: An
 
 @partial(jax.jit, static_argnums=0)
 def _reset_done(static: Any, arrays: Any, vstate: VectorState, done: Any) -> VectorState:
-    return reset_done(_env(static, arrays), vstate, done)[0]
+    return reset_done(joined(static, arrays), vstate, done)[0]
 
 
 class JaxVector(VectorEnv):

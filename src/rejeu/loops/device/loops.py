@@ -12,7 +12,6 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.loops.device.driver import Stops, train
 from rejeu.loops.device.groups import Groups
-from rejeu.loops.device.host_machine import HostMachine
 from rejeu.loops.device.off_policy_machine import OffPolicyMachine
 from rejeu.loops.device.on_policy_machine import OnPolicyMachine
 from rejeu.loops.device.sharing import group_size
@@ -83,13 +82,8 @@ def together(
         active: see :func:`rejeu.loops.device.driver.train`.
         variants: what makes the algorithm, if hyperparameters differ.
         hyper: those that differ, by run.
-        devices: of which each computes some of the runs in JAX environments; none for JAX's default device.
+        devices: of which each computes some of the runs; none for JAX's default device.
     """
-    if runs[0].env.backend != "jax":
-        assert isinstance(config, OffPolicyConfig)
-        host = HostMachine(learner, config, active)
-        yield from train(host, runs, learner, n_steps, progress, stops, begin_episodes, active)
-        return
     size = group_size(len(runs), devices)
     by_run = {id(run): one for run, one in zip(runs, hyper or [{}] * len(runs), strict=True)}
     kind: Any = OnPolicyMachine if isinstance(config, RolloutConfig) else OffPolicyMachine

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NoReturn
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from rejeu.core import Clock, Rollout, Transition
 from rejeu.envs.base import Step
+from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.envs.functional.vector import joined, split
 from rejeu.loops.checks import check_bounds, check_finite, check_obs
 from rejeu.loops.device.sharing import filled, mesh_of, over_runs, spread
 from rejeu.loops.device.transfer import copies, episodes_of, put_players, unstacked, vector_of
 from rejeu.loops.device.turns import Limits, Report
+from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Progress, Run
@@ -31,12 +35,16 @@ class Machine(ABC):
     With several runs their arrays have a leading axis, except for those that all runs share.
     """
 
-    def __init__(self, runs: Sequence[Run], program: Any, size: int, devices: Sequence[jax.Device]) -> None:
+    def __init__(
+        self, runs: Sequence[Run], learner: Learner, program: Any, size: int, devices: Sequence[jax.Device]
+    ) -> None:
         """Takes runs of equal settings in JAX environments, the program that trains them, and devices that may share them.
 
+        ``learner`` keeps the compiled functions, so that later calls find them and they are collected with its agents.
         ``size`` is the number of runs for which the program is compiled, a multiple of that of the devices.
         """
-        self.env, self.program = vector_of(runs[0]).env, program
+        self.learner, self.program = learner, program
+        self.env_arrays, self.env_static = split(vector_of(runs[0]).env)
         self.mesh = mesh_of(size, devices)
         """The devices that share the runs; None if one computes all."""
         self.n = size
@@ -106,14 +114,18 @@ class Machine(ABC):
         self.start(limits)
         self.finish()
 
+    def compiled(self, function: Callable[..., Any], **options: Any) -> Any:
+        """Returns ``function(program, env, ...)`` compiled for this program, as a function of the other arguments."""
+        key = getattr(function, "func", function), self.program, self.env_static, self.n, self.mesh
+        if key not in self.learner.programs:
+            self.learner.programs[key] = jax.jit(partial(with_env, function, self.program, self.env_static), **options)
+        return partial(self.learner.programs[key], self.env_arrays)
+
     def start(self, limits: Limits) -> None:
         """Starts a chunk of turns, and does not wait for it."""
         self.in_a_row = [int(one.in_a_row) for one in self.carries] or [0] * self.n
-        if self.n == 1:
-            self.carry, self.store, self.report = take_chunk((self.program, self.env, self.carry, limits), self.store)
-        else:
-            kept = (self.program, self.mesh, self.env, self.carry, limits)
-            self.carry, self.store, self.report = take_chunks(kept, self.store)
+        chunk = self.compiled(take_chunk if self.n == 1 else partial(take_chunks, self.mesh), donate_argnums=3)
+        self.carry, self.store, self.report = chunk(self.carry, limits, self.store)
 
     def finish(self) -> None:
         """Waits for the chunk, and copies what it did to the host."""
@@ -202,21 +214,23 @@ class Machine(ABC):
         raise NonFiniteUpdate(before, batch, clock, skipped, run.n_updates + number)
 
 
-@eqx.filter_jit(donate="all-except-first")
-def take_chunk(kept: tuple[Any, ...], store: Any) -> tuple[Any, Any, Report]:
-    """Returns carry, experience and report after a chunk; only the experience is donated."""
-    program, env, carry, limits = kept
+def with_env(function: Callable[..., Any], program: Any, static: Any, arrays: Any, *arguments: Any) -> Any:
+    """Returns the result of ``function(program, env, *arguments)``, given the two parts of the environment."""
+    return function(program, joined(static, arrays), *arguments)
+
+
+def take_chunk(program: Any, env: FunctionalEnv, carry: Any, limits: Limits, store: Any) -> tuple[Any, Any, Report]:
+    """Returns carry, experience and report after a chunk."""
     return program.chunk(env, carry, store, limits)
 
 
-@eqx.filter_jit(donate="all-except-first")
-def take_chunks(kept: tuple[Any, ...], store: Any) -> tuple[Any, Any, Report]:
+def take_chunks(
+    mesh: Mesh | None, program: Any, env: FunctionalEnv, carry: Any, limits: Limits, store: Any
+) -> tuple[Any, Any, Report]:
     """Does the same for several runs, which the devices of a mesh share."""
-    program, mesh, env, carry, limits = kept
-    arrays, rest = eqx.partition(env, eqx.is_array)
-    one = lambda arrays, carry, store, limits: program.chunk(eqx.combine(arrays, rest), carry, store, limits)  # noqa: E731
-    axes = axes_of(carry), axes_of(store)
-    return over_runs(one, mesh, (None, *axes, None), (*axes, 0))(arrays, carry, store, limits)
+    one = lambda carry, limits, store: program.chunk(env, carry, store, limits)  # noqa: E731
+    axes = axes_of(carry), None, axes_of(store)
+    return over_runs(one, mesh, axes, (axes[0], axes[2], 0))(carry, limits, store)
 
 
 def axes_of(tree: Any) -> Any:

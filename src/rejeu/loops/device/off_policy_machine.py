@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +60,7 @@ class OffPolicyMachine(Machine):
             stops.at_episodes,
             variants,
         )
-        super().__init__(runs, program, size, devices)
+        super().__init__(runs, learner, program, size, devices)
         self.heads: np.ndarray = np.zeros(0)
         """Times of the newest rows that the hosts' rings have, ``int64 (n_runs, n_envs)``."""
         self.hyper = {} if hyper is None else hyper
@@ -88,7 +88,7 @@ class OffPolicyMachine(Machine):
             hyper={name: jnp.float32(value) for name, value in self.hyper.get(id(run), {}).items()},
         )
         if run.action is None:
-            run.action = np.array(first_action(self.program, self.env, carry, np.float32(progress)))
+            run.action = np.array(self.compiled(first_action)(carry, np.float32(progress)))
             carry = carry._replace(action=jnp.array(run.action))
         return carry
 
@@ -115,9 +115,9 @@ class OffPolicyMachine(Machine):
         size = rounded_up(int((heads - self.heads).max()) + 1, self.program.replay.rows)
         first = self.heads.astype(np.int32)
         if self.n > 1:
-            rows = rows_of_each(self.program.replay, self.mesh, self.store, first, size)
+            rows = self.compiled(partial(rows_of_each, self.mesh), static_argnums=3)(self.store, first, size)
         else:
-            rows = rows_from(self.program.replay, self.store, first[0], size)
+            rows = self.compiled(rows_from, static_argnums=3)(self.store, first[0], size)
         self.heads = heads
         priorities: list[Any] = [None] * self.n
         if self.store.priorities is not None:
@@ -133,7 +133,7 @@ class OffPolicyMachine(Machine):
             put_priorities(run, priorities, int(carry.counts.pending))
 
     def batch(self, run: Run, clock: Clock, number: int) -> Transition:
-        return copies(drawn(self.program.replay, self.env, self.store, self.carry.key, clock, np.uint32(number + 1)))
+        return copies(self.compiled(drawn)(self.store, self.carry.key, clock, np.uint32(number + 1)))
 
 
 def put_priorities(run: Run, priorities: DevicePriorities, n_pending: int) -> None:
@@ -147,7 +147,6 @@ def put_priorities(run: Run, priorities: DevicePriorities, n_pending: int) -> No
     ]
 
 
-@eqx.filter_jit
 def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, progress: Any) -> Array:
     """Returns the first actions of a run."""
     program = program if program.variants is None else program.variants.applied(program, carry.hyper)
@@ -155,24 +154,23 @@ def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, pr
     return choose(program, env, carry, program.packing.unpack(carry.state), clock).action
 
 
-@eqx.filter_jit
 def drawn(
-    replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array, clock: Clock, number: Any
+    program: OffPolicyProgram, env: FunctionalEnv, ring: DeviceRing, key: Array, clock: Clock, number: Any
 ) -> Transition:
     """Returns the batch of a gradient step of a turn."""
-    return draw(replay, env, ring, jax.random.fold_in(draws(key, clock.step), number), clock.progress)[0]
+    return draw(program.replay, env, ring, jax.random.fold_in(draws(key, clock.step), number), clock.progress)[0]
 
 
-@eqx.filter_jit
-def rows_from(replay: DeviceReplay, ring: DeviceRing, first: Any, size: int) -> dict[str, Any]:
+def rows_from(program: OffPolicyProgram, env: FunctionalEnv, ring: DeviceRing, first: Any, size: int) -> dict[str, Any]:
     """Returns rows of a ring; see :func:`rejeu.buffers.device.written`."""
-    return written(replay, ring, first, size)
+    return written(program.replay, ring, first, size)
 
 
-@eqx.filter_jit
-def rows_of_each(replay: DeviceReplay, mesh: Mesh | None, ring: DeviceRing, first: Any, size: int) -> dict[str, Any]:
+def rows_of_each(
+    mesh: Mesh | None, program: OffPolicyProgram, env: FunctionalEnv, ring: DeviceRing, first: Any, size: int
+) -> dict[str, Any]:
     """Returns rows of the rings of several runs."""
-    return over_runs(lambda ring, first: written(replay, ring, first, size), mesh, (0, 0), 0)(ring, first)
+    return over_runs(lambda ring, first: written(program.replay, ring, first, size), mesh, (0, 0), 0)(ring, first)
 
 
 def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:

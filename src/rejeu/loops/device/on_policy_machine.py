@@ -52,7 +52,7 @@ class OnPolicyMachine(Machine):
             stops.at_episodes,
             variants,
         )
-        super().__init__(runs, program, size, devices)
+        super().__init__(runs, learner, program, size, devices)
         self.hyper = {} if hyper is None else hyper
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:

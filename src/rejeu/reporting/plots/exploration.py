@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rejeu.exploration.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise, barrier, barrier_slope
-from rejeu.reporting.plots import style
+from rejeu.reporting.plots import drawing
 from rejeu.validation import number, whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.plots.picture import Picture
 
 BEYOND = 1.2
 """Distance from the center up to which the boundary is drawn, in half widths of the range."""
@@ -56,23 +56,11 @@ def noise(
     given = [noises] if isinstance(noises, ActionNoise) else list(noises)
     n_steps, n_processes = whole("n_steps", n_steps, least=1), whole("n_processes", n_processes, least=1)
     paths = [_actions(one, n_steps, n_processes, action, seed) - np.asarray(action) for one in given]
-    figure = style.make_figure("drawing noise", height=1.2 + 2.4 * len(given))
+    figure = drawing.make_figure("drawing noise", height=1.2 + 2.4 * len(given))
     panels = figure.subplots(len(given), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for panel, one, values in zip(panels, given, paths, strict=True):
-        curves = values.reshape(n_steps, -1)
-        for i in range(curves.shape[1]):
-            shade = _shade(i, curves.shape[1])
-            panel.plot(np.arange(1, n_steps + 1), curves[:, i], color=style.LINE_COLOR, alpha=shade, linewidth=0.8)
-        panel.set_ylabel("noise")
-        panel.annotate(_describe(one), (0.0, 1.02), xycoords="axes fraction", color=style.INK, fontsize=8.5)
-        style.format_axes(panel)
-    panels[-1].set_xlabel("step")
-    panels[-1].set_xlim(0, n_steps)
-    panels[-1].locator_params(axis="x", integer=True)
-    panels[-1].xaxis.set_major_formatter(style.thousands)
-    if title:
-        figure.suptitle(title, x=0.02, ha="left", color=style.INK, fontsize=12, fontweight="bold")
-    return style.save(figure, path)
+        _sample_paths(panel, values.reshape(n_steps, -1), "noise", _describe(one))
+    return _finished(figure, n_steps, title, path)
 
 
 def repulsive_boundary(
@@ -105,22 +93,22 @@ def repulsive_boundary(
     u = np.linspace(-BEYOND, BEYOND, 481)
     action = low + half * (u + 1)
     push = (repulsive * barrier_slope(u)).clip(-abs(u), abs(u))
-    figure = style.make_figure("drawing the repulsive boundary", height=5.6)
+    figure = drawing.make_figure("drawing the repulsive boundary", height=5.6)
     panels = figure.subplots(2, 1, sharex=True)
     for panel, values, name in (
         (panels[0], half**2 * repulsive * barrier(u), "barrier"),
         (panels[1], half * push, "its derivative: push of one step"),
     ):
-        panel.plot(action, values, **style.LINE)
+        panel.plot(action, values, **drawing.LINE)
         panel.set_ylabel(name)
-        panel.xaxis.set_major_formatter(style.thousands)
-        panel.yaxis.set_major_formatter(style.thousands)
-        style.format_axes(panel)
+        panel.xaxis.set_major_formatter(drawing.thousands)
+        panel.yaxis.set_major_formatter(drawing.thousands)
+        drawing.format_axes(panel)
         for bound in (low, high):
-            panel.axvline(bound, color=style.INK, linewidth=1.2)
+            panel.axvline(bound, color=drawing.INK, linewidth=1.2)
     panels[1].set_xlabel("action plus noise, between its bounds")
-    style.add_title_and_legend(panels[0], title)
-    return style.save(figure, path)
+    drawing.add_title_and_legend(panels[0], title)
+    return drawing.save(figure, path)
 
 
 def saturation(
@@ -155,39 +143,36 @@ def saturation(
         raise ValueError(f"{noise!r} has no repulsive boundary; use OrnsteinUhlenbeckActionNoise(..., repulsive=1e-4)")
     n_steps, n_processes = whole("n_steps", n_steps, least=1), whole("n_processes", n_processes, least=1)
     action = number("action", action, least=-1, most=1)
-    figure = style.make_figure("drawing saturation", height=5.6)
+    figure = drawing.make_figure("drawing saturation", height=5.6)
     panels = figure.subplots(2, 1, sharex=True, sharey=True)
     for panel, one in zip(panels, (replace(noise, repulsive=(0.0,)), noise), strict=True):
         taken = _actions(one, n_steps, max(n_processes, N_MEASURED), action, seed)[:, :, 0].clip(-1.0, 1.0)
-        _taken(panel, taken[:, :n_processes], action)
         share = (abs(taken[:, :N_MEASURED]) == 1.0).mean()
         text = f"repulsive {one.repulsive[0]:g}: {share:.1%} of the actions of {N_MEASURED} sample paths at a bound"
-        panel.annotate(text, (0.0, 1.02), xycoords="axes fraction", color=style.INK, fontsize=8.5)
-    panels[-1].set_xlabel("step")
-    panels[-1].set_xlim(0, n_steps)
-    panels[-1].locator_params(axis="x", integer=True)
-    panels[-1].xaxis.set_major_formatter(style.thousands)
+        panel.axhline(action, color=drawing.MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
+        _sample_paths(panel, taken[:, :n_processes], "action taken", text)
+        at_bound = np.where(abs(taken[:, :n_processes]) == 1.0, taken[:, :n_processes], np.nan)
+        panel.plot(np.arange(1, n_steps + 1), at_bound, color=drawing.BAD_COLOR, linewidth=3.0)
+        panel.set_ylim(-1.08, 1.08)
+    return _finished(figure, n_steps, title, path)
+
+
+def _sample_paths(panel: Axes, curves: np.ndarray, name: str, text: str) -> None:
+    """Draws curves ``(n_steps, n_curves)``, which their opacity distinguishes, with a text above them."""
+    for i, curve in enumerate(curves.T):
+        shade = 1.0 - 0.7 * i / curves.shape[1]
+        panel.plot(np.arange(1, len(curve) + 1), curve, color=drawing.LINE_COLOR, alpha=shade, linewidth=0.8)
+    panel.set_ylabel(name)
+    panel.annotate(text, (0.0, 1.02), xycoords="axes fraction", color=drawing.INK, fontsize=8.5)
+    drawing.format_axes(panel)
+
+
+def _finished(figure: Picture, n_steps: int, title: str, path: str | Path | None) -> Picture:
+    """Gives a figure of panels its axis of steps and its title, and writes it to ``path``, if there is one."""
+    drawing.steps_axis(figure.axes[-1], n_steps)
     if title:
-        figure.suptitle(title, x=0.02, ha="left", color=style.INK, fontsize=12, fontweight="bold")
-    return style.save(figure, path)
-
-
-def _taken(panel: Axes, taken: np.ndarray, action: float) -> None:
-    """Draws actions ``(n_steps, n_processes)``, in red where they are at a bound, and the policy's action."""
-    steps = np.arange(1, len(taken) + 1)
-    panel.axhline(action, color=style.MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
-    for i, values in enumerate(taken.T):
-        shade = _shade(i, taken.shape[1])
-        panel.plot(steps, values, color=style.LINE_COLOR, alpha=shade, linewidth=0.9)
-        panel.plot(steps, np.where(abs(values) == 1.0, values, np.nan), color=style.BAD_COLOR, linewidth=3.0)
-    panel.set_ylim(-1.08, 1.08)
-    panel.set_ylabel("action taken")
-    style.format_axes(panel)
-
-
-def _shade(curve: int, n: int) -> float:
-    """Returns the opacity of one of ``n`` curves, which distinguishes them."""
-    return 1.0 - 0.7 * curve / n
+        figure.suptitle(title, x=0.02, ha="left", color=drawing.INK, fontsize=12, fontweight="bold")
+    return drawing.save(figure, path)
 
 
 def _actions(noise: ActionNoise, n_steps: int, n_processes: int, action: ArrayLike, seed: int) -> np.ndarray:

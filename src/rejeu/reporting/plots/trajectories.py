@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rejeu.reporting.plots import style
+from rejeu.reporting.plots import drawing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from rejeu.reporting.figures import Picture
+    from rejeu.reporting.plots.picture import Picture
 
 MAX_COORDINATES = 10
 """Maximum number of coordinates that are drawn against time next to the plane."""
@@ -64,16 +64,16 @@ def trajectory(
 
     what = "drawing a trajectory"
     if dimension == 1:
-        figure = style.make_figure(what)
+        figure = drawing.make_figure(what)
         panel = figure.subplots()
         _coordinate(panel, points[:, 0], lows[0], highs[0], names[0])
         panel.set_xlabel("step")
-        style.add_title_and_legend(panel, title)
+        drawing.add_title_and_legend(panel, title)
     elif dimension == 2:
-        figure = style.make_figure(what, 5.6, 5.6)
+        figure = drawing.make_figure(what, 5.6, 5.6)
         _plane(figure.subplots(), points, lows, highs, names, title)
     else:
-        figure = style.make_figure(what, 10.0, 5.6)
+        figure = drawing.make_figure(what, 10.0, 5.6)
         left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[5.6, 4.4])[0]
         _plane(left.subplots(), points, lows, highs, names, title)
         shown = min(dimension, MAX_COORDINATES)
@@ -82,7 +82,7 @@ def trajectory(
             name = textwrap.fill(names[i], NAME_CHARACTERS // shown, break_long_words=False)
             _coordinate(panel, points[:, i], lows[i], highs[i], name)
         panels[-1].set_xlabel("step" if shown == dimension else f"step (the first {shown} of {dimension} coordinates)")
-    return style.save(figure, path)
+    return drawing.save(figure, path)
 
 
 def _plane(
@@ -94,36 +94,36 @@ def _plane(
         corners = (lows[0], lows[1]), highs[0] - lows[0], highs[1] - lows[1]
         from matplotlib.patches import Rectangle
 
-        panel.add_patch(Rectangle(*corners, fill=False, edgecolor=style.INK, linewidth=1.2))
-    panel.plot(x, y, ".-", color=style.LINE_COLOR, linewidth=0.7, markersize=3, alpha=0.6)
+        panel.add_patch(Rectangle(*corners, fill=False, edgecolor=drawing.INK, linewidth=1.2))
+    panel.plot(x, y, ".-", color=drawing.LINE_COLOR, linewidth=0.7, markersize=3, alpha=0.6)
     _ends(panel, x, y)
     panel.set_xlim(*_limits(x, lows[0], highs[0]))
     panel.set_ylim(*_limits(y, lows[1], highs[1]))
     panel.set_box_aspect(1)
     panel.set_xlabel(names[0])
     panel.set_ylabel(names[1])
-    style.format_axes(panel)
-    style.add_title_and_legend(panel, title)
+    drawing.format_axes(panel)
+    drawing.add_title_and_legend(panel, title)
 
 
 def _coordinate(panel: Axes, values: np.ndarray, low: float, high: float, name: str) -> None:
     """Draws one coordinate against steps, its bounds, the start and the end."""
     for wall in (low, high):
         if np.isfinite(wall):
-            panel.axhline(wall, color=style.INK, linewidth=1.2)
+            panel.axhline(wall, color=drawing.INK, linewidth=1.2)
     steps = np.arange(len(values))
-    panel.plot(steps, values, color=style.LINE_COLOR, linewidth=1.0)
+    panel.plot(steps, values, color=drawing.LINE_COLOR, linewidth=1.0)
     _ends(panel, steps, values)
     panel.locator_params(axis="x", integer=True)
-    panel.xaxis.set_major_formatter(style.thousands)
+    panel.xaxis.set_major_formatter(drawing.thousands)
     panel.set_ylim(*_limits(values, low, high))
     panel.set_ylabel(name)
-    style.format_axes(panel)
+    drawing.format_axes(panel)
 
 
 def _ends(panel: Axes, x: np.ndarray, y: np.ndarray) -> None:
-    panel.plot(x[:1], y[:1], "o", markersize=6, color="white", markeredgecolor=style.MUTED, label="start", zorder=4)
-    panel.plot(x[-1:], y[-1:], "o", markersize=7, color=style.ACCENT_COLOR, label="end", zorder=5, clip_on=False)
+    panel.plot(x[:1], y[:1], "o", markersize=6, color="white", markeredgecolor=drawing.MUTED, label="start", zorder=4)
+    panel.plot(x[-1:], y[-1:], "o", markersize=7, color=drawing.ACCENT_COLOR, label="end", zorder=5, clip_on=False)
 
 
 def _limits(values: np.ndarray, low: float, high: float) -> tuple[float, float]:

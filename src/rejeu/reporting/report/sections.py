@@ -5,28 +5,29 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rejeu.io.records import shown
-from rejeu.reporting.report import curves, videos
+from rejeu.reporting import charts as chart_data
+from rejeu.reporting.formatting import counted
+from rejeu.reporting.report import videos
 from rejeu.reporting.runs import MAX_WORD, Run, best_row, flat
-from rejeu.reporting.text import counted, quoted
+from rejeu.runs.config import RunConfig
+from rejeu.runs.values import quoted
 
 LAST = 100
 """Training episodes that stand in for a final evaluation."""
 MAX_EVALUATIONS = 200
 """Most rows of the table of evaluations."""
 MAX_SETTINGS = 300
-STATES = {
-    "running": "running",
-    "finished": "finished",
-    "interrupted": "interrupted",
-    "crashed": "crashed",
-    "unknown": "state unknown",
-}
+CURVES, TIME = "Learning curves", "Time"
+"""Headings."""
+TITLES = {"return": "Return", "success": "Success rate", "length": "Episode length"}
+"""Titles of the learning curves by the column that they show."""
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -55,14 +56,9 @@ def title_of(runs: Sequence[Run]) -> str:
     return f"{runs[0].env_id or runs[0].name}, {runs[0].algorithm or 'unknown algorithm'}"
 
 
+@np.errstate(all="ignore")  # files may hold any number
 def build(runs: Sequence[Run], folder: Path | None) -> Parts:
     """Returns the content of a report; ``folder`` as for :func:`rejeu.reporting.report.render`."""
-    with np.errstate(all="ignore"):  # files may hold any number
-        return build_all(runs, folder)
-
-
-def build_all(runs: Sequence[Run], folder: Path | None) -> Parts:
-    """Returns the content of a report."""
     parts, budget = [], videos.BUDGET
     charts: dict[str, Any] = {}
     histograms: dict[str, Any] = {}
@@ -79,28 +75,20 @@ def build_all(runs: Sequence[Run], folder: Path | None) -> Parts:
 
 def charts_of(run: Run, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Returns the charts of a run by id, and groups of their ids and titles for the template."""
+    found: list[tuple[str, str, str, Any]] = [
+        (CURVES, column, title, chart_data.episode_chart(run.episodes, run.evaluations, column))
+        for column, title in TITLES.items()
+    ]
+    for i, (name, chart) in enumerate(chart_data.metric_charts(run.metrics).items()):
+        found.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
+    found.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
     charts: dict[str, Any] = {}
-    titles = {"return": "Return", "success": "Success rate", "length": "Episode length"}
-    curve_ids = []
-    for column, title in titles.items():
-        chart = curves.episode_chart(run, column)
+    groups: dict[str, list[dict[str, str]]] = {heading: [] for heading in (CURVES, *chart_data.GROUPS, TIME)}
+    for heading, key, title, chart in found:
         if chart is not None:
-            charts[f"{prefix}-{column}"] = chart
-            curve_ids.append({"id": f"{prefix}-{column}", "title": title, "note": chart["note"]})
-    groups = [{"title": "Learning curves", "charts": curve_ids}] if curve_ids else []
-    for group, found in curves.metric_charts(run).items():
-        entries = []
-        for name, chart in found:
-            key = f"{prefix}-metric{len(charts)}"
-            charts[key] = chart
-            entries.append({"id": key, "title": shown(name), "note": chart["note"]})
-        groups.append({"title": group, "charts": entries})
-    shares = curves.time_chart(run.metrics)
-    if shares is not None:
-        charts[f"{prefix}-time"] = shares
-        entry = {"id": f"{prefix}-time", "title": "Shares of the time", "note": "update includes compilation"}
-        groups.append({"title": "Time", "charts": [entry]})
-    return charts, groups
+            charts[f"{prefix}-{key}"] = chart
+            groups[heading].append({"id": f"{prefix}-{key}", "title": title, "note": chart["note"]})
+    return charts, [{"title": heading, "charts": entries} for heading, entries in groups.items() if entries]
 
 
 def histogram_of(run: Run) -> dict[str, Any] | None:
@@ -114,39 +102,39 @@ def histogram_of(run: Run) -> dict[str, Any] | None:
         "length": episodes.length,
         "success": episodes.success,
     }
-    return curves.histogram(episodes.returns, columns)
+    return chart_data.histogram(episodes.returns, columns)
 
 
 def replays_of(run: Run) -> dict[str, Any] | None:
     """Returns the histogram of the episodes that the trained agent played from known seeds; None without any."""
     columns = {name: run.replays.column(name) for name in ("seed", "return", "length", "success")}
-    return curves.histogram(columns["return"], columns, replay_command(run))
+    return chart_data.histogram(columns["return"], columns, replay_command(run))
 
 
 def describe(
     run: Run, key: str, groups: list[dict[str, Any]], found: list[videos.Video], notes: list[str], histograms: set[str]
 ) -> dict[str, Any]:
     """Returns what the template shows of a run."""
+    rows = hyperparameters(run)
     return {
         "id": key,
         "name": run.name,
         "env": run.env_id or "unknown environment",
         "algorithm": run.algorithm or "unknown algorithm",
         "state": run.state,
-        "state_text": STATES[run.state],
+        "state_text": "state unknown" if run.state == "unknown" else run.state,
         "tiles": tiles(run),
         "facts": facts(run),
         "groups": groups,
         "videos": found,
         "other_videos": max(len(run.videos) - len(found), 0),
         "histograms": histograms,
-        "n_episodes": len(run.episodes),
         "evaluations": evaluation_rows(run),
         "has_success": bool(np.isfinite(run.evaluations.column("success_rate")).any()),
         "evaluations_note": evaluations_note(run),
         "settings": settings(run),
-        "changed": [row for row in hyperparameters(run) if row["changed"]],
-        "unchanged": [row for row in hyperparameters(run) if not row["changed"]],
+        "changed": [row for row in rows if row["changed"]],
+        "unchanged": [row for row in rows if not row["changed"]],
         "versions": [(shown(name), shown(value)) for name, value in run.versions.items()],
         "warnings": [*run.warnings],
         "notes": [*run.notes, *notes],
@@ -217,10 +205,10 @@ def evaluation_tiles(run: Run, title: str, row: int) -> list[Tile]:
     table = run.evaluations
     mean, rate = table.column("mean_return")[row], table.column("success_rate")[row]
     at = f"step {number(table.column('step')[row], 0)}"
-    low, high = (end[row] for end in curves.interval(table, "return"))
+    low, high = (end[row] for end in chart_data.interval(table, "return"))
     interval = between(low, high)
     if math.isfinite(rate):
-        least, most = (end[row] for end in curves.interval(table, "success"))
+        least, most = (end[row] for end in chart_data.interval(table, "success"))
         note = f"success, 95 % interval {between(least, most, percent)}" if math.isfinite(least) else "success"
         more = f"return {number(mean)}" + (f" ({interval})" if interval else "")
         return [Tile(f"{title}, {at}", percent(rate), note, more)]
@@ -240,11 +228,11 @@ def training_tiles(run: Run) -> list[Tile]:
 
 def facts(run: Run) -> list[str]:
     """Returns the line below the headline."""
-    config = run.config
+    backend = None if run.config is None else run.config.backend
     found = [counted(len(run.episodes), "episode")]
     found += [f"seed {run.seed}"] if run.seed is not None else []
     found += [f"{counted(run.n_envs, 'environment')} at once"] if run.n_envs else []
-    found += [f"{shown(config['backend'])} backend"] if isinstance(config.get("backend"), str) else []
+    found += [f"{shown(backend)} backend"] if backend else []
     found += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
     return found
 
@@ -252,7 +240,7 @@ def facts(run: Run) -> list[str]:
 def evaluation_rows(run: Run) -> list[dict[str, Any]]:
     """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
     table = run.evaluations
-    (low, high), (least, most) = curves.interval(table, "return"), curves.interval(table, "success")
+    (low, high), (least, most) = chart_data.interval(table, "return"), chart_data.interval(table, "success")
     best = best_row(table)
     return [
         {
@@ -267,7 +255,7 @@ def evaluation_rows(run: Run) -> list[dict[str, Any]]:
             "time": duration(table.column("seconds")[row]),
             "best": row == best,
         }
-        for row in curves.thinned(len(table), MAX_EVALUATIONS).tolist()
+        for row in chart_data.thinned(len(table), MAX_EVALUATIONS).tolist()
     ]
 
 
@@ -307,12 +295,13 @@ def hyperparameters(run: Run) -> list[dict[str, Any]]:
 
 
 def settings(run: Run) -> list[tuple[str, str]]:
-    """Returns the configuration of the run without the hyperparameters."""
-    hidden = ("hyperparameters", "versions", "env", "algorithm")
-    rows = [
-        (name, value) for name, value in run.config.items() if name not in hidden and value not in (None, {}, [], "")
-    ]
-    return [(shown(name), value_text(value)) for name, value in rows[:MAX_SETTINGS]]
+    """Returns the configuration of the run without the hyperparameters, where it differs from what is usual."""
+    if run.config is None:
+        return []
+    usual = asdict(RunConfig(env=""))
+    hidden = ("hyperparameters", "env", "algorithm")
+    rows = [(name, value) for name, value in asdict(run.config).items() if name not in hidden and value != usual[name]]
+    return [(name, value_text(value)) for name, value in rows]
 
 
 def replay_command(run: Run) -> str:
@@ -325,10 +314,7 @@ def replay_command(run: Run) -> str:
 
 def env_options(run: Run) -> str:
     """Returns what commands about the run need to make its environment again, and to import; empty if its id is enough."""
-    words = run.env_words
-    if words or run.env_argument != run.env_id:
-        words = ["--env", run.env_argument, *words]
-    return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in [*words, *run.import_words])
+    return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in run.environment_words())
 
 
 def path_word(path: Path) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import os
 import re
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
@@ -28,8 +27,6 @@ class Video(NamedTuple):
     """A data URL, empty if it is not embedded."""
     link: str
     """A relative link, empty if there is none."""
-    step: int | None
-    """Environment step of the policy, None if unknown."""
     megabytes: float
 
 
@@ -42,11 +39,10 @@ def collect(run: Run, folder: Path | None, budget: int) -> tuple[list[Video], li
         budget: most bytes to embed.
     """
     during = [path for path in run.videos if path.name != BEST]
-    best = [path for path in run.videos if path.name == BEST]
-    chosen = [(path, "Best model") for path in best]
-    chosen += [(path, "Last") for path in during[-1:]] + [(path, "First") for path in during[:-1][:1]]
+    chosen = {path: "Best model" for path in run.videos if path.name == BEST}  # first, as the budget may not be enough
+    chosen |= dict.fromkeys(during[-1:], "Last") | dict.fromkeys(during[:-1][:1], "First")
     found, notes, spent = [], [], 0
-    for path, title in chosen:
+    for path, title in chosen.items():
         try:
             size = path.stat().st_size
             content = read_bytes(path, min(size, budget - spent + 1))
@@ -60,25 +56,10 @@ def collect(run: Run, folder: Path | None, budget: int) -> tuple[list[Video], li
         if size <= budget - spent:
             source = "data:video/mp4;base64," + base64.b64encode(content).decode("ascii")
             spent += size
-        step = step_of(path)
-        label = title if step is None or title == "Best model" else f"{title} (step {step:,})"
-        found.append(Video(label, shown(path.name), source, link_to(path, folder), step, size / 2**20))
-    return in_order(found), notes, spent
-
-
-def in_order(videos: Iterable[Video]) -> list[Video]:
-    """Returns the first video, the last, and the best."""
-    return sorted(videos, key=lambda video: ("First", "Last", "Best").index(video.title.split()[0]))
-
-
-def step_of(path: Path) -> int | None:
-    """Returns the step in the name of a video, None if there is none.
-
-    >>> step_of(Path("step_000001500.mp4"))
-    1500
-    """
-    found = re.fullmatch(r"step_(\d{1,15})\.mp4", path.name)
-    return int(found[1]) if found else None
+        step = re.fullmatch(r"step_(\d{1,15})\.mp4", path.name)
+        label = f"{title} (step {int(step[1]):,})" if step else title
+        found.append(Video(label, shown(path.name), source, link_to(path, folder), size / 2**20))
+    return found[::-1], notes, spent
 
 
 def link_to(path: Path, folder: Path | None) -> str:

@@ -126,15 +126,19 @@ class BaseCallback(TrainingCallback):
             setattr(self, name, state[name])
 
     def init_callback(self, model: Agent) -> None:
-        """Sets the agent."""
+        """Sets the agent, also of the child callbacks."""
         self.model = model
         self._init_callback()
+        for child in self._children():
+            child.init_callback(model)
 
     def on_training_start(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         """Called before the first step."""
         self.locals, self.globals = locals_, globals_
         self.num_timesteps = self.model.num_timesteps
         self._on_training_start()
+        for child in self._children():
+            child.on_training_start(locals_, globals_)
 
     def on_rollout_start(self) -> None:
         """Called before the first step after an update."""
@@ -168,6 +172,11 @@ class BaseCallback(TrainingCallback):
 
     def update_child_locals(self, locals_: dict[str, Any]) -> None:
         """Updates ``locals`` of the child callbacks."""
+        for child in self._children():
+            child.update_locals(locals_)
+
+    def _children(self) -> list[BaseCallback]:
+        return []
 
     def _init_callback(self) -> None:
         """Override it to act once the agent is known."""
@@ -203,12 +212,6 @@ class EventCallback(BaseCallback):
         if self.callback is not None:
             self.callback.parent = self
 
-    def init_callback(self, model: Agent) -> None:
-        """Sets the agent, also of the child callbacks."""
-        super().init_callback(model)
-        if self.callback is not None:
-            self.callback.init_callback(model)
-
     def state_dict(self) -> dict[str, Any]:
         """Returns the state of the callback and of its children."""
         return {"self": super().state_dict(), "inside": [child.state_dict() for child in self._children()]}
@@ -221,15 +224,6 @@ class EventCallback(BaseCallback):
 
     def _children(self) -> list[BaseCallback]:
         return [] if self.callback is None else [self.callback]
-
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """Updates ``locals`` of the child callbacks."""
-        if self.callback is not None:
-            self.callback.update_locals(locals_)
-
-    def _on_training_start(self) -> None:
-        if self.callback is not None:
-            self.callback.on_training_start(self.locals, self.globals)
 
     def _on_event(self) -> bool:
         return True if self.callback is None else self.callback.on_step()
@@ -264,18 +258,8 @@ class CallbackList(BaseCallback):
         for callback, (_, part) in zip(self.callbacks, state["inside"], strict=True):
             callback.load_state_dict(part)
 
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """Updates ``locals`` of each callback."""
-        for callback in self.callbacks:
-            callback.update_locals(locals_)
-
-    def _init_callback(self) -> None:
-        for callback in self.callbacks:
-            callback.init_callback(self.model)
-
-    def _on_training_start(self) -> None:
-        for callback in self.callbacks:
-            callback.on_training_start(self.locals, self.globals)
+    def _children(self) -> list[BaseCallback]:
+        return self.callbacks
 
     def _on_rollout_start(self) -> None:
         for callback in self.callbacks:

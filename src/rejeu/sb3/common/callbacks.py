@@ -187,19 +187,6 @@ class EvalCallback(EventCallback):
             make_masked(self.eval_env)
         if identities(self.training_env) & identities(self.eval_env):
             raise ValueError("EvalCallback was given the environments that the agent trains in; give it others")
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.init_callback(model)
-
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """Updates ``locals`` of the child callbacks."""
-        super().update_child_locals(locals_)
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.update_locals(locals_)
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.on_training_start(self.locals, self.globals)
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq:

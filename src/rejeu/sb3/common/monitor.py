@@ -75,14 +75,10 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.episode_times: list[float] = []
         self.total_steps = 0
         self.current_reset_info: dict[str, Any] = {}
-        self.path = None if filename is None else monitor_path(filename)
-        self._failed_writes = FailedWrites()
-        if self.path is not None and (override_existing or not self.path.exists()):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            env_id = str(env.spec.id if env.spec is not None else None)
-            with self.path.open("w", newline="\n", encoding="utf-8") as file:
-                file.write(f"#{json.dumps({'t_start': self.t_start, 'env_id': env_id})}\n")
-                csv.writer(file).writerow(self._columns())
+        columns = ("r", "l", "t", *self.reset_keywords, *self.info_keywords)
+        start = {"t_start": self.t_start, "env_id": str(env.spec.id if env.spec is not None else None)}
+        self._file = None if filename is None else MonitorFile(filename, columns, start, override_existing)
+        self.path = None if self._file is None else self._file.path
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Resets the environment with the arguments given.
@@ -125,18 +121,11 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.episode_returns.append(total)
         self.episode_lengths.append(length)
         self.episode_times.append(seconds)
-        for key in self.info_keywords:
-            if key not in info:
-                raise ValueError(f"info_keywords: the info of an episode's last step has no {key!r}, only {[*info]}")
         row = {"r": round(total, 6), "l": length, "t": round(seconds, 6)}
-        row |= {key: info[key] for key in self.info_keywords} | self.current_reset_info
-        if self.path is not None:
-            line = csv_line(row, self._columns())
-            self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), line)
+        row |= keywords_of(info, self.info_keywords) | self.current_reset_info
+        if self._file is not None:
+            self._file.append(row)
         return row
-
-    def _columns(self) -> tuple[str, ...]:
-        return ("r", "l", "t", *self.reset_keywords, *self.info_keywords)
 
     def get_wrapper_state(self) -> dict[str, Any]:
         """Returns what the wrapper stores, for the checkpoint of a run."""
@@ -153,8 +142,8 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     def close(self) -> None:
         """Writes rows that could not be written before, if possible, and closes the environment."""
-        self._failed_writes.retry()
-        self._failed_writes.warn()
+        if self._file is not None:
+            self._file.close()
         super().close()
 
     def get_total_steps(self) -> int:
@@ -174,11 +163,49 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return self.episode_times
 
 
-def csv_line(row: Mapping[str, Any], columns: Sequence[str]) -> bytes:
-    """Returns a row as a line of a CSV file."""
-    text = io.StringIO()
-    csv.DictWriter(text, columns).writerow(row)
-    return text.getvalue().encode()
+class MonitorFile:
+    """The CSV file of a monitor. Rows that cannot be written are kept, with a warning, and written later.
+
+    Args:
+        filename: as for :class:`Monitor`.
+        columns: names of the columns.
+        start: the first line, as JSON.
+        override_existing: replace an existing file; False appends to it.
+    """
+
+    def __init__(
+        self, filename: str | Path, columns: Sequence[str], start: Mapping[str, Any], override_existing: bool = True
+    ) -> None:
+        self.path, self.columns = monitor_path(filename), tuple(columns)
+        self._failed_writes = FailedWrites()
+        if override_existing or not self.path.exists():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("w", newline="\n", encoding="utf-8") as file:
+                file.write(f"#{json.dumps(start)}\n")
+                csv.writer(file).writerow(self.columns)
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Writes the row of an episode."""
+        text = io.StringIO()
+        csv.DictWriter(text, self.columns).writerow(row)
+        self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), text.getvalue().encode())
+
+    def close(self) -> None:
+        """Writes rows that could not be written before, if possible."""
+        self._failed_writes.retry()
+        self._failed_writes.warn()
+
+
+def keywords_of(info: Mapping[str, Any], keywords: Sequence[str]) -> dict[str, Any]:
+    """Returns the entries of an episode's last info that are recorded.
+
+    Raises:
+        ValueError: if one is missing.
+    """
+    for key in keywords:
+        if key not in info:
+            raise ValueError(f"info_keywords: the info of an episode's last step has no {key!r}, only {[*info]}")
+    return {key: info[key] for key in keywords}
 
 
 def monitor_path(filename: str | Path) -> Path:

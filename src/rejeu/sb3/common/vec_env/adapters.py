@@ -249,17 +249,14 @@ class AutoResetView(VecEnv):
         self._actions: Any = None
 
     def reset(self) -> Any:
-        """Resets every environment and returns the observations ``(num_envs, ...)``."""
         seed = self._seeds[0]
         self._reset_seeds()
         return jax.tree.map(np.copy, self.vector.reset(seed))
 
     def step_async(self, actions: Any) -> None:
-        """Stores the actions for :meth:`step_wait`."""
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> StepResult:
-        """Steps with the actions of :meth:`step_async`; returns the same as :meth:`step`."""
         step = self.vector.step(self._actions)
         dones = step.terminated | step.truncated
         infos: list[dict[str, Any]] = []
@@ -276,7 +273,6 @@ class AutoResetView(VecEnv):
         return jax.tree.map(np.copy, obs), step.reward, dones, infos
 
     def close(self) -> None:
-        """Closes the environments."""
         self.vector.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -294,7 +290,6 @@ class AutoResetView(VecEnv):
         raise AttributeError(self._no_access(method_name))
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        """Returns False for each environment."""
         return [False for _ in self._get_indices(indices)]
 
     def _no_access(self, name: str) -> str:
@@ -305,4 +300,3 @@ class AutoResetView(VecEnv):
 
 
 adapters.register_adapter(VecEnv, to_vector)
-adapters.register_vec_env_view(to_vec_env)

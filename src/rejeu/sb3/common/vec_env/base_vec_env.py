@@ -16,10 +16,11 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs.workers.calls import TERMINAL_OBSERVATION, TIME_LIMIT_TRUNCATED
 from rejeu.errors import MissingExtra
-from rejeu.reporting.text import counted
+from rejeu.reporting.formatting import counted
 
 __all__ = [
     "VecEnv",
@@ -176,6 +177,10 @@ class VecEnv(ABC):
     def _reset_options(self) -> None:
         self._options = [None] * self.num_envs
 
+    def _check_count(self, actions: Any) -> None:
+        if len(actions) != self.num_envs:
+            raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
+
     def _get_indices(self, indices: Indices) -> list[int]:
         chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
         return list(chosen)
@@ -214,55 +219,62 @@ class VecEnvWrapper(VecEnv):
         self.reset_infos = venv.reset_infos
 
     def step_async(self, actions: Any) -> None:
-        """Starts a step with one action for each environment."""
         self.venv.step_async(actions)
 
     def close(self) -> None:
-        """Closes the environments."""
         self.venv.close()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seeds the next reset of the environments and returns the seeds."""
         return self.venv.seed(seed)
 
     def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
-        """Sets the options of the next reset of the environments."""
         self.venv.set_options(options)
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Returns an image of each environment."""
         return self.venv.get_images()
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
-        """Renders the environments; see :meth:`VecEnv.render`."""
         return self.venv.render(mode)
 
     def has_attr(self, attr_name: str) -> bool:
-        """Returns whether the environments have the attribute."""
         return self.venv.has_attr(attr_name)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns an attribute of each environment."""
         return self.venv.get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Sets an attribute of each environment."""
         self.venv.set_attr(attr_name, value, indices)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of each environment and returns the results."""
         return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        """Returns for each environment whether it is wrapped in that class."""
         return self.venv.env_is_wrapped(wrapper_class, indices)
 
     def __getattr__(self, name: str) -> Any:
         if name == "venv":
             raise AttributeError(f"{type(self).__name__}.__init__ must call super().__init__(venv) first")
         return getattr(self.venv, name)
+
+
+class ObservationWrapper(VecEnvWrapper):
+    """A wrapper that maps observations, those of ``terminal_observation`` included. Abstract."""
+
+    @abstractmethod
+    def map_observation(self, obs: Any) -> Any:
+        """Returns the observation of one or of several environments as this wrapper shows it."""
+
+    def reset(self) -> Any:
+        return self.map_observation(self.venv.reset())
+
+    def step_wait(self) -> StepResult:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        for info in infos:
+            if TERMINAL_OBSERVATION in info:
+                info[TERMINAL_OBSERVATION] = self.map_observation(info[TERMINAL_OBSERVATION])
+        return self.map_observation(obs), rewards, dones, infos
 
 
 W = TypeVar("W", bound=VecEnvWrapper)
@@ -303,6 +315,12 @@ def tile_images(images: Sequence[np.ndarray]) -> np.ndarray:
     columns = math.ceil(len(images) / rows)
     filled = [*images, *[np.zeros_like(images[0])] * (rows * columns - len(images))]
     return np.concatenate([np.concatenate(filled[r * columns : (r + 1) * columns], axis=1) for r in range(rows)])
+
+
+def stacked(space: gym.Space, parts: list[Any]) -> Any:
+    """Returns the observations of all environments as one, ``(num_envs, ...)``."""
+    empty: Any = create_empty_array(space, len(parts))
+    return concatenate(space, parts, empty)
 
 
 def by_key(obs: Any) -> dict[str, Any]:

@@ -7,11 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs import batching, validation
+from rejeu.envs.rendering import check_renders, rgb_frame
 from rejeu.errors import BadEnvironmentError
-from rejeu.reporting.video import check_renders, rgb_frame
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
     TIME_LIMIT_TRUNCATED,
@@ -19,6 +18,7 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     StepResult,
     VecEnv,
     is_wrapped,
+    stacked,
 )
 
 __all__ = ["DummyVecEnv"]
@@ -63,22 +63,18 @@ class DummyVecEnv(VecEnv):
         self._actions: Any = None
 
     def reset(self) -> Any:
-        """Resets every environment, with the seeds and options set before; returns the observations."""
         parts = []
         for i, env in enumerate(self.envs):
             parts.append(self._reset_env(i, env, self._seeds[i], self._options[i]))
         self._reset_seeds()
         self._reset_options()
-        return self._stack(parts)
+        return stacked(self.observation_space, parts)
 
     def step_async(self, actions: Any) -> None:
-        """Stores the actions for :meth:`step_wait`."""
-        if len(actions) != self.num_envs:
-            raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
+        self._check_count(actions)
         self._actions = actions
 
     def step_wait(self) -> StepResult:
-        """Steps with the actions of :meth:`step_async`; returns the same as :meth:`step`."""
         self.n_steps += 1
         parts, infos = [], []
         rewards, dones = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
@@ -96,7 +92,7 @@ class DummyVecEnv(VecEnv):
                 obs = self._reset_env(i, env)
             parts.append(obs)
             infos.append(info)
-        return self._stack(parts), rewards, dones, infos
+        return stacked(self.observation_space, parts), rewards, dones, infos
 
     def _reset_env(self, i: int, env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Resets one environment; returns a copy of its observation."""
@@ -108,27 +104,18 @@ class DummyVecEnv(VecEnv):
             ) from error
         return batching.copy_observation(env.observation_space, obs)
 
-    def _stack(self, parts: list[Any]) -> Any:
-        space = self.observation_space
-        empty: Any = create_empty_array(space, self.num_envs)
-        return concatenate(space, parts, empty)
-
     def close(self) -> None:
-        """Closes every environment."""
         for env in self.envs:
             env.close()
 
     def get_images(self) -> list[np.ndarray]:
-        """Returns an image of each environment, ``uint8 (height, width, 3)``."""
         check_renders(self)
         return [rgb_frame(env) for env in self.envs]
 
     def has_attr(self, attr_name: str) -> bool:
-        """Returns whether every environment or one of its wrappers has the attribute."""
         return all(env.has_wrapper_attr(attr_name) for env in self.envs)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns an attribute of each environment, looked up through its wrappers."""
         return [env.get_wrapper_attr(attr_name) for env in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
@@ -143,11 +130,9 @@ class DummyVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of each environment, looked up through its wrappers, and returns the results."""
         return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        """Returns for each environment whether it is wrapped in that class."""
         return [is_wrapped(env, wrapper_class) for env in self._chosen(indices)]
 
     def _chosen(self, indices: Indices) -> list[gym.Env]:

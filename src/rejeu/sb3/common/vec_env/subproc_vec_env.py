@@ -7,15 +7,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector.utils import concatenate, create_empty_array
 
+from rejeu.envs.rendering import rgb_frame
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers import calls
 from rejeu.envs.workers.local import Processes, ProcessWorker
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
 from rejeu.envs.workers.process import Failure
 from rejeu.errors import BadEnvironmentError, WorkerError
-from rejeu.reporting.video import rgb_frame
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
     TIME_LIMIT_TRUNCATED,
@@ -23,6 +22,7 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     StepResult,
     VecEnv,
     is_wrapped,
+    stacked,
 )
 
 __all__ = ["SubprocVecEnv"]
@@ -78,12 +78,11 @@ class SubprocVecEnv(VecEnv):
         return [worker.process for worker in self.workers.workers if isinstance(worker, ProcessWorker)]
 
     def reset(self) -> Any:
-        """Resets every environment, with the seeds and options set before, and returns the observations."""
         for i, (obs, info) in self._reset(range(self.num_envs)).items():
             self._last[i], self.reset_infos[i] = obs, info
         self._reset_seeds()
         self._reset_options()
-        return self._stack(self._last)
+        return stacked(self.observation_space, self._last)
 
     def _reset(self, numbers: Sequence[int]) -> dict[int, tuple[Any, dict[str, Any]]]:
         """Resets some environments, again where the process had to be replaced; returns observations and infos."""
@@ -96,15 +95,12 @@ class SubprocVecEnv(VecEnv):
         return done
 
     def step_async(self, actions: Any) -> None:
-        """Starts a step with one action for each environment."""
-        if len(actions) != self.num_envs:
-            raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
+        self._check_count(actions)
         self._n_steps += 1
         self.workers.send({i: ("call", calls.step_and_reset, action) for i, action in enumerate(actions)})
         self.waiting = True
 
     def step_wait(self) -> StepResult:
-        """Waits for the step started by :meth:`step_async`; returns the same as :meth:`step`."""
         self.waiting = False
         replies = self._receive(range(self.num_envs))
         lost = {i: reply.why for i, reply in replies.items() if isinstance(reply, Restarted)}
@@ -115,32 +111,32 @@ class SubprocVecEnv(VecEnv):
         for i in np.flatnonzero(dones).tolist():
             self.reset_infos[i] = reset_infos[i]
         self._last = list(obs)
-        return self._stack(self._last), np.array(rewards, np.float32), np.array(dones, bool), list(infos)
+        return (
+            stacked(self.observation_space, self._last),
+            np.array(rewards, np.float32),
+            np.array(dones, bool),
+            list(infos),
+        )
 
     def close(self) -> None:
         """Ends the processes; a second call does nothing."""
         self.workers.close()
 
     def get_images(self) -> list[np.ndarray]:
-        """Returns an image of each environment, ``uint8 (height, width, 3)``."""
         return self._call(range(self.num_envs), _render)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns an attribute of each environment, looked up through its wrappers."""
         return self._call(self._get_indices(indices), calls.get_attr, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Sets an attribute of each environment where it exists, also inside wrappers."""
         self._call(self._get_indices(indices), calls.set_attr, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of each environment, looked up through its wrappers, and returns the results."""
         return self._call(self._get_indices(indices), calls.call_method, method_name, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        """Returns for each environment whether it is wrapped in that class."""
         return self._call(self._get_indices(indices), is_wrapped, wrapper_class)
 
     def _call(self, indices: Sequence[int] | range, function: Callable[..., Any], *arguments: Any) -> list[Any]:
@@ -169,10 +165,6 @@ class SubprocVecEnv(VecEnv):
                     raise BadEnvironmentError(with_location(type(self).__name__, i, self._n_steps, answer.message))
                 raise WorkerError(f"environment {i} raised an error:\n{answer.trace}")
         return replies
-
-    def _stack(self, parts: list[Any]) -> Any:
-        empty: Any = create_empty_array(self.observation_space, self.num_envs)
-        return concatenate(self.observation_space, parts, empty)
 
 
 def _render(env: gym.Env) -> Any:

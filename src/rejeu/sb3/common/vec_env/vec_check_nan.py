@@ -33,20 +33,17 @@ class VecCheckNan(VecEnvWrapper):
         """Actions of the last step, None after a reset."""
 
     def step_async(self, actions: Any) -> None:
-        """Starts a step with one action for each environment."""
         self._check(actions, "the actions")
         self._last_actions = actions
         self.venv.step_async(actions)
 
     def reset(self) -> Any:
-        """Resets the environments and returns the observations."""
         obs = self.venv.reset()
         self._last_actions = None
         self._check(obs, "the observations of reset")
         return obs
 
     def step_wait(self) -> StepResult:
-        """Steps the environments and returns observations, rewards, dones and infos."""
         obs, rewards, dones, infos = self.venv.step_wait()
         self._check(obs, "the observations")
         self._check(rewards, "the rewards")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, StepResult, VecEnv, VecEnvWrapper
+from rejeu.sb3.common.vec_env.base_vec_env import ObservationWrapper, VecEnv
 
 __all__ = ["VecExtractDictObs"]
 
 
-class VecExtractDictObs(VecEnvWrapper):
+class VecExtractDictObs(ObservationWrapper):
     """Replaces Dict observations by one of their entries.
 
     Args:
@@ -25,14 +25,6 @@ class VecExtractDictObs(VecEnvWrapper):
         super().__init__(venv, space[key])
         self.key = key
 
-    def reset(self) -> np.ndarray:
-        """Resets the environments and returns that entry of the observations."""
-        return self.venv.reset()[self.key]
-
-    def step_wait(self) -> StepResult:
-        """Steps the environments and returns that entry of the observations, rewards, dones and infos."""
-        obs, rewards, dones, infos = self.venv.step_wait()
-        for info in infos:
-            if TERMINAL_OBSERVATION in info:
-                info[TERMINAL_OBSERVATION] = info[TERMINAL_OBSERVATION][self.key]
-        return obs[self.key], rewards, dones, infos
+    def map_observation(self, obs: dict[str, np.ndarray]) -> np.ndarray:
+        """Returns that entry of the observations."""
+        return obs[self.key]

@@ -52,7 +52,6 @@ class VecFrameStack(VecEnvWrapper):
         self._stack: dict[str, np.ndarray] = {}
 
     def reset(self) -> Any:
-        """Resets the environments and returns the stacked observations."""
         obs = by_key(self.venv.reset())
         for key, newest in obs.items():
             width = newest.shape[self._axes[key] + 1]
@@ -63,7 +62,6 @@ class VecFrameStack(VecEnvWrapper):
         return self._stacked()
 
     def step_wait(self) -> StepResult:
-        """Steps the environments and returns stacked observations, rewards, dones and infos."""
         obs, rewards, dones, infos = self.venv.step_wait()
         ended = np.flatnonzero(dones).tolist()
         last = {i: by_key(infos[i][TERMINAL_OBSERVATION]) for i in ended if TERMINAL_OBSERVATION in infos[i]}

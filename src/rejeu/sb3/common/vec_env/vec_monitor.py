@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rejeu.io import atomic
-from rejeu.io.failed_writes import FailedWrites
-from rejeu.sb3.common.monitor import Monitor, csv_line, monitor_path
+from rejeu.sb3.common.monitor import Monitor, MonitorFile, keywords_of
 from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper
 
 __all__ = ["VecMonitor"]
@@ -38,28 +33,21 @@ class VecMonitor(VecEnvWrapper):
         self.episode_count = 0
         self.episode_returns = np.zeros(self.num_envs)
         self.episode_lengths = np.zeros(self.num_envs, np.int64)
-        self.path = None if filename is None else monitor_path(filename)
-        self._failed_writes = FailedWrites()
-        if self.path is not None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("w", newline="\n", encoding="utf-8") as file:
-                file.write(f"#{json.dumps({'t_start': self.t_start, 'env_id': None})}\n")
-                csv.writer(file).writerow(("r", "l", "t", *self.info_keywords))
+        columns, start = ("r", "l", "t", *self.info_keywords), {"t_start": self.t_start, "env_id": None}
+        self._file = None if filename is None else MonitorFile(filename, columns, start)
+        self.path = None if self._file is None else self._file.path
 
     def close(self) -> None:
-        """Writes rows that could not be written before, if possible, and closes the environments."""
-        self._failed_writes.retry()
-        self._failed_writes.warn()
+        if self._file is not None:
+            self._file.close()
         super().close()
 
     def reset(self) -> Any:
-        """Resets the environments and returns the observations."""
         self.episode_returns = np.zeros(self.num_envs)
         self.episode_lengths = np.zeros(self.num_envs, np.int64)
         return self.venv.reset()
 
     def step_wait(self) -> StepResult:
-        """Steps the environments and returns observations, rewards, dones and infos."""
         obs, rewards, dones, infos = self.venv.step_wait()
         self.episode_returns += rewards
         self.episode_lengths += 1
@@ -69,18 +57,11 @@ class VecMonitor(VecEnvWrapper):
         return obs, rewards, dones, infos
 
     def _end_episode(self, i: int, info: dict[str, Any]) -> dict[str, Any]:
-        row = {
-            "r": float(self.episode_returns[i]),
-            "l": int(self.episode_lengths[i]),
-            "t": round(time.time() - self.t_start, 6),
-        }
-        for key in self.info_keywords:
-            if key not in info:
-                raise ValueError(f"info_keywords: the info of an episode's last step has no {key!r}, only {[*info]}")
-            row[key] = info[key]
+        seconds = round(time.time() - self.t_start, 6)
+        row: dict[str, Any] = {"r": float(self.episode_returns[i]), "l": int(self.episode_lengths[i]), "t": seconds}
+        row |= keywords_of(info, self.info_keywords)
         self.episode_count += 1
         self.episode_returns[i] = self.episode_lengths[i] = 0
-        if self.path is not None:
-            line = csv_line(row, ("r", "l", "t", *self.info_keywords))
-            self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), line)
+        if self._file is not None:
+            self._file.append(row)
         return row

@@ -151,7 +151,6 @@ class VecNormalize(VecEnvWrapper):
         self.returns, self.old_reward = np.zeros(self.num_envs), np.zeros(self.num_envs, np.float32)
 
     def reset(self) -> Any:
-        """Resets the environments and returns the normalized observations."""
         obs = self.venv.reset()
         self.old_obs, self.returns = obs, np.zeros(self.num_envs)
         self._update(obs)
@@ -226,12 +225,7 @@ class VecNormalize(VecEnvWrapper):
 
     def statistics(self) -> dict[str, np.ndarray]:
         """Returns the statistics as arrays by name."""
-        arrays = {f"returns.{name}": value for name, value in _arrays(self.ret_rms).items()}
-        if isinstance(self.obs_rms, dict):
-            arrays |= {f"obs.{i}.{n}": v for i, m in enumerate(self.obs_rms.values()) for n, v in _arrays(m).items()}
-        elif self.obs_rms is not None:
-            arrays |= {f"obs.{name}": value for name, value in _arrays(self.obs_rms).items()}
-        return arrays
+        return {f"{name}.{part}": a for name, one in self._moments().items() for part, a in _arrays(one).items()}
 
     def put_statistics(self, arrays: Mapping[str, np.ndarray], path: str | Path = "the statistics") -> None:
         """Restores what :meth:`statistics` returned; ``path`` names the source in messages.
@@ -239,17 +233,19 @@ class VecNormalize(VecEnvWrapper):
         Raises:
             CheckpointError: if the arrays are damaged or belong to other observations.
         """
-        left = dict(arrays)
-        _restore(self.ret_rms, left, "returns", path)
+        _check_specs(arrays, self.statistics(), path)
+        for name, array in arrays.items():
+            if not np.isfinite(array).all() or (not name.endswith(".mean") and (array < 0).any()):
+                raise CheckpointError(f"{path}: {name} has negative values, or values that are not finite")
+        for name, moments in self._moments().items():
+            moments.mean, moments.var = arrays[f"{name}.mean"], arrays[f"{name}.var"]
+            moments.count = float(arrays[f"{name}.count"])
+
+    def _moments(self) -> dict[str, RunningMeanStd]:
+        """Returns all moments by name."""
         if isinstance(self.obs_rms, dict):
-            for i, moments in enumerate(self.obs_rms.values()):
-                _restore(moments, left, f"obs.{i}", path)
-        elif self.obs_rms is not None:
-            _restore(self.obs_rms, left, "obs", path)
-        if left:
-            raise CheckpointError(
-                f"{path} has the unexpected array {checkpoint.shown(min(left))}; it was saved with other settings"
-            )
+            return {"returns": self.ret_rms} | {f"obs.{i}": one for i, one in enumerate(self.obs_rms.values())}
+        return {"returns": self.ret_rms} | ({} if self.obs_rms is None else {"obs": self.obs_rms})
 
     def save(self, save_path: str | Path) -> Path:
         """Writes statistics and settings to a safetensors file, without the environments; returns its path.
@@ -322,25 +318,6 @@ def _check_specs(found: Mapping[str, Any], own: Mapping[str, Any], path: str | P
             f"{path}: {checkpoint.shown(name)} is {checkpoint.shown(forms[0].get(name, 'missing'))}, expected "
             f"{forms[1].get(name, 'no such array')}; it was saved with other observations or settings"
         )
-
-
-def _restore(moments: RunningMeanStd, arrays: dict[str, np.ndarray], name: str, path: str | Path) -> None:
-    """Restores moments from a file's arrays, which are removed from ``arrays``.
-
-    Raises:
-        CheckpointError: if they are missing or invalid.
-    """
-    found = {}
-    for part, shape in (("mean", moments.mean.shape), ("var", moments.mean.shape), ("count", ())):
-        array = arrays.pop(f"{name}.{part}", None)
-        if array is None or array.shape != shape or array.dtype != np.float64 or not np.isfinite(array).all():
-            same = array is not None and array.shape == shape
-            got = "no value" if array is None else "other values" if same else f"the shape {array.shape}"
-            raise CheckpointError(f"{path}: {name}.{part} has {got}, expected finite float64 of the shape {shape}")
-        if part != "mean" and (array < 0).any():
-            raise CheckpointError(f"{path}: {name}.{part} has negative values")
-        found[part] = array
-    moments.mean, moments.var, moments.count = found["mean"], found["var"], float(found["count"])
 
 
 def _written(key: str, value: float) -> float | bool | None:

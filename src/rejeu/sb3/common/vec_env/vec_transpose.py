@@ -7,19 +7,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.sb3.common.vec_env.base_vec_env import (
-    TERMINAL_OBSERVATION,
-    StepResult,
-    VecEnv,
-    VecEnvWrapper,
-    by_key,
-    is_image,
-)
+from rejeu.sb3.common.vec_env.base_vec_env import ObservationWrapper, VecEnv, by_key, is_image
 
 __all__ = ["VecTransposeImage"]
 
 
-class VecTransposeImage(VecEnvWrapper):
+class VecTransposeImage(ObservationWrapper):
     """Moves the channels of images to the front: ``(height, width, channels)`` becomes ``(channels, height, width)``.
 
     rejeu's networks accept either order; this is for scripts that use the observations themselves.
@@ -57,14 +50,6 @@ class VecTransposeImage(VecEnvWrapper):
         transposed = {key: self.transpose_image(part) if key in self._keys else part for key, part in parts.items()}
         return transposed.get("", transposed)
 
-    def reset(self) -> Any:
-        """Resets the environments and returns the transposed observations."""
-        return self.transpose_observations(self.venv.reset())
-
-    def step_wait(self) -> StepResult:
-        """Steps the environments and returns transposed observations, rewards, dones and infos."""
-        obs, rewards, dones, infos = self.venv.step_wait()
-        for info in infos:
-            if TERMINAL_OBSERVATION in info:
-                info[TERMINAL_OBSERVATION] = self.transpose_observations(info[TERMINAL_OBSERVATION])
-        return self.transpose_observations(obs), rewards, dones, infos
+    def map_observation(self, obs: Any) -> Any:
+        """Returns observations with their images transposed."""
+        return self.transpose_observations(obs)

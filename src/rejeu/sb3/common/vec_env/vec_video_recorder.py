@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rejeu.reporting.video import VideoFile, check_renders
+from rejeu.envs.rendering import check_renders
+from rejeu.reporting.video_file import VideoFile
 from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper, tile_images
 
 __all__ = ["VecVideoRecorder"]
@@ -60,14 +61,12 @@ class VecVideoRecorder(VecEnvWrapper):
         return self._video is not None
 
     def reset(self) -> Any:
-        """Resets the environments and returns the observations."""
         obs = self.venv.reset()
         if self.record_video_trigger(self.step_id):
             self._start()
         return obs
 
     def step_wait(self) -> StepResult:
-        """Waits for the step started by ``step_async``; returns the same as :meth:`step`."""
         result = self.venv.step_wait()
         self.step_id += 1
         if self._video is not None:
@@ -77,7 +76,6 @@ class VecVideoRecorder(VecEnvWrapper):
         return result
 
     def close(self) -> None:
-        """Completes a recording in progress and closes the environments."""
         self._end()
         self.venv.close()
 

@@ -1,0 +1,140 @@
+"""Rendering of environments to arrays, with and without a display."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+DEFAULT_FPS = 30.0
+"""Frames per second of environments that declare none."""
+
+
+def make_rendering_env(
+    make: Callable[..., gym.Env], env_id: str, plain_kwargs: Mapping[str, Any] = MappingProxyType({})
+) -> gym.Env:
+    """Returns ``make(render_mode="rgb_array")``, an environment that renders to arrays.
+
+    Args:
+        make: makes environments.
+        env_id: id for messages.
+        plain_kwargs: keyword arguments with which ``make`` makes an environment that does not render.
+
+    Raises:
+        ValueError: if the environment lacks this render mode, about which ``gymnasium.make`` only warns.
+    """
+    plain = make(**plain_kwargs)
+    modes = plain.metadata.get("render_modes") or []
+    plain.close()
+    if "rgb_array" not in modes:
+        raise ValueError(
+            f"{env_id} cannot be rendered to arrays: its render modes are {list(modes)}, expected 'rgb_array' among them; "
+            "pass another environment as env="
+        )
+    return make(render_mode="rgb_array")
+
+
+def check_renders(env: Any) -> None:
+    """Raises ValueError unless ``env``, an environment or a vector of them, was made to render to arrays."""
+    if env.render_mode != "rgb_array":
+        raise ValueError(
+            f"an environment made with render_mode={env.render_mode!r} cannot be recorded; make it with "
+            "gymnasium.make(id, render_mode='rgb_array')"
+        )
+
+
+def natural_fps(env: gym.Env) -> float:
+    """Returns the environment's ``render_fps``, or 30."""
+    return float(env.metadata.get("render_fps") or DEFAULT_FPS)
+
+
+def rgb_frame(env: gym.Env) -> np.ndarray:
+    """Returns a rendered frame, ``uint8 (height, width, 3)``; needs no display.
+
+    Raises:
+        ValueError: if it renders anything else, or if MuJoCo has no OpenGL context.
+    """
+    with display_for_pygame(), explain_mujoco_errors(env):
+        frame = env.render()
+    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3:
+        got = f"an array of shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
+        raise ValueError(
+            f"{env} cannot be recorded: render() returned {got}, expected an array (height, width, 3); make it with "
+            "render_mode='rgb_array'"
+        )
+    return frame
+
+
+@contextmanager
+def display_for_pygame() -> Iterator[None]:
+    """Lets pygame render without a display, by SDL's ``dummy`` driver; restores the environment variable at the end.
+
+    While ``SDL_VIDEODRIVER=dummy`` is set, highway-env renders black frames. Therefore the variable is set only while pygame's
+    display is opened.
+    """
+    before = os.environ.get("SDL_VIDEODRIVER")
+    driver = "dummy" if before is None and is_headless() else before
+    try:
+        if driver == "dummy":
+            os.environ["SDL_VIDEODRIVER"] = driver
+            if "pygame" in sys.modules:
+                display = sys.modules["pygame"].display
+                if not display.get_init():
+                    display.init()
+                del os.environ["SDL_VIDEODRIVER"]
+        yield
+    finally:
+        if before is None:
+            os.environ.pop("SDL_VIDEODRIVER", None)
+        else:
+            os.environ["SDL_VIDEODRIVER"] = before
+
+
+@contextmanager
+def headless_mujoco() -> Iterator[None]:
+    """Lets MuJoCo render without a display, by EGL or OSMesa, unless ``MUJOCO_GL`` is set; restores it at the end."""
+    if "mujoco" not in sys.modules or "MUJOCO_GL" in os.environ or not is_headless():
+        yield
+        return
+    libraries = {"egl": "EGL", "osmesa": "OSMesa"}
+    driver = next((name for name, library in libraries.items() if ctypes.util.find_library(library)), None)
+    try:
+        if driver is not None:
+            os.environ["MUJOCO_GL"] = driver
+        yield
+    finally:
+        os.environ.pop("MUJOCO_GL", None)
+
+
+def is_headless() -> bool:
+    """Returns whether this is Linux without a display."""
+    return sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+
+
+@contextmanager
+def explain_mujoco_errors(env: gym.Env) -> Iterator[None]:
+    """Raises ``ValueError`` with the fix if MuJoCo cannot render without a display."""
+    try:
+        with headless_mujoco(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"\(\d+\) b'")  # GLFW's, which the error below explains
+            yield
+    except Exception as error:
+        kind = type(error)
+        if (kind.__module__, kind.__name__) != ("mujoco", "FatalError"):
+            raise
+        chosen = os.environ.get("MUJOCO_GL")
+        fix = "set the environment variable MUJOCO_GL=egl (or osmesa) before starting Python"
+        if chosen is None:
+            fix = f"install EGL (on Debian and Ubuntu libegl1) or OSMesa (libosmesa6), or {fix}"
+        raise ValueError(
+            f"{env} cannot be rendered: MuJoCo has no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a display "
+            f"or an offscreen renderer; {fix}"
+        ) from error

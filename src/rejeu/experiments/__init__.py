@@ -1,0 +1,1 @@
+"""Many runs at once: sweeps, studies and populations, and the scheduler that trains their runs."""

@@ -1,0 +1,239 @@
+"""The description of a run. The command line, ``config.json``, sweeps and processes read and write it.
+
+Each field is declared once: its type with its range, its default, and how the command line shows it. As asked for, None
+stands for what the preset or the environment decides; ``config.json`` has every field as it was decided.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+
+from msgspec import Meta
+
+from rejeu.errors import CheckpointError
+from rejeu.io import atomic
+from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, read_json, shown
+from rejeu.runs.values import assignment_words
+
+R = TypeVar("R", bound="RunConfig")
+MAX_BYTES = 2**20
+"""Upper limit on the size of a ``config.json``."""
+LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
+"""What the argument ``log`` takes."""
+MAX_EPISODES = 10_000
+"""Upper limit on the episodes of an evaluation while training."""
+RENAMED = {"film_every": "video_every", "envs": "n_envs", "wrapper": "wrappers"}
+"""Fields of earlier versions, and their present names."""
+
+
+WORDS_OF_THEIR_OWN = ("env", "env_kwargs", "wrappers", "imports", "hyperparameters")
+"""Fields that are not one option with its value."""
+
+
+class Shown(NamedTuple):
+    """How the command line shows a field."""
+
+    metavar: str
+    name: str = ""
+    """Without dashes; empty for the name of the field."""
+    default: str = ""
+    """What help says of the default, beside the description."""
+    is_positional: bool = False
+
+
+Name = Annotated[str, Meta(max_length=300)]
+Key = Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]{0,199}\Z")]
+"""A name that cannot be taken for an option of the command line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentOptions:
+    """How an environment is made. Abstract: options of the commands that use one."""
+
+    env_kwargs: Annotated[dict[Key, Any], Shown("NAME=VALUE ...")] = field(default_factory=dict)
+    """Keyword arguments of the environment: sigma=2 map_name=8x8."""
+    wrappers: Annotated[tuple[str, ...], Shown("MODULE:CLASS", "wrapper")] = ()
+    """Wrap it in this gymnasium.Wrapper, such as gymnasium.wrappers:FlattenObservation; repeat for several, inner first."""
+    imports: Annotated[tuple[str, ...], Shown("MODULE", "import")] = ()
+    """Import this module or Python file first: one that registers algorithms or environments; repeat for several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(EnvironmentOptions):
+    """The description of a run."""
+
+    env: Annotated[str, Shown("ENV", is_positional=True)]
+    """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
+    algorithm: Annotated[str | None, Shown("NAME", "algo")] = None
+    """Algorithm; by default the preset's, else the one that fits the environment's actions."""
+    preset: Annotated[str | bool | None, Shown("FILE")] = None
+    """Use the preset in this file, such as the preset.json of rejeu tune, in the place of rejeu's own."""
+    steps: Annotated[Positive | None, Shown("N")] = None
+    """Environment steps to take, over all environments; by default the preset's, else 100000."""
+    minutes: Annotated[Duration | None, Shown("M")] = None
+    """Train for this long instead."""
+    n_envs: Annotated[EnvCount | None, Shown("N", "envs")] = None
+    """Environments stepped at once; by default the preset's, else 1."""
+    backend: Annotated[Name | None, Shown("NAME")] = None
+    """auto, envpool, gymnasium, gymnasium-async, jax or ray; by default the preset's, else auto."""
+    restart_workers: Annotated[int, Meta(ge=0), Shown("N")] = 0
+    """With --backend gymnasium-async or ray: how many workers that crashed, hung or were lost are restarted."""
+    wait_for: Annotated[Positive | None, Shown("K")] = None
+    """With these: take the first K results that arrive, and do not wait for the other environments."""
+    arrivals: Annotated[str | None, Shown("FILE")] = None
+    """With --wait-for: take the results in the order of an earlier run, its arrivals.npy."""
+    ray: Annotated[str | None, Shown("ADDRESS")] = None
+    """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
+    env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N")] = None
+    """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
+    device: Annotated[str, Shown("NAME")] = "auto"
+    """auto, cpu or gpu; auto is the device that JAX chooses, a GPU if it has one."""
+    seed: Annotated[Seed | None, Shown("N")] = None
+    """Seeds everything; by default a random one."""
+    hyperparameters: Annotated[dict[Key, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    """Hyperparameters, dotted where nested: "policy_kwargs.net_arch=[64,64]" "train_freq=[1,'episode']"."""
+    success_threshold: Annotated[float | None, Shown("RETURN")] = None
+    """Return from which on an episode counts as a success; by default what the environment reports or declares."""
+    video_every: Annotated[Positive | None, Shown("N")] = None
+    """Environment steps between two videos of the policy, in the folder videos; by default none are recorded."""
+    checkpoint_minutes: Annotated[Annotated[float, Meta(ge=0)] | None, Shown("M", default="(default: 5)")] = 5.0
+    """Minutes between two checkpoints, from which rejeu resume continues; 0 for none."""
+    evaluate_every: Annotated[Positive | None, Shown("N")] = None
+    """Environment steps between two evaluations; by default the preset's, else 5000."""
+    evaluate_episodes: Annotated[Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N")] = None
+    """Episodes of each evaluation; by default the preset's, else 20."""
+    log: Annotated[tuple[Name, ...], Shown("NAME ...")] = ()
+    """Log to these too: json, tensorboard, wandb, mlflow, trackio. metrics.csv is always written."""
+
+    env_argument: str = ""
+    """How the environment was named on the command line, if that is not its id. It is never imported."""
+    policy: str = ""
+    """Empty where the environment decides."""
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.minutes is not None:
+            raise ValueError(f"steps={self.steps} and minutes={self.minutes:g} exclude each other; give one of them")
+
+    @property
+    def typed(self) -> str:
+        """The environment as it was named on the command line."""
+        return self.env_argument or self.env
+
+    @property
+    def names_code(self) -> bool:
+        """Whether its environment is imported, or made with more than numbers and words, which no file may ask for."""
+        from rejeu.envs.registry import are_plain, is_plain_id  # Gymnasium takes longer than all that --help needs
+
+        is_imported = not is_plain_id(self.typed) or self.typed.endswith(".py")
+        return is_imported or bool(self.wrappers) or not are_plain(self.env_kwargs)
+
+    def environment_words(self, option: bool = False) -> list[str]:
+        """Returns the words of a command line that make the environment.
+
+        Args:
+            option: whether the command takes the environment as ``--env``, and needs it only if a file may not name it.
+
+        >>> RunConfig(env="my_env.py", env_kwargs={"g": 9.8}).environment_words(option=True)
+        ['--env', 'my_env.py', '--env-kwargs', 'g=9.8']
+        >>> RunConfig(env="CartPole-v1", imports=("my_algorithm.py",)).environment_words(option=True)
+        ['--import', 'my_algorithm.py']
+        """
+        named = ["--env", self.typed] if option else [self.typed]
+        named += assignment_words("--env-kwargs", self.env_kwargs)
+        named += chain.from_iterable(("--wrapper", name) for name in self.wrappers)
+        imports = chain.from_iterable(("--import", name) for name in self.imports)
+        return [*(named if self.names_code or not option else ()), *imports]
+
+    def words(self) -> list[str]:
+        """Returns the words of the command line that begins this run: ``rejeu`` is followed by them.
+
+        >>> RunConfig(env="CartPole-v1", algorithm="PPO", n_envs=8, hyperparameters={"gamma": 0.9}).words()
+        ['train', 'CartPole-v1', '--algo', 'PPO', '--envs', '8', '--set', 'gamma=0.9']
+        """
+        words = ["train", *self.environment_words()]
+        for one, shown_as in options(RunConfig):
+            value = getattr(self, one.name)
+            if one.name in WORDS_OF_THEIR_OWN or value == one.default or isinstance(value, bool):
+                continue
+            words.append(f"--{(shown_as.name or one.name).replace('_', '-')}")
+            words += value if isinstance(value, tuple) else [f"{value:g}" if isinstance(value, float) else str(value)]
+        return [*words, *assignment_words("--set", self.hyperparameters)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecidedRun(RunConfig):
+    """The description of a run of which nothing is left to the preset or the environment; ``config.json`` is one."""
+
+    algorithm: str
+    preset: bool
+    """Whether the hyperparameters are those of a preset, except where the command line changed them."""
+    hyperparameters: dict[Key, Any]
+    """All of them, defaults included."""
+    seed: Seed
+    n_envs: EnvCount
+    backend: Name
+    """The backend that stepped the environments; never ``auto``."""
+    policy: str
+    evaluate_every: Positive
+    evaluate_episodes: Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
+    device: Annotated[str, Meta(pattern="^(auto|cpu|gpu)$")] = "auto"
+    """The device that was asked for; the run can be resumed and its models loaded on any."""
+    log: tuple[Annotated[str, Meta(pattern=f"^({'|'.join(LOGS)})$")], ...] = ()
+
+
+def options(kind: type) -> Iterator[tuple[dataclasses.Field[Any], Shown]]:
+    """Yields the fields of a class that the command line shows."""
+    hints = get_type_hints(kind, include_extras=True)
+    for one in dataclasses.fields(kind):
+        marks = getattr(hints[one.name], "__metadata__", ())
+        yield from ((one, mark) for mark in marks if isinstance(mark, Shown))
+
+
+def parse(content: Any, kind: type[R]) -> R:
+    """Returns the run that JSON values describe, also those of earlier versions.
+
+    Raises:
+        CheckpointError: if they are damaged.
+    """
+    if isinstance(content, dict):
+        content = {RENAMED.get(name, name): value for name, value in content.items()}
+    return convert(content, kind)
+
+
+def read(path: Path) -> DecidedRun:
+    """Returns what :func:`write` wrote.
+
+    Raises:
+        CheckpointError: if the file is damaged.
+        OSError: if it cannot be read.
+    """
+    try:
+        return parse(read_json(path, MAX_BYTES), DecidedRun)
+    except (Malformed, CheckpointError) as error:
+        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
+
+
+def write(path: Path, config: DecidedRun) -> None:
+    """Writes ``config.json``, with the versions of what ran."""
+    content = {**dataclasses.asdict(config), "versions": versions()}
+    with atomic.replacing(path) as file:
+        file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def versions() -> dict[str, str | None]:
+    """Returns the versions of Python and of the packages that matter for a run, None for those that are not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for package in ("rejeu", "jax", "jaxlib", "numpy", "equinox", "optax", "gymnasium", "envpool", "highway-env"):
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    return found

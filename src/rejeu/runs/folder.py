@@ -1,0 +1,192 @@
+"""The folder of a run: its files, and its models."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rejeu.errors import CheckpointError
+from rejeu.io import atomic
+from rejeu.io.records import WRONG
+from rejeu.runs import config
+from rejeu.runs.config import DecidedRun
+from rejeu.runs.values import quoted
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of one run."""
+
+    path: Path
+    """The folder."""
+
+    @property
+    def config(self) -> Path:
+        """Everything needed to repeat the run."""
+        return self.path / "config.json"
+
+    @property
+    def episodes(self) -> Path:
+        """One row an episode of training."""
+        return self.path / "episodes.csv"
+
+    @property
+    def metrics(self) -> Path:
+        """Means, losses and rates while training."""
+        return self.path / "metrics.csv"
+
+    @property
+    def evaluations(self) -> Path:
+        """One row an evaluation."""
+        return self.path / "evaluations.csv"
+
+    @property
+    def agent(self) -> Path:
+        """The last model."""
+        return self.path / "agent.safetensors"
+
+    @property
+    def best(self) -> Path:
+        """The model that evaluated best."""
+        return self.path / "best.safetensors"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints from which the run can be resumed."""
+        return self.path / "checkpoints"
+
+    @property
+    def arrivals(self) -> Path:
+        """In which order the results of environments were taken, of a run with ``wait_for``; see :func:`read_arrivals`."""
+        return self.path / "arrivals.npy"
+
+    @property
+    def curve(self) -> Path:
+        """The learning curve."""
+        return self.path / "curve.png"
+
+    @property
+    def replays(self) -> Path:
+        """Episodes of the trained agent, one row each; read by :mod:`rejeu.reporting.runs`."""
+        return self.path / "replays.csv"
+
+    @property
+    def report(self) -> Path:
+        """The page about the run."""
+        return self.path / "report.html"
+
+    @property
+    def warnings(self) -> Path:
+        """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.reporting.runs`."""
+        return self.path / "warnings.txt"
+
+    @property
+    def videos(self) -> Path:
+        """Folder of videos of the policy during training; earlier versions called it ``films``."""
+        videos, films = self.path / "videos", self.path / "films"
+        return films if films.is_dir() and not videos.exists() else videos
+
+    @property
+    def video(self) -> Path:
+        """A few episodes of the best model."""
+        return self.path / "video.mp4"
+
+
+def read_config(folder: RunFolder) -> DecidedRun:
+    """Returns what the ``config.json`` of a run says.
+
+    Raises:
+        FileNotFoundError: if it is not a run folder.
+        CheckpointError: if the file is damaged.
+    """
+    if not folder.config.is_file():
+        raise FileNotFoundError(
+            f"{folder.path} is no run folder: it holds no {folder.config.name}{newest_inside(folder.path)}"
+        )
+    return config.read(folder.config)
+
+
+def newest_inside(folder: Path) -> str:
+    """Returns the part of a message that names the newest run in a folder of runs; empty if there is none."""
+    configs = [*folder.glob("*/config.json")] if folder.is_dir() else []
+    if not configs:
+        return ""
+    newest = max(configs, key=lambda path: path.stat().st_mtime)
+    return f"; the newest of the {len(configs)} in it is {quoted(newest.parent)}"
+
+
+def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
+    """Makes an empty folder: ``out``, or a new one under ``runs`` named after the run and the time.
+
+    Raises:
+        FileExistsError: if ``out`` is a file or holds something.
+    """
+    if out is not None:
+        check_free(out)
+        out.mkdir(parents=True, exist_ok=True)
+        return RunFolder(out)
+    stem = re.sub(r"[^\w.-]+", "-", f"{env_id}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    n = 1
+    while True:
+        path = Path("runs") / (stem if n == 1 else f"{stem}-{n}")
+        try:
+            path.mkdir(parents=True)
+            return RunFolder(path)
+        except FileExistsError:
+            n += 1
+
+
+def check_free(out: Path | None) -> None:
+    """Raises ``FileExistsError`` if a run may not be written there: nothing is ever overwritten."""
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"--out {out} exists and is not an empty folder; name another, or remove it first")
+
+
+def write_arrivals(folder: RunFolder, arrivals: np.ndarray) -> None:
+    """Writes the order in which the results of environments were taken."""
+    with atomic.replacing(folder.arrivals) as file:
+        np.save(file, arrivals, allow_pickle=False)
+
+
+def read_arrivals(path: Path) -> np.ndarray:
+    """Returns what :func:`write_arrivals` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it is not a NumPy array without pickles.
+    """
+    try:
+        with path.open("rb") as file:  # np.load also opens zip files, which cannot be a record
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except (*WRONG, EOFError) as error:
+        raise CheckpointError(
+            f"{path} is not the arrivals.npy of a run: {' '.join(str(error).split())[:100]}"
+        ) from None
+
+
+def find_model(run: Path, which: Literal["best", "last"]) -> Path:
+    """Returns the model file of a run folder, or ``run`` itself if it is a file.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    if run.is_file():
+        return run
+    folder = RunFolder(run)
+    model = folder.best if which == "best" else folder.agent
+    if not run.is_dir():
+        raise FileNotFoundError(f"there is no run folder or model file {run}")
+    if not model.is_file():
+        newest = newest_inside(run)
+        if newest:
+            raise FileNotFoundError(f"{run} is no run folder{newest}")
+        other = "last" if which == "best" else "best"
+        raise FileNotFoundError(
+            f"{run} holds no {model.name}; is it a run folder? --which {other} takes the other model"
+        )
+    return model

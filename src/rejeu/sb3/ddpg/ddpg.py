@@ -1,5 +1,0 @@
-"""Deep deterministic policy gradient."""
-
-from rejeu.agents import DDPG
-
-__all__ = ["DDPG"]

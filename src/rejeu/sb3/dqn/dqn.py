@@ -1,5 +1,0 @@
-"""Deep Q-learning."""
-
-from rejeu.agents import DQN
-
-__all__ = ["DQN"]

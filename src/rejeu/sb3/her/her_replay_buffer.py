@@ -1,5 +1,0 @@
-"""The hindsight replay buffer."""
-
-from rejeu.buffers.hindsight import HerReplayBuffer
-
-__all__ = ["HerReplayBuffer"]

@@ -1,5 +1,0 @@
-"""Proximal policy optimization."""
-
-from rejeu.agents import PPO
-
-__all__ = ["PPO"]

@@ -1,5 +1,0 @@
-"""Soft actor-critic."""
-
-from rejeu.agents import SAC
-
-__all__ = ["SAC"]

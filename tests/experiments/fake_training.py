@@ -1,0 +1,71 @@
+"""Stands in for ``rejeu --task FILE``: writes the files of a run whose return grows with the steps taken.
+
+It grows by 1 over the whole run with the learning rate 1e-3, and by 1 less for each order of magnitude away from it.
+"""
+
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+HEADER = "step,seconds,success_rate,mean_return,std_return,mean_length,episodes,best"
+
+
+def stop_at_end():
+    sys.stdin.read()  # until the supervisor closes it
+    os._exit(143)
+
+
+def rate_of(value):
+    return float(value.removeprefix("lin_")) if isinstance(value, str) else value
+
+
+def main(file):
+    threading.Thread(target=stop_at_end, daemon=True).start()
+    task = json.loads(Path(file).read_text())
+    is_new, path = not task["resume"], Path(task["folder"])
+    if is_new:
+        preset = json.loads(Path(task["run"]["preset"]).read_text())
+        state = {"step": 0, "weight": 0.0, "seed": task["run"]["seed"], "preset": preset}
+        state["rate"] = rate_of(preset["hyperparameters"].get("learning_rate", 1e-3))
+    else:
+        state = json.loads(max((path / "checkpoints").glob("run_*.safetensors")).read_text())
+        preset = state["preset"]
+        state["rate"] = rate_of(task["changes"].get("learning_rate", state["rate"]))
+    (path / "checkpoints").mkdir(parents=True, exist_ok=True)
+    with (path.parent / "commands.txt").open("a") as file:
+        print("train" if is_new else "resume", path.name, file=file)
+    steps, every = preset["total_steps"], preset["evaluate_every"]
+    end = steps if task["pause"] is None else min(state["step"] + task["pause"], steps)
+    config = {"env": preset["env_id"], "algorithm": preset["algorithm"], "seed": state["seed"], "steps": steps}
+    (path / "config.json").write_text(json.dumps({**config, "hyperparameters": preset["hyperparameters"]}))
+    table = path / "evaluations.csv"
+    rows = table.read_text().splitlines()[1:] if table.exists() else []
+    rows = [row for row in rows if int(row.split(",")[0]) <= state["step"]]
+    table.write_text("\n".join([HEADER, *rows]) + "\n")
+    while state["step"] < end:
+        if state["rate"] > 5e-3:
+            print("rejeu: error: at step 20: the loss is NaN", flush=True)
+            sys.exit(2)
+        state["step"] += every
+        state["weight"] += (1 - abs(math.log10(state["rate"]) + 3)) * every / steps
+        value = state["weight"] + (state["seed"] % 7) / 100
+        with table.open("a") as file:
+            if str(state["step"]) != os.environ.get("NO_ROW_AT"):
+                file.write(f"{state['step']},{state['step'] / 100},nan,{value},0,1,3,0\n")
+        checkpoint = path / "checkpoints" / f"run_{state['step']:012d}.safetensors"
+        checkpoint.with_suffix(".tmp").write_text(json.dumps(state))
+        checkpoint.with_suffix(".tmp").replace(checkpoint)
+        if is_new and str(state["step"]) == os.environ.get("KILLED_AT"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.02)
+    episodes = [f"{step},0,{state['weight']},1,nan,{step / 100}" for step in range(1, state["step"] + 1)]
+    (path / "episodes.csv").write_text("\n".join(["step,env,return,length,success,seconds", *episodes]) + "\n")
+    (path / "agent.safetensors").write_text(json.dumps(state))
+
+
+main(sys.argv[1])

@@ -1,0 +1,49 @@
+"""The table of a sweep."""
+
+from rich.progress import Progress, TextColumn
+
+from rejeu.experiments import table
+from rejeu.experiments.coordinator import Coordinator
+from rejeu.experiments.folder import Sweep, open_folder
+from rejeu.experiments.jobs import Job
+from rejeu.interrupt import Interrupt
+from rejeu.runs.config import RunConfig
+from tests.experiments.test_scheduler import Launcher
+from tests.reporting.test_comparison import write_run
+
+
+def make(tmp_path):
+    """Returns a coordinator in the middle of a sweep: a run is done, one trains, one has failed, one waits."""
+    jobs = tuple(Job(name=f"job-{i}", run=RunConfig(env="CartPole-v1", seed=i, steps=1000)) for i in range(4))
+    folder = open_folder(tmp_path / "sweep", Sweep(jobs=jobs, threads=1), None, RunConfig(env=""))
+    write_run(folder.run(jobs[0]), level=100.0)
+    folder.write_exit(jobs[0], 0)
+    folder.write_exit(jobs[1], 2)
+    coordinator = Coordinator(folder, Launcher(capacity=1, ends={"job-2": [None]}), Interrupt(), RunConfig(env=""))
+    coordinator.scheduler.turn()
+    metrics = "step,time/time_elapsed,rollout/ep_rew_mean\n250,5,20\n500,10,30\n"
+    (folder.run(jobs[2]) / "metrics.csv").write_text(metrics, encoding="utf-8")
+    return coordinator
+
+
+def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
+    coordinator = make(tmp_path)
+    with Progress(TextColumn("{task.description} {task.fields[text]}")) as bars:
+        bars.add_task("all steps", total=None, text="")
+        table.draw(bars, coordinator)
+        everything, one = bars.tasks
+    assert (one.description, one.completed, one.total) == ("job-2", 500, 1000)
+    assert (everything.completed, everything.total) == (1500, 3000)  # the failed run is not trained
+    states = "1 running, 1 done, 1 failed, 1 waiting"
+    assert everything.fields["text"] == states
+    assert table.line(coordinator) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
+    assert table.closing_lines(coordinator)[0] == f"4 runs: {states}"
+    (coordinator.folder.run(coordinator.folder.jobs[2]) / "agent.safetensors").touch()
+    coordinator.scheduler.running[0].handle.status = 0
+    while coordinator.scheduler.running:
+        coordinator.scheduler.turn()
+    with Progress() as bars:
+        bars.add_task("all steps", total=None, text="")
+        bars.add_task("job-2", text="")
+        table.draw(bars, coordinator)
+        assert "job-2" not in {task.description for task in bars.tasks}

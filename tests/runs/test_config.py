@@ -1,0 +1,118 @@
+"""The description of a run: declared once, read from files of every version, and handed to processes as data."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.cli import commands, main, parsing
+from rejeu.errors import CheckpointError
+from rejeu.runs import config, task
+from rejeu.runs.config import DecidedRun, RunConfig
+from rejeu.runs.task import Task
+from tests.cli.test_cli import FEWER_FILES, TINY
+
+EARLIER = {
+    "env": "Pendulum-v1",
+    "algorithm": "SAC",
+    "preset": True,
+    "hyperparameters": {"gamma": 0.9},
+    "policy": "MlpPolicy",
+    "seed": 3,
+    "n_envs": 1,
+    "backend": "gymnasium",
+    "steps": 850,
+    "minutes": None,
+    "success_threshold": None,
+    "film_every": 700,
+    "evaluate_every": 400,
+    "evaluate_episodes": 2,
+    "checkpoint_minutes": None,
+    "versions": {"python": "3.11.7"},
+}
+"""What an early version wrote to ``config.json``."""
+
+RUNS = {
+    "little": RunConfig(env="CartPole-v1"),
+    "much": RunConfig(
+        env="my_env:Walk-v0",
+        env_kwargs={"g": 9.8, "map.size": [1, 2]},
+        wrappers=("a:B", "c:D"),
+        imports=("my_algorithm.py",),
+        algorithm="PPO",
+        n_envs=8,
+        seed=0,
+        steps=10**12,
+        checkpoint_minutes=0.0,
+        hyperparameters={"gamma": 0.9, "policy_kwargs.net_arch": [8], "train_freq": [1, "episode"]},
+        log=("json", "wandb"),
+    ),
+}
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
+
+def test_files_of_earlier_versions_are_read(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(EARLIER))
+    found = config.read(path)
+    assert (found.video_every, found.device, found.wrappers, found.n_envs) == (700, "auto", (), 1)
+    config.write(path, found)
+    assert config.read(path) == found
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"n_envs": 10**6},
+        {"seed": -1},
+        {"steps": 1.5},
+        {"device": "tpu"},
+        {"log": ["print"]},
+        {"algorithm": None},
+        {"minutes": 3.0},
+        {"hyperparameters": []},
+        {"evaluate_episodes": 10**9},
+        {"env_kwargs": {"--import": "evil.py"}},
+    ],
+)
+def test_what_is_out_of_range_is_damaged(tmp_path, changed):
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps({**EARLIER, **changed}))
+    with pytest.raises(CheckpointError, match=r"config\.json is damaged"):
+        config.read(path)
+
+
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_a_run_is_the_same_as_words_of_the_command_line_and_as_data(run, tmp_path):
+    command, arguments = parsing.parse(run.words(), commands.COMMANDS, "")
+    assert command == "train"
+    assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
+    task.write(tmp_path / "task.json", Task(folder="runs/1", run=run, pause=7))
+    command, arguments = commands.of_task(task.read(tmp_path / "task.json"))
+    assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
+    assert (command, str(arguments.out), arguments.pause) == ("train", "runs/1", 7)
+
+
+def test_every_field_of_a_decided_run_is_one_of_a_run():
+    assert [one.name for one in dataclasses.fields(DecidedRun)] == [one.name for one in dataclasses.fields(RunConfig)]
+
+
+def test_a_process_trains_and_continues_what_its_file_says(tmp_path):
+    settings = {"policy_kwargs.net_arch": [8], "learning_starts": 50, "batch_size": 8, "buffer_size": 5000}
+    run = RunConfig(
+        env="Pendulum-v1", algorithm="SAC", seed=3, steps=120, evaluate_episodes=1, hyperparameters=settings
+    )
+    one = Task(folder=str(tmp_path / "data"), run=run, pause=70, no_report=True, no_video=True)
+    for part in (one, dataclasses.replace(one, resume=True, pause=None)):
+        task.write(tmp_path / "task.json", part)
+        assert main(["--task", str(tmp_path / "task.json")]) == 0
+    words = ["train", "Pendulum-v1", "--algo", "SAC", "--seed", "3", "--steps", "120", "--evaluate-episodes", "1"]
+    assert main([*words, "--out", str(tmp_path / "words"), *FEWER_FILES, "--set", *TINY]) == 0
+    first, second = (rejeu.load(tmp_path / name / "agent.safetensors") for name in ("data", "words"))
+    for name, value in first.get_parameters().items():
+        np.testing.assert_array_equal(value, second.get_parameters()[name])
