@@ -71,9 +71,12 @@ def test_a_typical_mistake_is_named(check, wrong, message, capsys):
 @pytest.mark.parametrize("course", ["base", "dqn_ppo", "box", "goals"])
 def test_messages_are_in_both_languages_with_the_same_values(course):
     for exercise in base.messages(course).values():
-        for message in exercise.values():
-            assert message.keys() == {"en", "fr"}
-            fields = [{part[1] for part in string.Formatter().parse(text) if part[1]} for text in message.values()]
+        for name, message in exercise.items():
+            if name in ("case", "where", "right", "each", "compiles"):
+                continue
+            assert message.keys() - {"result"} == {"en", "fr"}
+            texts = (message["en"], message["fr"])
+            fields = [{part[1] for part in string.Formatter().parse(text) if part[1]} for text in texts]
             assert fields[0] == fields[1] or course == "base"
 
 

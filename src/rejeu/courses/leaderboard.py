@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import math
 import time
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rejeu.agents import load
 from rejeu.agents.policy import policy
+from rejeu.courses.notebooks import Language
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.errors import MissingExtra
@@ -31,55 +34,10 @@ from rejeu.reporting.evaluation import Evaluation, evaluate
 if TYPE_CHECKING:
     from jinja2 import Template
 
-Language = Literal["en", "fr"]
 MAX_MODELS = 1_000
 """Upper limit on the models of a folder; the others are left out, with a line that says so."""
 MAX_BYTES = 2**28
 """Upper limit on the size of a model."""
-TEXTS: dict[str, dict[str, Any]] = {
-    "en": {
-        "title": "Leaderboard:",
-        "columns": ("place", "model", "algorithm", "steps", "seed", "mean return", "95 % CI", "success", "length"),
-        "to": "to",
-        "episodes": "Episodes of each model: {n}, with the same seeds",
-        "places": "Models whose intervals overlap may be equally good: the place is the range that the intervals allow.",
-        "none": "No model could be evaluated.",
-        "problems": "Not evaluated",
-        "other_env": "it was trained on {said}, not on {env_id}",
-        "slow": "it needs more than {seconds:g} seconds for {n} episodes",
-        "not_finite": "the return of an episode is not a finite number",
-        "damaged": "{reason}",
-        "more": "{n:,} more files",
-        "first": "only the first {n:,} were evaluated",
-    },
-    "fr": {
-        "title": "Classement :",
-        "columns": (
-            "place",
-            "modèle",
-            "algorithme",
-            "pas",
-            "graine",
-            "retour moyen",
-            "IC à 95 %",
-            "succès",
-            "longueur",
-        ),
-        "to": "à",
-        "episodes": "Épisodes par modèle : {n}, avec les mêmes graines",
-        "places": "Des modèles dont les intervalles se recouvrent peuvent être aussi bons l'un que l'autre : la place est "
-        "l'étendue que permettent les intervalles.",
-        "none": "Aucun modèle n'a pu être évalué.",
-        "problems": "Non évalués",
-        "other_env": "il a été entraîné sur {said}, et non sur {env_id}",
-        "slow": "il lui faut plus de {seconds:g} secondes pour {n} épisodes",
-        "not_finite": "le retour d'un épisode n'est pas un nombre fini",
-        "damaged": "le fichier ne peut pas être lu : {reason}",
-        "more": "{n} autres fichiers",
-        "first": "seuls les {n} premiers ont été évalués",
-    },
-}
-"""The texts of a leaderboard by language."""
 NARROW_SPACE = "\N{NARROW NO-BREAK SPACE}"
 PROBLEMS = (ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 """Exceptions that a damaged or hostile model can cause."""
@@ -95,22 +53,16 @@ class Model:
     """Environment steps of its training."""
     seed: int
     evaluation: Evaluation
-
-
-@dataclass(frozen=True)
-class Row:
-    """A model with its places."""
-
-    model: Model
-    first: int
+    first: int = 1
     """Best place that the intervals allow: 1 and the number of models whose whole interval is above."""
-    last: int
+    last: int = 1
     """Worst place that the intervals allow."""
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the mean return; the mean itself for a single episode."""
-        return interval_of(self.model.evaluation)
+        """95 % confidence interval of the mean return; the mean twice for a single episode."""
+        low, high = self.evaluation.return_interval
+        return (self.evaluation.mean_return,) * 2 if math.isnan(low) else (low, high)
 
 
 @dataclass(frozen=True)
@@ -119,7 +71,7 @@ class Leaderboard:
 
     env_id: str
     episodes: int
-    rows: tuple[Row, ...]
+    rows: tuple[Model, ...]
     problems: tuple[tuple[str, str], ...]
     """Name and reason."""
     language: Language = "en"
@@ -127,7 +79,13 @@ class Leaderboard:
     @property
     def texts(self) -> Mapping[str, Any]:
         """The texts in its language."""
-        return TEXTS[self.language]
+        return texts()[self.language]
+
+
+@cache
+def texts() -> dict[str, dict[str, Any]]:
+    """Returns the texts of leaderboards by language and name."""
+    return tomllib.loads((resources.files("rejeu.courses") / "leaderboard.toml").read_text(encoding="utf-8"))
 
 
 def models(folder: Path) -> list[Path]:
@@ -208,19 +166,19 @@ def build(
     """
     done: list[Model] = []
     problems = []
-    texts = TEXTS[language]
+    said = texts()[language]
     if len(paths) > MAX_MODELS:
-        problems.append((texts["more"].format(n=len(paths) - MAX_MODELS), texts["first"].format(n=MAX_MODELS)))
+        problems.append((said["more"].format(n=len(paths) - MAX_MODELS), said["first"].format(n=MAX_MODELS)))
     with closing(make_vector(episodes)) as env:
         for path in paths[:MAX_MODELS]:
             name = shown(path.relative_to(folder).with_suffix("").as_posix())
             try:
-                model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, texts)
+                model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, said)
             except Unranked as error:
                 reason = str(error)
             except PROBLEMS as error:
                 text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
-                reason = texts["damaged"].format(reason=shown(" ".join(text.split()), 300))
+                reason = said["damaged"].format(reason=shown(" ".join(text.split()), 300))
             else:
                 done.append(model)
                 report(f"{name}: {model.evaluation}")
@@ -243,7 +201,7 @@ def evaluated(
     seed: int,
     seconds: float,
     success_threshold: float | None,
-    texts: Mapping[str, Any],
+    said: Mapping[str, Any],
 ) -> Model:
     """Returns a model with its evaluation.
 
@@ -251,9 +209,9 @@ def evaluated(
         Unranked: if it is of another environment, takes too long, or has returns that are not finite.
         ValueError: if it is damaged.
     """
-    said = header(path).get("env_id")
-    if said != env_id:
-        raise Unranked(texts["other_env"].format(said=shown(said), env_id=env_id))
+    trained_on = header(path).get("env_id")
+    if trained_on != env_id:
+        raise Unranked(said["other_env"].format(said=shown(trained_on), env_id=env_id))
     end = time.perf_counter() + seconds
     agent = load(path)
     agent.check_spaces(env, env_id)
@@ -261,32 +219,22 @@ def evaluated(
 
     def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
         if time.perf_counter() > end:
-            raise Unranked(texts["slow"].format(seconds=seconds, n=episodes))
+            raise Unranked(said["slow"].format(seconds=seconds, n=episodes))
         return choose(obs, started)
 
     result = evaluate(within_budget, env, episodes, success_threshold, seed)
     if not np.isfinite(result.returns).all():
-        raise Unranked(texts["not_finite"])
+        raise Unranked(said["not_finite"])
     return Model(name, agent.name, agent.num_timesteps, agent.seed, result)
 
 
-def interval_of(evaluation: Evaluation) -> tuple[float, float]:
-    """Returns the 95 % confidence interval of the mean return; the mean twice for a single episode."""
-    low, high = evaluation.return_interval
-    return (evaluation.mean_return,) * 2 if math.isnan(low) else (low, high)
-
-
-def ranked(models: Iterable[Model]) -> tuple[Row, ...]:
-    """Returns the rows by mean return, with the places that their intervals allow."""
+def ranked(models: Iterable[Model]) -> tuple[Model, ...]:
+    """Returns the models by mean return, with the places that their intervals allow."""
     done = sorted(models, key=lambda one: (-one.evaluation.mean_return, one.name))
-    intervals = [interval_of(one.evaluation) for one in done]
+    lows, highs = np.array([one.interval for one in done]).reshape(-1, 2).T
     return tuple(
-        Row(
-            one,
-            first=1 + sum(other_low > high for other_low, _ in intervals),
-            last=len(done) - sum(other_high < low for _, other_high in intervals),
-        )
-        for one, (low, high) in zip(done, intervals, strict=True)
+        replace(one, first=1 + int(np.sum(lows > one.interval[1])), last=int(np.sum(highs >= one.interval[0])))
+        for one in done
     )
 
 
@@ -294,12 +242,12 @@ def to_dict(board: Leaderboard) -> dict[str, Any]:
     """Returns a leaderboard as JSON values."""
     rows = [
         {
-            "name": row.model.name,
-            "algorithm": row.model.algorithm,
-            "steps": row.model.steps,
-            "seed": row.model.seed,
+            "name": row.name,
+            "algorithm": row.algorithm,
+            "steps": row.steps,
+            "seed": row.seed,
             "places": [row.first, row.last],
-            "mean_return": (result := row.model.evaluation).mean_return,
+            "mean_return": (result := row.evaluation).mean_return,
             "return_interval": [*row.interval],
             "success_rate": None if math.isnan(result.success_rate) else result.success_rate,
             "mean_length": result.mean_length,
@@ -321,14 +269,14 @@ def markdown(board: Leaderboard) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def cells_of(row: Row, board: Leaderboard) -> list[str]:
+def cells_of(row: Model, board: Leaderboard) -> list[str]:
     """Returns the cells of a row, in the order of the columns."""
-    to, result = board.texts["to"], row.model.evaluation
+    to, result = board.texts["to"], row.evaluation
     low, high = row.interval
     place = f"{row.first}" if row.first == row.last else f"{row.first} {to} {row.last}"
     numbers = [
-        f"{row.model.steps:,}",
-        f"{row.model.seed}",
+        f"{row.steps:,}",
+        f"{row.seed}",
         f"{result.mean_return:,.1f}",
         f"{low:,.1f} {to} {high:,.1f}",
         "" if math.isnan(result.success_rate) else f"{result.success_rate:.0%}",
@@ -336,7 +284,7 @@ def cells_of(row: Row, board: Leaderboard) -> list[str]:
     ]
     if board.language == "fr":
         numbers = [one.replace(",", NARROW_SPACE).replace(".", ",").replace("%", f"{NARROW_SPACE}%") for one in numbers]
-    return [place, row.model.name, row.model.algorithm, *numbers]
+    return [place, row.name, row.algorithm, *numbers]
 
 
 def quoted(text: str) -> str:
@@ -356,7 +304,7 @@ def page(board: Leaderboard) -> str:
     """
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     low, width = min(ends), max(max(ends) - min(ends), 1e-9)
-    means = [row.model.evaluation.mean_return for row in board.rows]
+    means = [row.evaluation.mean_return for row in board.rows]
     bars = [
         [100 * (end - low) / width for end in (*row.interval, mean)]
         for row, mean in zip(board.rows, means, strict=True)

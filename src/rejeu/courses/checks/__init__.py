@@ -1,20 +1,25 @@
 '''Checks of a student's answers, which say what was seen and what to think about.
 
-There is one module for each course, with a table of messages (TOML) of the same name next to it. A check is a function that
-gets what the student wrote, runs it on a small case and compares the result with the right one and with those of typical
-mistakes, by the names of their messages::
+There is one module for each course, with a table (TOML) of the same name next to it. Most checks are a section of the table: a
+small case, the right result and those of typical mistakes, each with its message in both languages::
+
+    [td_error]
+    case.q = [1.0, 2.0]
+    case.target = [3.0, 1.0]
+    right = "target - q"
+    reversed.result = "q - target"
+    reversed.en = "The sign is reversed: ..."
+    reversed.fr = "Le signe est inversé : ..."
+
+The names of ``case`` are the arguments, in their order. Text is an expression in NumPy (``np``), and ``where.NAME`` names a
+part of several. With ``compiles = true`` the arguments are arrays of JAX, and JAX must be able to compile the student's
+function. With ``each = "NAME"`` the function is called once for each value of that argument. Other checks are functions::
 
     @exercise
     def td_error(student):
         """Checks ``td_error(q, target)``."""
         q, target = np.array([1.0, 2.0]), np.array([3.0, 1.0])
         diagnose(numbers(call(student, q, target), shape=(2,)), target - q, reversed=q - target)
-
-and the table holds::
-
-    [td_error]
-    reversed.en = "The sign is reversed: ..."
-    reversed.fr = "Le signe est inversé : ..."
 
 A notebook says once in which language, then calls the checks, and asks for the answers that a cell needs::
 
@@ -36,6 +41,19 @@ from rejeu.courses.checks.base import (
     numbers,
     require,
     speak,
+    tabulated,
 )
 
-__all__ = ["Wrong", "call", "close", "compiles", "diagnose", "exercise", "mistakes", "numbers", "require", "speak"]
+__all__ = [
+    "Wrong",
+    "call",
+    "close",
+    "compiles",
+    "diagnose",
+    "exercise",
+    "mistakes",
+    "numbers",
+    "require",
+    "speak",
+    "tabulated",
+]

@@ -6,13 +6,14 @@ import copy
 import sysconfig
 import tomllib
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, wraps
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rejeu.courses.notebooks import LANGUAGES, Language
@@ -74,8 +75,8 @@ SESSION = Session()
 
 
 @cache
-def messages(course: str) -> dict[str, dict[str, dict[Language, str]]]:
-    """Returns the messages of a course by exercise, name and language, from the file next to its module."""
+def messages(course: str) -> dict[str, dict[str, Any]]:
+    """Returns the table of a course by exercise and name, from the file next to its module; messages are by language."""
     file = resources.files("rejeu.courses.checks") / f"{course}.toml"
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -118,6 +119,49 @@ def exercise(check: Callable[..., None]) -> Callable[..., Verdict]:
         return Verdict(not found)
 
     return checked
+
+
+def tabulated(module: str) -> dict[str, Callable[..., Verdict]]:
+    """Returns the checks that the table of a course describes, by name; see :mod:`rejeu.courses.checks`."""
+    table = messages(module.rpartition(".")[2])
+    return {name: of_table(name, module, section) for name, section in table.items() if "case" in section}
+
+
+def of_table(name: str, module: str, section: Mapping[str, Any]) -> Callable[..., Verdict]:
+    """Returns the check of a section of a table."""
+    case, each, is_compiled = section["case"], section.get("each"), section.get("compiles", False)
+
+    def check(student: Any) -> None:
+        names: dict[str, Any] = {"np": np}
+        for key, value in (*case.items(), *section.get("where", {}).items()):
+            names[key] = evaluated(value, names)
+        given = [[rows if key == each else names[key] for key in case] for rows in (names[each] if each else [None])]
+        given = [
+            [jnp.asarray(one) if is_compiled and hasattr(one, "dtype") else one for one in all_of] for all_of in given
+        ]
+        right = np.asarray(evaluated(section["right"], names))
+        results = [call(student, *arguments) for arguments in given]
+        wrong = {key: evaluated(one["result"], names) for key, one in section.items() if is_mistake(one)}
+        mistakes(**{key: np.shape(results[0]) == np.shape(one) != right.shape for key, one in wrong.items()})
+        found = [numbers(result, right.shape[1:] if each else right.shape) for result in results]
+        diagnose(np.stack(found) if each else found[0], right, **wrong)
+        if is_compiled:
+            compiles(student, *given[0])
+
+    check.__name__, check.__module__ = name, module
+    check.__doc__ = f"Checks ``{name}({', '.join(case)})``."
+    return exercise(check)
+
+
+def is_mistake(entry: Any) -> bool:
+    """Returns whether an entry of a section is a mistake with its result."""
+    return isinstance(entry, dict) and "result" in entry
+
+
+def evaluated(value: Any, names: dict[str, Any]) -> Any:
+    """Returns a value of a table: text is an expression, a list an array."""
+    value = eval(value, names) if isinstance(value, str) else value  # noqa: S307 - of our own file
+    return np.asarray(value) if isinstance(value, list) else value
 
 
 def require(*names: str, **answers: Any) -> None:

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.courses.checks.base import call, close, diagnose, exercise, mistakes, numbers
+from rejeu.courses.checks.base import call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 SHAPES = {"state": (2, 4), "action": (1, 4), "common": (8, 5)}
 """Inputs and outputs of the layers of a small critic. Both branches have as many outputs, so that their order shows."""
+
+
+globals().update(tabulated(__name__))
 
 
 @exercise
@@ -38,36 +41,6 @@ def ball_step(student: Any) -> None:
         reversed=~lost,
     )
     mistakes(reward=not close([numbers(result[1], ()) for result in results], np.where(lost, -10.0, 1.0)))
-
-
-@exercise
-def td_targets(student: Any) -> None:
-    """Checks ``td_targets(reward, terminated, next_value, gamma)``."""
-    reward, next_value, gamma = np.array([1.0, 1.0, -10.0]), np.array([4.0, -2.0, 7.0]), 0.9
-    terminated = np.array([False, False, True])
-    left = 1.0 - terminated
-    diagnose(
-        numbers(call(student, reward, terminated, next_value, gamma), (3,)),
-        reward + gamma * left * next_value,
-        future_after_end=reward + gamma * next_value,
-        only_after_end=reward + gamma * terminated * next_value,
-        lost_reward=left * (reward + gamma * next_value),
-        no_gamma=reward + left * next_value,
-        reward_discounted=gamma * (reward + left * next_value),
-    )
-
-
-@exercise
-def td_error(student: Any) -> None:
-    """Checks ``td_error(value, target)``."""
-    value, target = np.array([2.0, 0.5, -1.0]), np.array([3.0, -0.5, -1.5])
-    diagnose(
-        numbers(call(student, value, target), (3,)),
-        target - value,
-        reversed=value - target,
-        absolute=abs(target - value),
-        squared=(target - value) ** 2,
-    )
 
 
 def _relu(layers: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray) -> np.ndarray:
@@ -98,65 +71,6 @@ def critic(student: Any) -> None:
 
 
 @exercise
-def bounded(student: Any) -> None:
-    """Checks ``bounded(output, low, high)``."""
-    output, low, high = np.array([[-20.0, 0.0], [0.5, 20.0]]), np.array([-1.0, 0.0]), np.array([3.0, 2.0])
-    middle, half = (low + high) / 2, (high - low) / 2
-    result = numbers(call(student, output, low, high), (2, 2))
-    diagnose(
-        result,
-        middle + half * np.tanh(output),
-        clipped=np.clip(output, low, high),
-        zero_in_middle=high * np.tanh(output),
-        too_wide=middle + 2 * half * np.tanh(output),
-        sigmoid=low + 2 * half * np.tanh(output),
-        swapped=middle - half * np.tanh(output),
-    )
-
-
-def _value(state: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """A critic ``(n, 1)`` whose values rise with the action."""
-    return state[:, :1] + 2.0 * action
-
-
-def _policy(state: np.ndarray) -> np.ndarray:
-    return 0.5 * state[:, 1:]
-
-
-@exercise
-def critic_loss(student: Any) -> None:
-    """Checks ``critic_loss(q, state, action, target)``."""
-    state, action = np.array([[1.0, 0.0], [-1.0, 2.0], [0.5, 1.0]]), np.array([[0.5], [-0.5], [0.25]])
-    target = np.array([1.0, -1.5, 3.0])
-    error = _value(state, action)[:, 0] - target
-    crossed = _value(state, action) - target
-    diagnose(
-        numbers(call(student, _value, state, action, target), ()),
-        (error**2).mean(),
-        broadcast=(crossed**2).mean(),
-        sum=(error**2).sum(),
-        not_squared=error.mean(),
-        not_squared_reversed=-error.mean(),
-        reversed=-(error**2).mean(),
-    )
-
-
-@exercise
-def actor_loss(student: Any) -> None:
-    """Checks ``actor_loss(mu, q, state)``."""
-    state = np.array([[1.0, 0.5], [-1.0, 2.0], [0.5, 1.0]])
-    values = _value(state, _policy(state))[:, 0]
-    diagnose(
-        numbers(call(student, _policy, _value, state), ()),
-        -values.mean(),
-        reversed=values.mean(),
-        sum=-values.sum(),
-        squared=-(values**2).mean(),
-        no_critic=-_policy(state).mean(),
-    )
-
-
-@exercise
 def soft_update(student: Any) -> None:
     """Checks ``soft_update(target, online, tau)``."""
     target, online, tau = np.array([1.0, -2.0]), np.array([3.0, 4.0]), 0.1
@@ -169,42 +83,6 @@ def soft_update(student: Any) -> None:
         copied=online,
         grows=target + tau * online,
         away=target - tau * (online - target),
-    )
-
-
-@exercise
-def ou_step(student: Any) -> None:
-    """Checks ``ou_step(x, normal, theta, sigma, dt)``."""
-    x, normal, theta, sigma, dt = np.array([2.0, -1.0, 0.0]), np.array([0.0, 1.0, -2.0]), 0.5, 0.3, 0.04
-    drift, kick = -theta * x * dt, sigma * math.sqrt(dt) * normal
-    diagnose(
-        numbers(call(student, x, normal, theta, sigma, dt), (3,)),
-        x + drift + kick,
-        drift_reversed=x - drift + kick,
-        dt_without_root=x + drift + sigma * dt * normal,
-        kick_without_dt=x + drift + sigma * normal,
-        drift_without_dt=x - theta * x + kick,
-        no_noise=x + drift,
-        change_only=drift + kick,
-        drift_without_x=x - theta * dt + kick,
-    )
-
-
-@exercise
-def barrier_slope(student: Any) -> None:
-    """Checks ``barrier_slope(u, low, high)``."""
-    u, low, high = np.array([-2.0, 0.5, 3.5]), -1.0, 3.0
-    half, scaled = 2.0, math.pi / 2 * (np.array([-2.0, 0.5, 3.5]) - 1.0) / 2.0
-    right = 6 * scaled**5 * math.pi / (2 * half)
-    diagnose(
-        numbers(call(student, u, low, high), (3,)),
-        right,
-        no_inner_derivative=6 * scaled**5,
-        half_width_of_one=6 * scaled**5 * math.pi / 2,
-        negative=-right,
-        absolute=abs(right),
-        barrier_itself=scaled**6,
-        middle=6 * (math.pi / 2 * u / half) ** 5 * math.pi / (2 * half),
     )
 
 
@@ -237,37 +115,4 @@ def repel(student: Any) -> None:
         process_not_pushed=x,
         process_pushed_out=x + push(u),
         process_clipped=right - action,
-    )
-
-
-@exercise
-def pendulum_reward(student: Any) -> None:
-    """Checks ``pendulum_reward(observation, torque)``."""
-    angle, speed, torque = 2.5, -3.0, 1.5
-    observation = np.array([math.cos(angle), math.sin(angle), speed])
-    rest = 0.1 * speed**2 + 0.001 * torque**2
-    diagnose(
-        numbers(call(student, observation, torque), ()),
-        -(angle**2 + rest),
-        reversed=angle**2 + rest,
-        sine_first=-((math.pi / 2 - angle) ** 2 + rest),
-        arctan=-(math.atan(math.tan(angle)) ** 2 + rest),
-        no_factors=-(angle**2 + speed**2 + torque**2),
-    )
-
-
-@exercise
-def discrete_actor_loss(student: Any) -> None:
-    """Checks ``discrete_actor_loss(logits, values)``."""
-    logits, values = np.array([[0.0, 1.0, -1.0], [2.0, 0.0, 0.5]]), np.array([[1.0, -2.0, 3.0], [0.5, 4.0, -1.0]])
-    probabilities = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
-    right = -(probabilities * values).sum(axis=1).mean()
-    diagnose(
-        numbers(call(student, logits, values), ()),
-        right,
-        reversed=-right,
-        mean_of_actions=-(probabilities * values).mean(),
-        logits_as_weights=-(logits * values).sum(axis=1).mean(),
-        argmax=-values[np.arange(2), logits.argmax(axis=1)].mean(),
-        no_logits=-values.mean(axis=1).mean(),
     )

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rejeu.core import Transition
-from rejeu.courses.checks.base import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers
+from rejeu.courses.checks.base import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers, tabulated
+
+globals().update(tabulated(__name__))
 
 
 @exercise
@@ -56,60 +58,6 @@ def _sampled(memory: Any) -> set[int]:
 
 
 @exercise
-def discounts(student: Any) -> None:
-    """Checks ``discounts(terminated, truncated, gamma)``."""
-    terminated, truncated = np.array([False, True, False, True]), np.array([False, False, True, True])
-    result = numbers(call(student, terminated, truncated, 0.9), (4,))
-    diagnose(
-        result,
-        [0.9, 0.0, 0.9, 0.0],
-        truncation_ends=[0.9, 0.0, 0.0, 0.0],
-        termination_goes_on=[0.9, 0.9, 0.9, 0.9],
-        reversed=[0.0, 0.9, 0.0, 0.9],
-        exchanged=[0.9, 0.9, 0.0, 0.0],
-        no_gamma=[1.0, 0.0, 1.0, 0.0],
-    )
-
-
-@exercise
-def td_targets(student: Any) -> None:
-    """Checks ``td_targets(reward, discount, next_q)``."""
-    reward, discount = jnp.array([1.0, -1.0, 2.0]), jnp.array([0.9, 0.5, 0.0])
-    next_q = jnp.array([[1.0, 3.0], [4.0, 2.0], [5.0, 6.0]])
-    best = next_q.max(axis=1)
-    diagnose(
-        numbers(call(student, reward, discount, next_q), (3,)),
-        reward + discount * best,
-        no_discount=reward + best,
-        worst_action=reward + discount * next_q.min(axis=1),
-        mean_action=reward + discount * next_q.mean(axis=1),
-        number_of_action=reward + discount * next_q.argmax(axis=1),
-        whole_batch=reward + discount * next_q.max(),
-        reward_discounted=discount * (reward + best),
-        sign_of_future=reward - discount * best,
-    )
-    compiles(student, reward, discount, next_q)
-
-
-@exercise
-def td_errors(student: Any) -> None:
-    """Checks ``td_errors(q, action, target)``."""
-    q = jnp.array([[1.0, 3.0, 0.0], [4.0, 2.0, 7.0], [5.0, 6.0, 8.0]])
-    action, target = jnp.array([0, 1, 2]), jnp.array([2.0, 5.0, 7.0])
-    taken = jnp.array([1.0, 2.0, 8.0])
-    diagnose(
-        numbers(call(student, q, action, target), (3,)),
-        target - taken,
-        reversed=taken - target,
-        best_action=target - q.max(axis=1),
-        first_action=target - q[:, 0],
-        squared=(target - taken) ** 2,
-        absolute=jnp.abs(target - taken),
-    )
-    compiles(student, q, action, target)
-
-
-@exercise
 def td_loss(student: Any) -> None:
     """Checks ``td_loss(network, target_network, batch)``: its value, and its gradient with respect to the network."""
     network = jax.tree_util.Partial(_linear, jnp.array([[1.0, -1.0], [0.5, 2.0]]))
@@ -143,39 +91,6 @@ def td_loss(student: Any) -> None:
 
 def _linear(weight: Any, obs: Any) -> Any:
     return obs @ weight
-
-
-@exercise
-def next_target(student: Any) -> None:
-    """Checks ``next_target(target, weight, n_updates, interval)``."""
-    target, weight = jnp.array([1.0, 2.0]), jnp.array([3.0, 5.0])
-    counts = range(8, 17)
-    result = np.stack([numbers(call(student, target, weight, jnp.int32(n), 8), (2,)) for n in counts])
-    is_due = np.array([[n % 8 == 0] for n in counts])
-    diagnose(
-        result,
-        np.where(is_due, weight, target),
-        reversed=np.where(is_due, target, weight),
-        never_frozen=np.tile(weight, (9, 1)),
-        never_changes=np.tile(target, (9, 1)),
-    )
-    compiles(student, target, weight, jnp.int32(1), 8)
-
-
-@exercise
-def epsilon(student: Any) -> None:
-    """Checks ``epsilon(progress, start, end)``."""
-    progress, start, end = np.array([0.0, 0.25, 0.5, 1.0]), 0.8, 0.05
-    result = np.stack([numbers(call(student, float(p), start, end), ()) for p in progress])
-    diagnose(
-        result,
-        start * (end / start) ** progress,
-        grows=end * (start / end) ** progress,
-        linear=start + (end - start) * progress,
-        misses_end=start * end**progress,
-        constant=np.full(4, start),
-    )
-    compiles(student, 0.5, start, end)
 
 
 @exercise
@@ -278,77 +193,6 @@ def loop(student: Any) -> None:
 
 
 @exercise
-def success_rate(student: Any) -> None:
-    """Checks ``success_rate(returns, threshold)``."""
-    returns = np.array([-200.0, -150.0, -110.0, -200.0, -90.0, -200.0, -200.0, -120.0, -200.0, -130.0])
-    diagnose(
-        numbers(call(student, returns, -200.0), ()),
-        0.5,
-        number=5.0,
-        threshold_counts=1.0,
-        percent=50.0,
-        reversed=0.0,
-    )
-
-
-@exercise
-def log_prob(student: Any) -> None:
-    """Checks ``log_prob(mean, log_std, action)``."""
-    mean, log_std = jnp.array([[0.0, 1.0], [0.5, -1.0], [2.0, 0.0]]), jnp.array([[-0.5, 0.3]])
-    action = jnp.array([[0.2, 0.4], [0.0, 0.0], [1.0, 1.5]])
-    result = call(student, mean, log_std, action)
-    z = (action - mean) / jnp.exp(log_std)
-    terms = -0.5 * z**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
-    mistakes(per_component=np.shape(result) == (3, 2))
-    diagnose(
-        numbers(result, (3,)),
-        terms.sum(axis=1),
-        density=jnp.exp(terms.sum(axis=1)),
-        reversed=-terms.sum(axis=1),
-        mean=terms.mean(axis=1),
-        no_std=(terms + log_std).sum(axis=1),
-        no_constant=(terms + 0.5 * jnp.log(2 * jnp.pi)).sum(axis=1),
-        no_half=(terms - 0.5 * z**2).sum(axis=1),
-        divided_by_log_std=(-0.5 * ((action - mean) / log_std) ** 2 - log_std - 0.5 * jnp.log(2 * jnp.pi)).sum(axis=1),
-    )
-    compiles(student, mean, log_std, action)
-
-
-@exercise
-def draw_action(student: Any) -> None:
-    """Checks ``draw_action(mean, log_std, noise)``."""
-    mean, log_std = jnp.array([[0.0, 1.0], [0.5, -1.0]]), jnp.array([[-0.5, 0.3]])
-    noise = jnp.array([[1.0, -0.5], [0.2, 2.0]])
-    diagnose(
-        numbers(call(student, mean, log_std, noise), (2, 2)),
-        mean + jnp.exp(log_std) * noise,
-        log_std_as_std=mean + log_std * noise,
-        no_std=mean + noise,
-        no_noise=mean,
-        no_mean=jnp.exp(log_std) * noise,
-        minus=mean - jnp.exp(log_std) * noise,
-        variance=mean + jnp.exp(2 * log_std) * noise,
-    )
-    compiles(student, mean, log_std, noise)
-
-
-@exercise
-def returns_to_go(student: Any) -> None:
-    """Checks ``returns_to_go(rewards, gamma)``."""
-    rewards, gamma = np.array([1.0, 2.0, -1.0, 4.0]), 0.5
-    powers = gamma ** np.arange(4)
-    diagnose(
-        numbers(call(student, rewards, gamma), (4,)),
-        [2.25, 2.5, 1.0, 4.0],
-        no_gamma=[6.0, 5.0, 3.0, 4.0],
-        past=[1.0, 2.5, 0.25, 4.125],
-        discounted_from_start=np.cumsum((rewards * powers)[::-1])[::-1],
-        in_reverse=[4.0, 1.0, 2.5, 2.25],
-        without_own=[1.25, 0.5, 2.0, 0.0],
-    )
-
-
-@exercise
 def normalized_advantages(student: Any) -> None:
     """Checks ``normalized_advantages(returns, values)``."""
     returns, values = jnp.array([5.0, -1.0, 2.0, 4.0]), jnp.array([1.0, 1.0, 0.0, 6.0])
@@ -366,78 +210,3 @@ def normalized_advantages(student: Any) -> None:
     )
     mistakes(zero_deviation=not np.isfinite(np.asarray(call(student, values, values))).all())
     compiles(student, returns, values)
-
-
-@exercise
-def advantage(student: Any) -> None:
-    """Checks ``advantage(reward, value, next_value, discount, ended, following, gae_lambda)``."""
-    reward, value = jnp.array([1.0, 2.0, -1.0]), jnp.array([0.5, 3.0, 1.0])
-    next_value, discount = jnp.array([2.0, 1.0, 4.0]), jnp.array([0.9, 0.0, 0.9])
-    ended, following, lam = jnp.array([False, True, True]), jnp.array([1.5, -2.0, 3.0]), 0.8
-    going = jnp.where(ended, 0.0, discount * lam * following)
-    delta = reward + discount * next_value - value
-    diagnose(
-        numbers(call(student, reward, value, next_value, discount, ended, following, lam), (3,)),
-        delta + going,
-        reversed=going - delta,
-        into_next_episode=delta + discount * lam * following,
-        truncation_ends=reward + jnp.where(ended, 0.0, discount * next_value) - value + going,
-        next_not_discounted=reward + next_value - value + going,
-        exchanged=reward + discount * value - next_value + going,
-        following_not_discounted=delta + jnp.where(ended, 0.0, lam * following),
-        no_lambda=delta + jnp.where(ended, 0.0, discount * following),
-        only_td_error=delta,
-    )
-    compiles(student, reward, value, next_value, discount, ended, following, lam)
-
-
-@exercise
-def ratio(student: Any) -> None:
-    """Checks ``ratio(new, old)`` of log-probabilities."""
-    new, old = jnp.array([-1.0, -2.0, -0.5]), jnp.array([-1.5, -1.0, -0.25])
-    diagnose(
-        numbers(call(student, new, old), (3,)),
-        jnp.exp(new - old),
-        inverted=jnp.exp(old - new),
-        logarithm=new - old,
-        divided_logarithms=new / old,
-    )
-    compiles(student, new, old)
-
-
-@exercise
-def policy_loss(student: Any) -> None:
-    """Checks ``policy_loss(ratio, advantage, clip)``."""
-    r, a = jnp.array([0.5, 0.9, 1.6, 1.7, 0.4, 1.1]), jnp.array([2.0, 1.0, 3.0, -1.0, -2.0, -3.0])
-    clipped = jnp.clip(r, 0.8, 1.2)
-    right = jnp.minimum(r * a, clipped * a)
-    diagnose(
-        numbers(call(student, r, a, 0.2), ()),
-        -right.mean(),
-        reversed=right.mean(),
-        larger_term=-jnp.maximum(r * a, clipped * a).mean(),
-        not_clipped=-(r * a).mean(),
-        only_clipped=-(clipped * a).mean(),
-        advantage_clipped=-jnp.minimum(r * a, r * jnp.clip(a, 0.8, 1.2)).mean(),
-        around_zero=-jnp.minimum(r * a, jnp.clip(r, -0.2, 0.2) * a).mean(),
-        only_above=-jnp.minimum(r * a, jnp.minimum(r, 1.2) * a).mean(),
-        only_below=-jnp.minimum(r * a, jnp.maximum(r, 0.8) * a).mean(),
-        sum=-right.sum(),
-    )
-    compiles(student, r, a, 0.2)
-
-
-@exercise
-def value_loss(student: Any) -> None:
-    """Checks ``value_loss(value, target)``, with values ``(n, 1)`` and targets ``(n,)``."""
-    value, target = jnp.array([[1.0], [2.0], [4.0]]), jnp.array([2.0, 0.0, 5.0])
-    error = value[:, 0] - target
-    diagnose(
-        numbers(call(student, value, target), ()),
-        jnp.mean(error**2),
-        broadcast=jnp.mean((value - target[None]) ** 2),
-        reversed=-jnp.mean(error**2),
-        not_squared=jnp.mean(error),
-        sum=jnp.sum(error**2),
-    )
-    compiles(student, value, target)

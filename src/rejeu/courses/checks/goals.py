@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import SAC
-from rejeu.courses.checks.base import Wrong, call, close, diagnose, exercise, mistakes, numbers
+from rejeu.courses.checks.base import Wrong, call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 N = 4_000
 """Draws of a strategy, enough that every time occurs."""
@@ -29,6 +29,9 @@ class Step(NamedTuple):
     next_obs: dict[str, np.ndarray]
     """The same after the step."""
     terminated: bool
+
+
+globals().update(tabulated(__name__))
 
 
 @exercise
@@ -170,26 +173,6 @@ def episode(student: Any) -> None:
         only_later=(chosen > time).all(),
         last_never=not (chosen == last).any(),
         first_never=not (chosen == first).any(),
-    )
-
-
-@exercise
-def parking_reward(student: Any) -> None:
-    """Checks ``parking_reward(achieved, desired, weights)``."""
-    rng = np.random.default_rng(0)
-    achieved, desired = rng.normal(size=(2, 5, 6))
-    weights = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
-    gap = abs(achieved - desired)
-    result = call(student, achieved, desired, weights)
-    mistakes(single_number=np.shape(result) == ())
-    diagnose(
-        numbers(result, (5,)),
-        -np.sqrt(gap @ weights),
-        reversed=np.sqrt(gap @ weights),
-        no_root=-(gap @ weights),
-        squared=-np.sqrt(gap**2 @ weights),
-        no_weights=-np.sqrt(gap.sum(axis=1)),
-        root_of_terms=-(np.sqrt(gap) @ weights),
     )
 
 
