@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -15,13 +14,11 @@ import pytest
 import rejeu
 from rejeu.algorithms import dqn
 from rejeu.core import TD_ERROR, Clock, Transition, clip
-from rejeu.io.checkpoint import tree_to_arrays
 from rejeu.schedules import at
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
 from tests.tiers import exhaustive
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "dqn_sb3.npz"
 OBS_DIM, N_ACTIONS, BATCH = 3, 4, 8
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)
 ACTION_SPACE = gym.spaces.Discrete(N_ACTIONS)
@@ -266,118 +263,12 @@ def test_a_copy_is_exact():
     np.testing.assert_array_equal(dqn.moved_target(target, online, jnp.int32(1), 1.0)["w"], online["w"])
 
 
-@pytest.mark.parametrize(
-    ("n_envs", "expected"),
-    # Multiples of 20, met at the first turn of n_envs steps at or after them.
-    [(1, [20, 40, 60, 80]), (8, [24, 40, 64, 80])],
-)
-def test_target_moves_at_multiples_of_environment_steps(n_envs, expected):
-    env = rejeu.make_vector(lambda: Sampled(OBS_SPACE, ACTION_SPACE), n_envs)
-    agent = rejeu.DQN(
-        "MlpPolicy", env, seed=0, target_update_interval=20, train_freq=1, learning_starts=2, learning_rate=1e-2
-    )
-    weights = [np.array(agent.state.target_network.head.weight)]
-    moved = []
-
-    def watch(agent, turn):
-        weights.append(np.array(agent.state.target_network.head.weight))
-        if (weights[-1] != weights[-2]).any():
-            moved.append(turn.step)
-
-    agent.learn(96, callback=watch)
-    assert moved == expected
-
-
 def test_target_takes_the_network_from_before_the_gradient_step():
     algorithm, state = make(target_update_interval=10, learning_rate=0.1)
     state, _ = algorithm.update(state, random_batch(), CLOCK._replace(step=np.uint32(9)))
     after, _ = algorithm.update(state, random_batch(1), CLOCK._replace(step=np.uint32(10)))
     jax.tree.map(np.testing.assert_array_equal, after.target_network, state.network)
     assert (after.network.head.weight != state.network.head.weight).any()
-
-
-# Whole updates, against Stable-Baselines3 (tests/golden/record_dqn.py).
-
-
-def from_sb3(record, prefix, part):
-    """A recorded network of torch parameters under our names, weights transposed; ``part`` is torch's name of it."""
-    names = {"torso.layers.0": 0, "torso.layers.1": 2, "head": 4}
-    return {
-        f"{ours}.{kind}": record[f"{prefix}{part}.q_net.{theirs}.{kind}"].T
-        for ours, theirs in names.items()
-        for kind in ("weight", "bias")
-    }
-
-
-def recorded_state(record, prefix):
-    found = {}
-    for ours, theirs in (("network", "q_net"), ("target_network", "q_net_target")):
-        found |= {f"{ours}.{name}": value for name, value in from_sb3(record, prefix, theirs).items()}
-    return found
-
-
-def recorded_moments(record, prefix):
-    found = {}
-    for ours, theirs in (("mu", "exp_avg"), ("nu", "exp_avg_sq")):
-        found |= {f"optimizer.{ours}.{name}": v for name, v in from_sb3(record, f"{prefix}{theirs}.", "q_net").items()}
-    return found
-
-
-@pytest.fixture(scope="module")
-def record():
-    with np.load(GOLDEN, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
-@pytest.fixture(scope="module")
-def replayed(record):
-    """States and metrics after each recorded update, from the recorded parameters and batches."""
-    settings = {"learning_rate": 1e-2, "gamma": 0.9, "tau": 0.25, "target_update_interval": 2, "max_grad_norm": 0.1}
-    agent = rejeu.DQN(
-        "MlpPolicy", Sampled(OBS_SPACE, ACTION_SPACE), policy_kwargs={"net_arch": [5, 4]}, seed=0, **settings
-    )
-    agent.set_parameters(recorded_state(record, "before."), exact_match=False)
-    algorithm = dqn.make(agent.config, OBS_SPACE, ACTION_SPACE)
-    states, metrics, state = [], [], agent.state
-    for k in range(3):
-        discount = np.where(record[f"{k}.terminated"], 0.0, 0.9).astype(np.float32)
-        obs, action, reward, next_obs = (record[f"{k}.{name}"] for name in ("obs", "action", "reward", "next_obs"))
-        batch = Transition(obs, action.astype(np.int32), reward, next_obs, discount)
-        # The environment steps at which the target was moved in the recording: before the third update only.
-        state, metric = algorithm.update(state, batch, CLOCK._replace(step=np.uint32([1, 1, 2][k])))
-        states.append(state)
-        metrics.append(metric)
-    return states, metrics
-
-
-@pytest.mark.parametrize("k", [0, 2])
-def test_parameters_after_an_update_equal_stable_baselines3(record, replayed, k):
-    given, expected = tree_to_arrays(replayed[0][k]), recorded_state(record, f"{k}.after.")
-    assert {name for name in given if "optimizer" not in name} == {*expected, "step", "n_updates"}
-    for name, value in expected.items():
-        np.testing.assert_allclose(given[name], value, atol=1e-5, err_msg=name)
-
-
-@pytest.mark.parametrize("k", [0, 2])
-def test_adam_moments_after_an_update_equal_stable_baselines3(record, replayed, k):
-    given, expected = tree_to_arrays(replayed[0][k]), recorded_moments(record, f"{k}.after.")
-    assert {name for name in given if "optimizer" in name and not name.endswith("count")} == set(expected)
-    for name, value in expected.items():
-        np.testing.assert_allclose(given[name], value, rtol=1e-4, atol=1e-7, err_msg=name)
-
-
-def test_losses_equal_stable_baselines3(record, replayed):
-    for k, metrics in enumerate(replayed[1]):
-        assert float(metrics["loss"]) == pytest.approx(float(record[f"{k}.loss"]), abs=1e-5), k
-
-
-def test_recorded_updates_clip_their_gradients_and_move_every_network(record):
-    """Guards the tests above: what did nothing must not pass them."""
-    assert [float(record[f"{k}.grad_norm"]) for k in range(3)] == pytest.approx([0.1] * 3, rel=1e-3)
-    before, after = recorded_state(record, "before."), recorded_state(record, "2.after.")
-    for part in ("network.", "target_network."):
-        moved = max(np.abs(after[name] - before[name]).max() for name in before if name.startswith(part))
-        assert moved > 1e-3, part
 
 
 # What it learns.

@@ -198,22 +198,6 @@ def test_a_loaded_agent_predicts_the_same_bits_and_goes_on_learning_all_its_part
 
 
 @every_algorithm
-def test_two_agents_of_one_file_go_on_alike(kind, tmp_path):
-    path = start(kind).learn(32).save(tmp_path / "model")
-    one, two = (kind.load(path, env=wanderers(kind)).learn(40) for _ in range(2))
-    assert_same_parameters(one, two)
-
-
-@every_algorithm
-def test_an_agent_without_environment_predicts_and_will_not_learn(kind, tmp_path):
-    agent = start(kind).learn(16)
-    loaded = kind.load(agent.save(tmp_path / "model"))
-    np.testing.assert_array_equal(loaded.predict(OBS, deterministic=True)[0], agent.predict(OBS, deterministic=True)[0])
-    with pytest.raises(ValueError, match="this agent has no environment to learn in"):
-        loaded.learn(8)
-
-
-@every_algorithm
 def test_ctrl_c_ends_training_after_a_step_with_everything_consistent(kind):
     def press(agent, progress):
         if progress.step == 21:

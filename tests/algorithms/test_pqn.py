@@ -160,17 +160,6 @@ def test_a_terminal_state_is_worth_nothing_and_a_time_limit_what_it_was_reached_
     np.testing.assert_allclose(given[:, 0], [1 + 0.5 * 2, 2, 3 + 0.5 * (4 + 0.5 * 8), 4 + 0.5 * 8])
 
 
-def test_nothing_flows_over_the_end_of_an_episode_or_from_one_environment_to_another():
-    reward, _, next_value, discount, ended = random_steps((8, 3), 4)
-    ended[3] = True
-    before = np.asarray(returns(reward, next_value, discount, ended, np.float32(0.9)))
-    reward[4:, 1] += 100.0
-    after = np.asarray(returns(reward, next_value, discount, ended, np.float32(0.9)))
-    np.testing.assert_array_equal(before[:4], after[:4])
-    np.testing.assert_array_equal(before[:, [0, 2]], after[:, [0, 2]])
-    assert (before[4:, 1] != after[4:, 1]).all()
-
-
 @pytest.mark.usefixtures("strict_dtypes")
 def test_targets_bootstrap_from_the_highest_value_in_the_true_successor():
     """Also where the rollout ends and where padding follows: there the step is the last that counts."""
@@ -189,30 +178,6 @@ def test_targets_bootstrap_from_the_highest_value_in_the_true_successor():
 
 
 # Losses and updates.
-
-
-def batch_of(n=12):
-    rng = np.random.default_rng(0)
-    obs, target = rng.normal(size=(n, 3)).astype(np.float32), rng.normal(size=n).astype(np.float32)
-    action = rng.integers(3, size=n).astype(np.int32)
-    return pqn.Samples(jnp.array(obs), jnp.array(action), jnp.array(target), jnp.arange(n) % 4 > 0)
-
-
-def test_the_gradient_of_the_loss_equals_finite_differences_in_float64():
-    _, _, state = make()
-    batch, layers = batch_of(), parameters(state.network)
-    (loss, q_value), given = jax.value_and_grad(pqn.td_loss, has_aux=True)(state.network, batch)
-    valid = np.asarray(batch.valid)
-
-    def taken():
-        return forward(layers, batch.obs)[np.arange(len(valid)), batch.action][valid]
-
-    def expected():
-        return 0.5 * np.mean((taken() - np.float64(batch.target)[valid]) ** 2)
-
-    assert float(loss) == pytest.approx(expected(), rel=1e-5)
-    assert float(q_value) == pytest.approx(taken().mean(), rel=1e-4, abs=1e-6)
-    assert_equal(parameters(given), gradient(layers, expected), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

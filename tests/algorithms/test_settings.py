@@ -65,7 +65,9 @@ OWN_RATE = {"critic_learning_rate": 1e-3, "policy_kwargs": SHARED}
 OWN_RATE_MESSAGE = (
     "critic_learning_rate is a learning rate of its own for the value, which share_layers=True forbids; leave"
 )
+NO_TEMPERATURES = "automatic", "auto_x", "auto_-1", "auto_nan", 0, -0.1, True, None, float("nan"), float("inf")
 REFUSED = [
+    *(("SAC", {"ent_coef": v}, "ent_coef=.*must be 'auto', 'auto_0.1' or a positive number") for v in NO_TEMPERATURES),
     ("SAC", {"n_critics": 0}, "n_critics=0 must be a whole number of at least 1"),
     ("TD3", {"policy_delay": 1.5}, "policy_delay=1.5 must be a whole number of at least 1"),
     ("TD3", {"target_policy_noise": -0.1}, "target_policy_noise=-0.1 must be a finite number, at least 0"),
