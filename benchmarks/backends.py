@@ -10,10 +10,6 @@ for environments whose step takes a millisecond or more in this process. The res
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
-import shlex
 import sys
 import time
 from contextlib import closing
@@ -26,7 +22,9 @@ import rejeu
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import auto_backend
 from rejeu.runs.config import versions
-from rejeu.xla import cores
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "backends.json"
 CASES = {
@@ -83,15 +81,7 @@ def main() -> None:
         for env_id, numbers in CASES.items()
         for n in numbers
     ]
-    machine = {
-        "processor": platform.processor() or platform.machine(),
-        "cores": cores(),
-        "load": os.getloadavg()[0],
-    }
-    command = shlex.join(["python", *sys.argv])
-    RESULT.write_text(
-        json.dumps({"command": command, "machine": machine, "versions": versions(), "results": rows}, indent=1) + "\n"
-    )
+    write(RESULT, {**provenance(), "machine": machine(), "versions": versions(), "results": rows})
     print("| environment | at once | EnvPool | this process | workers | `auto` takes |\n|---|---|---|---|---|---|")
     for row in rows:
         rates = row["steps_per_second"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import json
-import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ from rejeu import presets, validation
 from rejeu.algorithms import config as configs
 from rejeu.envs import make_vector
 from rejeu.reporting.plots import drawing as style
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, PICTURES = ROOT / "benchmarks" / "results", ROOT / "docs" / "images" / "curves"
@@ -80,19 +83,14 @@ def record(name: str) -> None:
         curves.append(curve(agent.history["step"], agent.history["return"], grid))
         print(name, seed, curves[-1][-1], flush=True)
     versions = {package: importlib.metadata.version(package) for package in ("jax", "gymnasium", "envpool")}
-    data: dict[str, Any] = {"command": f"python benchmarks/curves.py record {name}", "env": env_id, "algorithm": name}
+    data: dict[str, Any] = {**provenance(), "command": f"python benchmarks/curves.py record {name}"}
+    data |= {"env": env_id, "algorithm": name}
     config = validation.build(rejeu.AGENTS[name].algorithm.Config, preset.hyperparameters)
-    data |= {"commit": commit(), "versions": versions, "hyperparameters": configs.to_json(config), "seeds": SEEDS}
+    data |= {"versions": versions, "hyperparameters": configs.to_json(config), "seeds": SEEDS}
     data |= {"steps": grid.tolist(), "returns": curves}
     path = RESULTS / "curves" / f"{name}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(data) + "\n", encoding="utf-8")
-
-
-def commit() -> str:
-    """Returns the commit of this checkout."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def plot(path: Path, published: list[dict[str, Any]]) -> None:

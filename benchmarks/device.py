@@ -15,13 +15,14 @@ import argparse
 import json
 import os
 import platform
-import shlex
-import subprocess
 import sys
 import time
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import in_process, machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "device.json"
 PARKING = {
@@ -137,11 +138,8 @@ def measure(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> 
     """Returns a measurement made in a process of its own, or its error."""
     words = [sys.executable, __file__, "--child", json.dumps([name, kind, n_envs, n_seeds, seconds])]
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": ""}  # no cache, so that every process compiles
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     found = {"case": name, "kind": kind, "n_envs": n_envs, "n_seeds": n_seeds}
-    if done.returncode:
-        return {**found, "error": (done.stderr.strip().splitlines() or ["no message"])[-1]}
-    return {**found, **json.loads(done.stdout.strip().splitlines()[-1])}
+    return {**found, **in_process(*words, environment=environment)}
 
 
 def plan(cases: list[str], seeds: list[int], envs: list[int]) -> list[tuple[str, str, int, int]]:
@@ -203,18 +201,14 @@ def main() -> None:
             rounds[one].append(measure(*one, arguments.seconds))
             print(json.dumps(rounds[one][-1]), flush=True)
     results = [combined(found) for found in rounds.values()]
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     content = {
-        "command": shlex.join(["python", "benchmarks/device.py", *sys.argv[1:]]),
-        "commit": commit,
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": {"platform": platform.platform(), "cores": os.cpu_count()},
+        **provenance(),
+        "machine": {"platform": platform.platform(), **machine()},
         "device": next((one["device"] for one in results if "device" in one), None),
         "seconds": arguments.seconds,
         "results": results,
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write(arguments.out, content)
     print(table(results))
 
 

@@ -24,14 +24,15 @@ import argparse
 import json
 import os
 import platform
-import shlex
-import subprocess
 import sys
 import time
 from importlib import metadata
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import in_process, machine, provenance, write
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "device_peers.json"
@@ -251,11 +252,8 @@ def measure(name: str, library: str, threads: str, python: str, seconds: float) 
     else:
         environment.pop("PYTHONPATH", None)
     words = [python, __file__, "--child", json.dumps([name, library, seconds])]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
     found = {"case": name, "library": library, "threads_of_process": threads}
-    if done.returncode:
-        return {**found, "error": (done.stderr.strip().splitlines() or ["no message"])[-1]}
-    return {**found, **json.loads(done.stdout.strip().splitlines()[-1])}
+    return {**found, **in_process(*words, environment=environment)}
 
 
 def all_measurements(
@@ -338,16 +336,10 @@ def main() -> None:
     pythons = {"rejeu": sys.executable, "rejax": arguments.rejax_python, "sb3": arguments.sb3_python}
     found = all_measurements(arguments.cases, arguments.libraries, pythons, arguments.rounds, arguments.seconds)
     rows = summary(found)
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout.strip()
     shown = {str(Path(arguments.rejax_python)): "PATH", str(Path(arguments.sb3_python)): "PATH"}
-    words = ["python", "benchmarks/device_peers.py", *(shown.get(word, word) for word in sys.argv[1:])]
     content = {
-        "command": shlex.join(words),
-        "commit": commit,
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": {"platform": platform.platform(), "cores": os.cpu_count()},
+        **provenance(shown),
+        "machine": {"platform": platform.platform(), **machine()},
         "device": next((one["device"] for one in found if "device" in one), None),
         "versions": {one["library"]: one["versions"] for one in found if "versions" in one},
         "seconds": arguments.seconds,
@@ -356,8 +348,7 @@ def main() -> None:
         "results": rows,
         "measurements": [{key: value for key, value in one.items() if key != "versions"} for one in found],
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write(arguments.out, content)
     print(table(rows))
 
 

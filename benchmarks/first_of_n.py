@@ -12,10 +12,6 @@ over the seeds and their 95 % bootstrap intervals.
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
-import shlex
 import sys
 import time
 from contextlib import closing
@@ -28,11 +24,12 @@ import gymnasium as gym
 import numpy as np
 
 import rejeu
-from benchmarks.remote import commit
 from rejeu import presets
 from rejeu.reporting import statistics
 from rejeu.runs.config import versions
-from rejeu.xla import cores
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "first_of_n.json"
 ENV = "Pendulum-v1"
@@ -106,20 +103,15 @@ def main() -> None:
         texts = [f"{key} {one['mean']:.1f} [{one['low']:.1f}, {one['high']:.1f}]" for key, one in parts.items()]
         print(f"{name}: {', '.join(texts)}")
     content = {
-        "command": shlex.join(["python", *sys.argv]),
-        "commit": commit(),
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "cores": cores(),
-            "load": os.getloadavg()[0],
-        },
+        **provenance(),
+        "machine": machine(),
         "versions": versions(),
         "steps": arguments.steps,
         "mean_step_seconds": arguments.mean_seconds,
         "summary": summary,
         "runs": runs,
     }
-    arguments.out.write_text(json.dumps(content, indent=1) + "\n")
+    write(arguments.out, content)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,6 @@ result is the median of the rounds, in which all are measured in turn. It is wri
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
-import shlex
 import sys
 import time
 from contextlib import closing
@@ -32,7 +28,9 @@ from rejeu.envs.functional import FunctionalEnv, make
 from rejeu.envs.functional.vector import VectorState, reset_all, reset_done, step_all
 from rejeu.envs.make import make_vector
 from rejeu.runs.config import versions
-from rejeu.xla import cores
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "functional.json"
 CASES = {
@@ -129,15 +127,8 @@ def main() -> None:
         for n in NUMBERS:
             rows.append(measure(env_id, CASES[env_id], n, given.rounds))
             print(rows[-1], flush=True)
-    machine = {
-        "processor": platform.processor() or platform.machine(),
-        "device": jax.devices()[0].device_kind,
-        "cores": cores(),
-        "load": os.getloadavg()[0],
-    }
-    command = shlex.join(["python", "benchmarks/functional.py", *sys.argv[1:]])
-    data = {"command": command, "machine": machine, "versions": versions(), "results": rows}
-    given.out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    here = {**machine(), "device": jax.devices()[0].device_kind}
+    write(given.out, {**provenance(), "machine": here, "versions": versions(), "results": rows})
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ absolute differences are written to ``benchmarks/results/functional_equality.jso
 from __future__ import annotations
 
 import argparse
-import json
-import shlex
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from tests.envs.functional import classic_control, parking  # noqa: E402
 from tests.envs.functional.peers import compare  # noqa: E402
+from trials.provenance import provenance, write  # noqa: E402
 
 RESULT = Path(__file__).parent / "results" / "functional_equality.json"
 
@@ -81,8 +80,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=12_000)
     steps = parser.parse_args().steps
     rows = [classic(case, steps) for case in classic_control.CASES] + [lot(steps)]
-    command = shlex.join(["python", *sys.argv])
-    RESULT.write_text(json.dumps({"command": command, "results": rows}, indent=1) + "\n", encoding="utf-8")
+    write(RESULT, {**provenance(), "results": rows})
     for row in rows:
         print(row)
 

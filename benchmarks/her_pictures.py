@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT))
 import rejeu  # noqa: E402
 from rejeu.reporting.plots import drawing as style  # noqa: E402
 from tests.bit_flipping import BitFlipping  # noqa: E402
+from trials.provenance import provenance, write  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results" / "bit_flipping.json"
 PICTURES = ROOT / "docs" / "images"
@@ -50,9 +51,9 @@ def record() -> None:
         rates[name] = {n: [success_rate(n, seed, with_her) for seed in SEEDS] for n in BITS}
         print(name, rates[name], flush=True)
     versions = {package: importlib.metadata.version(package) for package in ("jax", "gymnasium")}
-    data = {"command": "python benchmarks/her_pictures.py record", "versions": versions, "hyperparameters": SETTINGS}
+    data = {**provenance(), "versions": versions, "hyperparameters": SETTINGS}
     data |= {"steps": STEPS, "seeds": SEEDS, "success_rate": rates}
-    RESULTS.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write(RESULTS, data)
 
 
 def plot_bit_flipping() -> None:

@@ -16,16 +16,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import shlex
-import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import in_process, machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "lunar_lander_document.json"
 ENV = "LunarLanderContinuous-v3"
@@ -101,21 +100,19 @@ def main() -> None:
     runs: dict[str, list[dict]] = {variant: [] for variant in VARIANTS}
     for seed in arguments.seeds:
         for variant in VARIANTS:
-            command = [sys.executable, __file__, "--child", variant, str(seed)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                raise SystemExit(done.stderr[-2000:])
-            runs[variant].append(json.loads(done.stdout.strip().splitlines()[-1]))
+            runs[variant].append(in_process(sys.executable, __file__, "--child", variant, str(seed)))
+            if "error" in runs[variant][-1]:
+                raise SystemExit(runs[variant][-1]["error"])
             print(variant, json.dumps(runs[variant][-1]), flush=True)
     keys = ("steps", "seconds", "last_training_return", "last_training_success", "mean_return", "success_rate")
     result = {
-        "command": shlex.join(["python", "benchmarks/lunar_lander_document.py", *sys.argv[1:]]),
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
+        **provenance(),
+        "machine": machine(),
         "hyperparameters": {variant: settings for variant, (_, settings, _) in VARIANTS.items()},
         "runs": runs,
         "means": {v: {key: float(np.mean([run[key] for run in by])) for key in keys} for v, by in runs.items()},
     }
-    RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(RESULT, result)
     print(json.dumps(result["means"], indent=1))
 
 

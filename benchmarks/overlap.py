@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from pathlib import Path
 
@@ -21,6 +20,9 @@ from scipy import stats
 
 import rejeu
 from rejeu import presets
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "overlap.json"
 CASES = {"Pendulum-v1": "SAC", "CartPole-v1": "DQN"}
@@ -48,7 +50,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     arguments = parser.parse_args()
-    content: dict[str, object] = {"command": shlex.join(["python", "benchmarks/overlap.py", *sys.argv[1:]])}
+    content: dict[str, object] = dict(provenance())
     for env_id in arguments.cases:
         rows: dict[bool, list[dict[str, float]]] = {True: [], False: []}
         for seed in arguments.seeds:
@@ -58,7 +60,7 @@ def main() -> None:
         content[f"{CASES[env_id]} on {env_id}"] = {
             f"overlap={overlap}": {**summary(found), "runs": found} for overlap, found in rows.items()
         }
-    RESULT.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write(RESULT, content)
     print(json.dumps(content))
 
 

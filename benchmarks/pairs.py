@@ -21,6 +21,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import commit, write
+
 RESULT = Path(__file__).parent / "results" / "pairs.json"
 STEPS = {"SAC": 1000, "DDPG": 800, "TD3": 800, "DQN": 1000, "PPO": 8192, "parking": 1600}
 """Environment steps of a turn."""
@@ -125,13 +128,8 @@ def main() -> None:
             "pairs": pairs,
         }
         print(case, found[case]["ratio"], found[case]["processor_ratio"], flush=True)
-        RESULT.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        write(RESULT, found)
     return None
-
-
-def commit(checkout: Path) -> str:
-    command = ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 if __name__ == "__main__":

@@ -15,9 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import platform
-import shlex
-import subprocess
 import sys
 import time
 from contextlib import closing
@@ -28,10 +25,13 @@ import jax
 from scipy import stats
 
 import rejeu
-from rejeu import presets, xla
+from rejeu import presets
 from rejeu.algorithms import config as configs
 from rejeu.callbacks import Evaluate
 from rejeu.runs.config import versions
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "parking_transfer.json"
 TRAINED = "jax/Parking-v0"
@@ -103,12 +103,9 @@ def main() -> None:
         print(json.dumps(runs[-1]), flush=True)
     preset = presets.find(TRAINED)
     assert preset is not None
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     content = {
-        "command": shlex.join(["python", "benchmarks/parking_transfer.py", *sys.argv[1:]]),
-        "commit": commit.stdout.strip(),
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": xla.cores()},
+        **provenance(),
+        "machine": machine(),
         "device": f"{jax.devices()[0].device_kind} ({jax.default_backend()})",
         "versions": versions(),
         "hyperparameters": configs.to_json(agent.config),
@@ -116,8 +113,7 @@ def main() -> None:
         "runs": runs,
         "all": pooled(runs),
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write(arguments.out, content)
     print(json.dumps(content["all"]))
 
 

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import shlex
-import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import in_process, machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "pqn.json"
 ENV = "jax/CartPole-v1"
@@ -102,28 +101,22 @@ def main() -> None:
     if arguments.child is not None:
         print(json.dumps(child(*json.loads(arguments.child))))
         return
-    from benchmarks.remote import commit
     from rejeu import presets
-    from rejeu.xla import cores
 
     runs = []
     for seed in arguments.seeds:
         asked = json.dumps([seed, arguments.every, arguments.episodes, arguments.target])
-        words = [sys.executable, __file__, "--child", asked]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise SystemExit(f"seed {seed} failed: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
-        runs.append(json.loads(done.stdout.strip().splitlines()[-1]))
+        runs.append(in_process(sys.executable, __file__, "--child", asked))
+        if "error" in runs[-1]:
+            raise SystemExit(f"seed {seed} failed: {runs[-1]['error']}")
         print(line(runs[-1]), flush=True)
     preset = presets.find(ENV, "PQN")
     assert preset is not None
     shared = {name: runs[0][name] for name in SHARED}
     times = [run["reached"]["seconds"] for run in runs if run["reached"]]
     content = {
-        "command": shlex.join(["python", "benchmarks/pqn.py", *sys.argv[1:]]),
-        "commit": commit(),
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": cores(), "load": os.getloadavg()},
+        **provenance(),
+        "machine": machine(),
         **shared,
         "env": ENV,
         "hyperparameters": dict(preset.hyperparameters),
@@ -136,7 +129,7 @@ def main() -> None:
         },
         "runs": [{name: run[name] for name in run if name not in SHARED} for run in runs],
     }
-    arguments.out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write(arguments.out, content)
 
 
 def line(run: dict[str, Any]) -> str:

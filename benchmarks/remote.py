@@ -11,11 +11,6 @@ local worker processes and actors of a Ray cluster on this machine; all environm
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
-import shlex
-import subprocess
 import sys
 import time
 from contextlib import closing
@@ -29,7 +24,9 @@ import numpy as np
 import rejeu
 from rejeu import cluster
 from rejeu.runs.config import versions
-from rejeu.xla import cores
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance, write
 
 ROOT = Path(__file__).parents[1]
 RESULT = Path(__file__).parent / "results" / "remote.json"
@@ -108,14 +105,6 @@ def send_and_receive(env: Any, action: np.ndarray) -> None:
     env.receive()
 
 
-def commit() -> str:
-    """Returns the commit of the working tree, with a plus if files were changed."""
-    said = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    return said.stdout.strip()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--backends", nargs="+", default=BACKENDS, choices=BACKENDS)
@@ -144,21 +133,8 @@ def main() -> None:
                 )
     if connection is not None:
         connection.close()
-    machine = {"processor": platform.processor() or platform.machine(), "cores": cores(), "load": os.getloadavg()[0]}
-    arguments.out.write_text(
-        json.dumps(
-            {
-                "command": shlex.join(["python", *sys.argv]),
-                "commit": commit(),
-                "machine": machine,
-                "versions": versions(),
-                "seconds": arguments.seconds,
-                "results": rows,
-            },
-            indent=1,
-        )
-        + "\n"
-    )
+    content = {**provenance(), "machine": machine(), "versions": versions(), "seconds": arguments.seconds}
+    write(arguments.out, {**content, "results": rows})
 
 
 if __name__ == "__main__":

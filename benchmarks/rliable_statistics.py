@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import write
+
 RESULTS = Path(__file__).parent / "results" / "rliable_statistics.json"
 N_SAMPLES = 2000
 SHAPES = {"5 runs, 1 environment": (5, 1), "10 runs, 4 environments": (10, 4), "7 runs, 26 environments": (7, 26)}
@@ -120,7 +123,7 @@ def main() -> None:
     ]
     command = "python benchmarks/rliable_statistics.py --peer PYTHON"
     content = {"command": command, "versions": versions, "samples": N_SAMPLES, "seed": SEED, "rows": rows}
-    RESULTS.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write(RESULTS, content)
     for row in rows:
         print(f"{row['statistic']:40} {row['largest_difference']:.1e}")
     sys.exit(max(row["largest_difference"] for row in rows) > 1e-6)

@@ -18,8 +18,6 @@ import argparse
 import json
 import math
 import os
-import platform
-import shlex
 import statistics
 import subprocess
 import sys
@@ -29,6 +27,9 @@ from pathlib import Path
 from typing import Any
 
 from rejeu.experiments.process import environment
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import provenance, write
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "sweep.json"
@@ -136,16 +137,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULT)
     arguments = parser.parse_args()
     runs, workers = arguments.runs, arguments.workers
-    result: dict[str, Any] = {
-        "commit": subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout.strip(),
-        "date": time.strftime("%Y-%m-%d"),
-        "command": shlex.join(["python", "benchmarks/sweep.py", *sys.argv[1:]]),
-        "python": platform.python_version(),
-        "system": platform.system(),
-        "cores": os.cpu_count(),
-    }
+    result: dict[str, Any] = {**provenance(), "cores": os.cpu_count()}
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         steps = steps_of(arguments.seconds, root)
@@ -171,8 +163,7 @@ def main() -> None:
                 "share_of_the_times_of_its_processes": sum(own) / workers / seconds,
             }
             print(kind, json.dumps(result[kind]), flush=True)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(arguments.out, result)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import platform
 import shlex
 import signal
 import subprocess
@@ -29,6 +27,9 @@ from typing import Any
 import rejeu
 from rejeu.experiments import study as studies
 from rejeu.experiments.study import Outcome, StudyFolder
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance, write
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "tune.json"
@@ -76,17 +77,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             found.append(run(name, Path(folder) / "study", arguments))
         print(json.dumps(found[-1], indent=1), flush=True)
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
-    content = {
-        "command": shlex.join(["python", "benchmarks/tune.py", *sys.argv[1:]]),
-        "commit": commit.stdout.strip(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "python": platform.python_version(),
-        "rejeu": rejeu.__version__,
-        "studies": found,
-    }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    cores = machine()["cores"]
+    write(arguments.out, {**provenance(), "cores": cores, "rejeu": rejeu.__version__, "studies": found})
 
 
 def run(name: str, folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:

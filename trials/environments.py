@@ -35,7 +35,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # comp
 import numpy as np
 import psutil
 from gymnasium import spaces
-from provenance import provenance
+from provenance import provenance, write
 
 import rejeu
 from rejeu.agents.run_files import run_files
@@ -245,8 +245,7 @@ def main() -> None:
             "not as they must be": [one for one in runs if one["wrong"]],
         }
     result["restarted workers"] = restarted()
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(RESULT, result)
     print(json.dumps(result, indent=1))
 
 

@@ -31,7 +31,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from provenance import provenance
+from provenance import provenance, write
 
 import rejeu
 from rejeu.io import checkpoint
@@ -82,9 +82,7 @@ def main() -> None:
         result["code in a rejeu file"] = code_in_ours(Path(folder))
         if arguments.sb3_python is not None:
             result["code in a Stable-Baselines3 file"] = code_in_theirs(arguments.sb3_python, Path(folder))
-    target = ROOT / "trials" / "results" / "hostile.json"
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(ROOT / "trials" / "results" / "hostile.json", result)
     print(json.dumps({key: value for key, value in result.items() if key.startswith(("code", "mega"))}, indent=1))
 
 

@@ -305,7 +305,7 @@ def main() -> None:
     elif arguments.check_sb3_callback:
         check_sb3_callback(arguments.check_sb3_callback)
     else:
-        from provenance import provenance
+        from provenance import provenance, write
 
         rng = random.Random(arguments.seed)
         result: dict[str, object] = {**provenance({arguments.sb3_python: "PATH"})}
@@ -313,8 +313,7 @@ def main() -> None:
         if arguments.sb3_python:
             result["stable_baselines3"] = kill_sb3(arguments.sb3_python, arguments.sb3_kills, rng)
             result["stable_baselines3_callback"] = kill_sb3_callback(arguments.sb3_python, arguments.sb3_kills, rng)
-        RESULT.parent.mkdir(parents=True, exist_ok=True)
-        RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write(RESULT, result)
         print(json.dumps(result, indent=1))
 
 

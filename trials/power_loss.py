@@ -36,7 +36,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import kill
-from provenance import provenance
+from provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "power_loss.json"
 SHUTDOWN, WITHOUT_FLUSHING = 0x8004587D, 2
@@ -188,8 +188,7 @@ def main() -> None:
             rng = random.Random(0)
             result["ext4"] = for_real(arguments.cuts, Path(root), rng, fsync=True)
             result["ext4 without fsync"] = for_real(arguments.cuts_without_fsync, Path(root), rng, fsync=False)
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(RESULT, result)
     print(json.dumps(result, indent=1))
 
 

@@ -1,15 +1,18 @@
-"""Origin of results: commit, date, command and machine."""
+"""What scripts of trials and benchmarks share: origin of results, their files, and measurements in other processes."""
 
 from __future__ import annotations
 
+import json
+import os
 import platform
 import shlex
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def provenance(names: dict[str, str] | None = None) -> dict[str, str]:
@@ -29,11 +32,41 @@ def provenance(names: dict[str, str] | None = None) -> dict[str, str]:
     }
 
 
-def commit() -> str:
-    """Returns the commit of the working tree, and whether its sources differ from the commit."""
-    head = git("rev-parse", "--short", "HEAD")
-    return f"{head}, with changes" if git("status", "--porcelain", "--", "src", "tests", "trials/*.py") else head
+def machine() -> dict[str, Any]:
+    """Returns processor, cores that this process may use, and load average."""
+    from rejeu.xla import cores
+
+    return {"processor": platform.processor() or platform.machine(), "cores": cores(), "load": os.getloadavg()[0]}
 
 
-def git(*arguments: str) -> str:
-    return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+def commit(root: Path = ROOT) -> str:
+    """Returns the commit of a working tree, and whether its sources differ from the commit."""
+    head = git(root, "rev-parse", "--short", "HEAD")
+    changes = git(root, "status", "--porcelain", "--", "src", "tests", "trials/*.py", "benchmarks/*.py")
+    return f"{head}, with changes" if changes else head
+
+
+def git(root: Path, *arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def write(path: Path, content: dict[str, Any], rows: str = "") -> None:
+    """Writes results as JSON; ``rows`` names a list of which each element is on one line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({key: value for key, value in content.items() if key != rows}, indent=1)
+    if rows:
+        lines = ",\n  ".join(json.dumps(row) for row in content[rows])
+        text = f'{text[:-2]},\n "{rows}": [\n  {lines}\n ]\n}}'
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def in_process(*command: str, environment: dict[str, str] | None = None) -> dict[str, Any]:
+    """Runs a command in a process of its own and returns the last line that it printed, which is JSON.
+
+    A command that fails has only the key ``error``, with the last line of its standard error.
+    """
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode:
+        return {"error": (done.stderr.strip().splitlines() or ["no message"])[-1]}
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from provenance import provenance
+from provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "resume.json"
 STEPS = 1200
@@ -227,9 +227,7 @@ def main() -> None:
         if done.returncode:
             raise SystemExit(f"{shlex.join(done.args)} failed:\n{done.stderr[-2000:]}")
         content["stable_baselines3"] = json.loads(done.stdout.strip().splitlines()[-1])
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    rows = ",\n  ".join(json.dumps(row) for row in content.pop("cases"))
-    RESULT.write_text(json.dumps(content, indent=1)[:-2] + f',\n "cases": [\n  {rows}\n ]\n}}\n', encoding="utf-8")
+    write(RESULT, content, rows="cases")
     print(
         f"{sum(r.get('equal_at_the_end', r['equal_at_the_break']) for r in results)} of {len(results)} are as they must be"
     )

@@ -18,13 +18,11 @@ import argparse
 import collections
 import json
 import random
-import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -155,12 +153,10 @@ def main() -> None:
             found.append(one)
             print(len(found), json.dumps(one), flush=True)
     counted = [one for one in found if one["phase"] != PHASES[0]]
-    from provenance import commit
+    from provenance import provenance, write
 
     result = {
-        "command": shlex.join(["python", "trials/signals.py", "--signals", str(arguments.signals)]),
-        "commit": commit(),
-        "date": date.today().isoformat(),
+        **provenance(),
         "seconds_of_a_run": round(lengths[-1], 1),
         "signals": len(found),
         "by_phase": {name: sum(one["phase"] == name for one in found) for name in PHASES},
@@ -175,8 +171,7 @@ def main() -> None:
             {key: one[key] for key in ("signal", "status", "error")} for one in found if one["phase"] == PHASES[0]
         ],
     }
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write(RESULT, result)
     print(json.dumps(result, indent=1))
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from provenance import provenance
+from provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "soak.json"
 PICTURE = Path(__file__).parent / "images" / "soak.png"
@@ -167,10 +167,8 @@ def main() -> None:
         "files_before_and_after": [before["files"], after["files"]],
         "seen": watch.rows,
     }
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    rows = ",\n  ".join(json.dumps(row) for row in content.pop("seen"))
-    text = json.dumps(content, indent=1)[:-2] + f',\n "seen": [\n  {rows}\n ]\n}}\n'
-    RESULT.write_text(text, encoding="utf-8")
+    write(RESULT, content, rows="seen")
+    del content["seen"]
     draw(watch.rows, arguments.minutes, PICTURE)
     print(json.dumps(content, indent=1))
 

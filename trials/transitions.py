@@ -17,7 +17,6 @@ import argparse
 import itertools
 import json
 import math
-import subprocess
 import time
 import warnings
 from pathlib import Path
@@ -387,18 +386,10 @@ def main() -> None:
         results.append(try_case(case, arguments.seed))
         print(json.dumps(results[-1]), flush=True)
     totals = {key: sum(one[key] for one in results) for key in ("transitions", "relabeled", "terminal", "differ")}
-    git = ["git", "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(git, capture_output=True, text=True, check=True, cwd=Path(__file__).parent).stdout.strip()
-    content = {
-        "command": f"python trials/transitions.py --seed {arguments.seed}",
-        "commit": commit,
-        "date": time.strftime("%Y-%m-%d"),
-        "seconds": round(time.monotonic() - began),
-        **totals,
-    }
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    rows = ",\n  ".join(json.dumps(row) for row in results)
-    RESULT.write_text(json.dumps(content, indent=1)[:-2] + f',\n "cases": [\n  {rows}\n ]\n}}\n', encoding="utf-8")
+    from provenance import provenance, write
+
+    content = {**provenance(), "seconds": round(time.monotonic() - began), **totals, "cases": results}
+    write(RESULT, content, rows="cases")
     print(
         f"{totals['transitions']:,} transitions in {len(results)} cases, {totals['relabeled']:,} with another goal, "
         f"{totals['terminal']:,} into a terminal state: {totals['differ']} differ"
