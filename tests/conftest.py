@@ -30,7 +30,7 @@ import hypothesis
 import jax
 import pytest
 
-hypothesis.settings.register_profile("rejeu", derandomize=True, deadline=None, database=None)
+hypothesis.settings.register_profile("rejeu", max_examples=50, derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("rejeu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # set by shells for background jobs; subprocesses inherit it

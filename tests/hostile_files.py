@@ -11,7 +11,7 @@ import math
 import pickle
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +19,8 @@ import numpy as np
 NAMES = {"float32": "F32", "float64": "F64", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8"}
 NAMES |= {"uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8", "bool": "BOOL", "float16": "F16"}
 DTYPES = {name: dtype for dtype, name in NAMES.items()}
+GONE = object()
+"""Stands for a value that is left out."""
 
 
 class Parts(NamedTuple):
@@ -57,12 +59,14 @@ def checksum(array: np.ndarray) -> int:
     return zlib.crc32(array.tobytes(), zlib.crc32(f"{array.dtype.name}{list(array.shape)}".encode()))
 
 
+def text_of(parts: Parts) -> str:
+    """Returns the JSON of a header with correct checksums."""
+    return json.dumps({**parts.header, "checksums": {name: checksum(a) for name, a in parts.arrays.items()}})
+
+
 def table_of(header: Any, arrays: dict[str, np.ndarray], text: str | None = None) -> dict[str, Any]:
     """Returns the table of a file with correct checksums; ``text`` replaces the JSON of the header."""
-    if text is None:
-        sums = {name: checksum(array) for name, array in arrays.items()}
-        full = {**header, "checksums": sums} if isinstance(header, dict) else header
-        text = json.dumps(full)
+    text = text_of(Parts(header, arrays)) if text is None else text
     metadata = {"rejeu": text, "crc32": f"{zlib.crc32(text.encode('utf-8', 'surrogatepass')):08x}"}
     table: dict[str, Any] = {"__metadata__": metadata}
     place = 0
@@ -92,11 +96,34 @@ def changed(content: bytes, change: Callable[[dict, dict], Any]) -> bytes:
     return put_together(parts)
 
 
+def with_values(content: bytes, kind: str, path: str, values: Iterable[Any]) -> Iterator[Variant]:
+    """Yields files whose header has each of the values at a path of keys, for example ``config.gamma``."""
+    for value in values:
+
+        def change(header: dict, arrays: dict, value: Any = value) -> None:
+            *way, last = path.split(".")
+            for key in way:
+                header = header[key]
+            header.pop(last) if value is GONE else header.update({last: value})
+
+        name = "gone" if value is GONE else str(value)[:20]
+        yield Variant(kind, f"{path} {name}", changed(content, change))
+
+
+def with_arrays(content: bytes, kind: str, changes: dict[str, Callable[[dict], Any]]) -> Iterator[Variant]:
+    """Yields files whose arrays were changed by each of the functions."""
+    for name, change in changes.items():
+        yield Variant(kind, name, changed(content, lambda header, arrays, change=change: change(arrays)))
+
+
 def variants(content: bytes) -> Iterator[Variant]:
     """Yields invalid files made from a valid one of any kind, except bit flips (:func:`flipped`) and truncations."""
     yield from foreign()
+    yield from bad_entries(content)
     yield from bad_tables(content)
+    yield from bad_json(content)
     yield from bad_arrays(content)
+    yield from bad_checksums(content)
     yield from bad_texts(content)
 
 
@@ -106,144 +133,127 @@ def foreign() -> Iterator[Variant]:
     with zipfile.ZipFile(zipped, "w") as file:
         file.writestr("data", "{}")
     np.save(array, np.arange(3))
-    contents = {
-        "empty": b"",
-        "zip": zipped.getvalue(),
-        "numpy": array.getvalue(),
-        "zeros": bytes(64),
-        "ones": b"\xff" * 64,
-    }
-    contents |= {f"pickle {n}": pickle.dumps({"a": [1, 2]}, protocol=n) for n in (0, 2, 4)}
-    contents |= {
-        "text": b"{}",
-        "length only": (2).to_bytes(8, "little"),
-        "no table": bytes(8),
-        "empty table": join({}, b""),
-    }
+    contents = {"empty": b"", "zip": zipped.getvalue(), "numpy": array.getvalue(), "text": b"{}", "ones": b"\xff" * 64}
+    contents |= {"pickle": pickle.dumps({"a": [1]}), "old pickle": pickle.dumps({"a": [1]}, protocol=0)}
+    contents |= {"length only": (2).to_bytes(8, "little"), "no table": bytes(8), "empty table": join({}, b"")}
     for name, content in contents.items():
         yield Variant("foreign", name, content)
 
 
+def bad_entries(content: bytes) -> Iterator[Variant]:
+    """Yields files whose table has an invalid place, shape or dtype of the largest array."""
+    parts = take_apart(content)
+    table, data = table_of(parts.header, parts.arrays), content_of(parts)
+    large = max(parts.arrays, key=lambda name: parts.arrays[name].nbytes)
+    begin, end = table[large]["data_offsets"]
+    first = table[next(iter(parts.arrays))]["data_offsets"][0]
+    places = ([begin, end + 1], [begin - 1, end], [end, begin], [-1, end], [begin, 2**62], [2**62, 2**63])
+    places += ([begin, end, end], [], [0.0, 1.0], [True, 2], "ab", None, [10**30, 10**31], [first, first + end - begin])
+    shapes = ([2**40], [2**62, 4], [-1], [1.5], [True], "3", None, {}, [[1]], [0, 2**60, 2**60], [1] * 100_000)
+    shapes += ([10**30], [0], [], parts.arrays[large].size + 1)
+    dtypes = {"F64", "BF16", "object", "", None, 3, "U8", "V4"} - {table[large]["dtype"]}
+    for key, values in (("data_offsets", places), ("shape", shapes), ("dtype", dtypes)):
+        kind = {"data_offsets": "places"}.get(key, key)
+        for i, value in enumerate(values):
+            yield Variant(kind, f"{i}: {str(value)[:20]}", join({**table, large: {**table[large], key: value}}, data))
+
+
 def bad_tables(content: bytes) -> Iterator[Variant]:
-    """Yields files whose table has invalid lengths, offsets, shapes and names."""
+    """Yields files whose table has an invalid length, or too few or too many entries."""
     parts = take_apart(content)
     table, data = table_of(parts.header, parts.arrays), content_of(parts)
     size = len(json.dumps(table))
-    for length in (0, 1, 7, size - 1, size + 1, size + len(data), size + len(data) + 1, 2**20, 2**31, 2**63, 2**64 - 1):
+    for length in (0, 1, size - 1, size + 1, size + len(data) + 1, 2**20, 2**31, 2**63, 2**64 - 1):
         yield Variant("length", str(length), join(table, data, length))
-    names = [name for name in table if name != "__metadata__"]
-    first, last = names[0], max(names, key=lambda name: table[name]["data_offsets"][1])
-    large = max(names, key=lambda name: parts.arrays[name].nbytes)
-    begin, end = table[large]["data_offsets"]
-
-    def with_entry(name: str, **fields: Any) -> bytes:
-        return join({**table, name: {**table[name], **fields}}, data)
-
-    places = (
-        [begin, end + 1],
-        [begin - 1, end],
-        [begin + 1, end],
-        [end, begin],
-        [-1, end],
-        [begin, 2**62],
-        [2**62, 2**63],
-    )
-    places += ([begin, end, end], [begin], [], [0.0, 1.0], [True, 2], "ab", None, [None, None], [10**30, 10**31])
-    for place in places:
-        yield Variant("places", str(place), with_entry(large, data_offsets=place))
-    overlap = table[first]["data_offsets"]
-    yield Variant(
-        "places", "two arrays at one place", with_entry(large, data_offsets=[overlap[0], overlap[0] + end - begin])
-    )
-    shapes = ([2**40], [10**12], [2**62, 4], [2**63], [-1], [1.5], [True], "3", None, {}, [[1]], [0, 2**60, 2**60])
-    shapes += ([1] * 100_000, [2] * 10_000, [10**30], [0], [], parts.arrays[large].size + 1)
-    for i, shape in enumerate(shapes):
-        yield Variant("shape", f"{i}: {str(shape)[:20]}", with_entry(large, shape=shape))
-    own = table[large]["dtype"]
-    for dtype in ("F64", "I32", "F16", "BF16", "F8_E4M3", "object", "O", "", None, 3, ["F32"], "U8", "BOOL", "V4"):
-        if dtype != own:
-            yield Variant("dtype", str(dtype), with_entry(large, dtype=dtype))
-    more = {"extra": 1}
-    yield Variant("table", "a field too many", with_entry(large, **more))
-    yield Variant("table", "a field too few", join({**table, large: {"dtype": own}}, data))
-    for value in (None, [], 3, "x", {}):
-        yield Variant("table", f"entry {value!r}", join({**table, large: value}, data))
-        yield Variant("table", f"metadata {value!r}", join({**table, "__metadata__": value}, data))
-        yield Variant("table", f"table {value!r}", join([value], data))
-    yield Variant("table", "bytes after the arrays", join(table, data + b"\0"))
-    yield Variant("table", "a hole", join({**table, last: {**table[last]}}, data[:-1]))
-    huge = {"dtype": "F32", "shape": [10**12], "data_offsets": [len(data), len(data) + 4 * 10**12]}
-    yield Variant("table", "four terabytes", join({**table, "huge": huge}, data))
+    large = max(parts.arrays, key=lambda name: parts.arrays[name].nbytes)
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [len(data)] * 2}
-    yield Variant("table", "an array too many", join({**table, "more": empty}, data))
-    many = {f"more.{i}": empty for i in range(40_000)}
-    yield Variant("table", "forty thousand arrays too many", join({**table, **many}, data))
-    text = json.dumps(table)
-    twice = text[:-1] + f', "{large}": {json.dumps(table[large])}}}'
-    yield Variant("duplicate", "array", join(twice.encode(), data))
-    yield Variant("duplicate", "metadata", join((text[:-1] + ', "__metadata__": {}}').encode(), data))
-    yield Variant("duplicate", "many", join(("{" + '"a":1,' * 100_000 + '"a":1}').encode(), b""))
-    for name, bad in (
-        ("deep lists", "[" * 10_000),
-        ("deep and closed", "[" * 10_000 + "]" * 10_000),
-        ("quotes", '"' * 9999),
-    ):
-        yield Variant("json", name, join(bad.encode(), data))
-    for name, bad in (("backslashes", '"\\' * 500_000), ("brackets", "[],"), ("million brackets", "[{}," * 400_000)):
-        yield Variant("json", name, join(bad.encode(), data))
-    yield Variant("json", "deep dicts", join(('{"a":' * 10_000 + "1" + "}" * 10_000).encode(), data))
+    huge = {"dtype": "F32", "shape": [10**12], "data_offsets": [len(data), len(data) + 4 * 10**12]}
+    for name, bad in {
+        "a field too many": {**table, large: {**table[large], "extra": 1}},
+        "a field too few": {**table, large: {"dtype": table[large]["dtype"]}},
+        "four terabytes": {**table, "huge": huge},
+        "an array too many": {**table, "more": empty},
+        "forty thousand arrays too many": {**table, **{f"more.{i}": empty for i in range(40_000)}},
+        **{f"entry {value!r}": {**table, large: value} for value in (None, [], 3, "x", {})},
+        **{f"metadata {value!r}": {**table, "__metadata__": value} for value in (None, [], 3, "x", {})},
+        **{f"table {value!r}": [value] for value in (None, [], 3, "x", {})},
+    }.items():
+        yield Variant("table", name, join(bad, data))
+    yield Variant("table", "bytes after the arrays", join(table, data + b"\0"))
+    yield Variant("table", "bytes missing", join(table, data[:-1]))
+
+
+def bad_json(content: bytes) -> Iterator[Variant]:
+    """Yields files whose table is no JSON, or JSON that no program would write."""
+    parts = take_apart(content)
+    table, data = table_of(parts.header, parts.arrays), content_of(parts)
+    text, name = json.dumps(table), max(parts.arrays, key=lambda name: parts.arrays[name].nbytes)
+    place = json.dumps(table[name]["data_offsets"])
+    begin = table[name]["data_offsets"][0]
+    texts = {
+        "deep lists": "[" * 10_000,
+        "deep and closed": "[" * 10_000 + "]" * 10_000,
+        "deep dicts": '{"a":' * 10_000 + "1" + "}" * 10_000,
+        "quotes": '"' * 9999,
+        "backslashes": '"\\' * 500_000,
+        "million brackets": "[{}," * 400_000,
+        "a lone surrogate": text.replace(f'"{name}"', '"\\ud800"'),
+        "a new line": text.replace(f'"{name}"', '"a\\nb"'),
+        "an array twice": text[:-1] + f', "{name}": {json.dumps(table[name])}}}',
+        "metadata twice": text[:-1] + ', "__metadata__": {}}',
+        "a key many times": "{" + '"a":1,' * 100_000 + '"a":1}',
+    }
+    numbers = ("NaN", "-Infinity", "1e999", "9" * 5000, "9" * 60)
+    texts |= {f"place {number[:9]}": text.replace(place, f"[{begin}, {number}]") for number in numbers}
+    for what, bad in texts.items():
+        yield Variant("json", what, join(bad.encode(), data))
     yield Variant("json", "no text", join(b'{"\xff": 1}', data))
-    yield Variant("json", "a lone surrogate", join(text.replace(f'"{large}"', '"\\ud800"').encode(), data))
-    yield Variant("json", "a new line", join(text.replace(f'"{large}"', '"a\\nb"').encode(), data))
-    for number in ("NaN", "Infinity", "-Infinity", "1e999", "9" * 5000, "9" * 60):
-        place = json.dumps([begin, end])
-        yield Variant("json", f"place {number[:9]}", join(text.replace(place, f"[{begin}, {number}]").encode(), data))
 
 
 def bad_arrays(content: bytes) -> Iterator[Variant]:
     """Yields files with wrong arrays."""
     parts = take_apart(content)
-    for name, array in parts.arrays.items():
-        if (array.dtype.kind == "f" and name.split(".")[0] not in ("obs",)) or name in ("obs.mean", "obs.var"):
-            for value in (math.nan, math.inf):
-                spoilt = array.copy()
-                spoilt.flat[-1] = value
-                yield Variant(
-                    "not finite", f"{name} {value}", put_together(parts._replace(arrays=parts.arrays | {name: spoilt}))
-                )
-            break
-    long = {"many\nlines " * 200: np.zeros(1, np.float32)}
-    yield Variant("names", "of many lines", put_together(parts._replace(arrays=parts.arrays | long)))
+    numbers = [
+        name
+        for name, array in parts.arrays.items()
+        if (array.dtype.kind == "f" and name.split(".")[0] != "obs") or name in ("obs.mean", "obs.var")
+    ][:1]
     name, array = max(parts.arrays.items(), key=lambda item: item[1].nbytes)
     others = {
         "gone": None,
         "longer": np.zeros((*array.shape, 2), array.dtype),
         "flat": array.ravel() if array.ndim != 1 else array[None],
-        "of bytes": array.view(np.uint8)
-        if array.ndim and array.dtype != np.uint8
-        else np.zeros(array.nbytes, np.uint8),
         "of half precision": array.astype(np.float16),
         "of double precision": array.astype(np.float64 if array.dtype != np.float64 else np.float32),
         "of truth": array.astype(bool),
     }
-    for word, other in others.items():
-        rest = {key: value for key, value in parts.arrays.items() if key != name}
-        yield Variant(
-            "array",
-            f"{name} {word}",
-            put_together(parts._replace(arrays=rest if other is None else {**rest, name: other})),
-        )
-    yield Variant(
-        "array", "too many", put_together(parts._replace(arrays={**parts.arrays, "evil": np.zeros(3, np.float32)}))
-    )
-    yield Variant("array", "none", put_together(parts._replace(arrays={})))
+    changes: dict[str, Callable[[dict], Any]] = {
+        f"{name} {word}": lambda a, other=other: a.pop(name) if other is None else a.update({name: other})
+        for word, other in others.items()
+    }
+    changes |= {
+        "too many": lambda a: a.update(evil=np.zeros(3, np.float32)),
+        "none": lambda a: a.clear(),
+        "of a name of many lines": lambda a: a.update({"many\nlines " * 200: np.zeros(1, np.float32)}),
+        **{
+            f"{one} {value}": lambda a, one=one, value=value: np.put(a[one], -1, value)
+            for one in numbers
+            for value in (math.nan, math.inf)
+        },
+    }
+    yield from with_arrays(content, "array", changes)
+
+
+def bad_checksums(content: bytes) -> Iterator[Variant]:
+    """Yields files whose checksums are wrong, missing or something else."""
+    parts = take_apart(content)
     table, data = table_of(parts.header, parts.arrays), content_of(parts)
     damaged = bytearray(data)
     damaged[len(data) // 2] ^= 1
     yield Variant("checksum", "of an array", join(table, bytes(damaged)))
-    header = table["__metadata__"]["rejeu"]
+    header, crc32 = table["__metadata__"].values()
     for name, metadata in {
-        "of the header": {"rejeu": header.replace('"schema"', ' "schema"'), "crc32": table["__metadata__"]["crc32"]},
+        "of the header": {"rejeu": header.replace('"schema"', ' "schema"'), "crc32": crc32},
         "of the header, missing": {"rejeu": header},
         "of the header, of another kind": {"rejeu": header, "crc32": "x"},
         "metadata of numbers": {"rejeu": header, "crc32": 3},
@@ -258,261 +268,139 @@ def bad_arrays(content: bytes) -> Iterator[Variant]:
 def bad_texts(content: bytes) -> Iterator[Variant]:
     """Yields files with an invalid header and its correct checksum."""
     parts = take_apart(content)
-    good = json.dumps({**parts.header, "checksums": {name: checksum(a) for name, a in parts.arrays.items()}})
-    texts = [
-        "",
-        "{",
-        "[]",
-        "{}",
-        "null",
-        "3",
-        '"text"',
-        "[" * 10_000,
-        "[" * 10_000 + "]" * 10_000,
-        '{"a":' * 5000 + "}" * 5000,
-    ]
-    texts += [good[:-1], good + "}", good[:-1] + ', "kind": "agent"}', good[:-1] + ', "schema": 2}', "\ufeff" + good]
-    texts += [
-        good.replace('"schema": 2', f'"schema": {n}')
-        for n in ("NaN", "0", "3", "-1", "2.0", "true", "1e999", "[2]", "null")
-    ]
-    texts += [good.replace('"schema": 2', f'"schema": 2, "x": {n}') for n in ("NaN", "-Infinity", "1e999", "9" * 5000)]
-    texts += [
-        good.replace(f'"kind": "{parts.header["kind"]}"', f'"kind": {kind}')
-        for kind in ('"evil"', "null", "[]", "{}", "7")
-    ]
+    good, schema, kind = text_of(parts), '"schema": 2', f'"kind": "{parts.header["kind"]}"'
+    texts = ["", "{", "[]", "{}", "null", "3", '"text"', "[" * 10_000, '{"a":' * 5000 + "}" * 5000]
+    texts += [good[:-1], good + "}", good[:-1] + f", {kind}}}", good[:-1] + f", {schema}}}", "\ufeff" + good]
+    texts += [good.replace(schema, f'"schema": {n}') for n in ("NaN", "0", "3", "-1", "2.0", "true", "[2]", "null")]
+    texts += [good.replace(schema, f'{schema}, "x": {n}') for n in ("NaN", "-Infinity", "1e999", "9" * 5000)]
+    texts += [good.replace(kind, f'"kind": {other}') for other in ('"evil"', "null", "[]", "{}", "7")]
     for i, text in enumerate(texts):
         yield Variant("header text", f"{i}: {text[:20]!r}", put_together(parts, text))
 
 
+NUMBERS = (math.nan, math.inf, -1, 10**30, "3", "NaN", True, None, [], {})
+"""What is no number that a header may hold."""
 LARGE_SPACES = (
     {"Box": {"low": 0, "high": 1, "shape": [10**9], "dtype": "float32"}},
     {"Discrete": {"n": 10**12, "start": 0}},
     {"MultiBinary": {"shape": [10**5, 10**5]}},
 )
 """Spaces that would exhaust the memory."""
-CODE = (
-    "os.system",
-    "__import__('os').system('true')",
-    "builtins.eval",
-    "subprocess:Popen",
-    "../../evil",
-    "gASVAAAAAA==",
-)
+CODE = ("os.system", "__import__('os').system('true')", "subprocess:Popen", "../../evil", "gASVAAAAAA==")
 """Names of code and files, which may occur in a header and must not be looked up."""
+LARGE = (10**6, 10**9, 10**15, 2**63)
 
 
 def bad_models(content: bytes) -> Iterator[Variant]:
     """Yields model files whose header asks for unknown names, for code, or for too much memory."""
-
-    def of(kind: str, name: str, change: Callable[[dict, dict], Any]) -> Variant:
-        return Variant(kind, name, changed(content, change))
-
-    policy = lambda h: h["config"]["policy_kwargs"]  # noqa: E731
+    header = take_apart(content).header
+    shape = "config.policy_kwargs"
+    for path in ("algorithm", "policy", "config", f"{shape}.torso", f"{shape}.activation_fn", f"{shape}.architecture"):
+        yield from with_values(content, "code", path, CODE)
+    yield from with_values(content, "code", f"{shape}.torso", [{":serialized:": text} for text in CODE])
+    yield from with_values(content, "code", "observation_space", [{text: "true"} for text in CODE])
+    yield from with_values(content, "code", "action_space", [{":type:": text, ":serialized:": text} for text in CODE])
+    yield from with_values(content, "code", "config.learning_rate", [{"schedule": text} for text in CODE])
     for text in CODE:
-        yield of("code", f"algorithm {text}", lambda h, a, t=text: h.update(algorithm=t))
-        yield of("code", f"policy {text}", lambda h, a, t=text: h.update(policy=t))
-        yield of("code", f"torso {text}", lambda h, a, t=text: policy(h).update(torso=t))
-        yield of("code", f"torso as data {text}", lambda h, a, t=text: policy(h).update(torso={":serialized:": t}))
-        yield of("code", f"activation {text}", lambda h, a, t=text: policy(h).update(activation_fn=t))
-        yield of("code", f"architecture {text}", lambda h, a, t=text: policy(h).update(architecture=t))
-        yield of("code", f"space {text}", lambda h, a, t=text: h.update(observation_space={t: "true"}))
-        yield of(
-            "code", f"space type {text}", lambda h, a, t=text: h.update(action_space={":type:": t, ":serialized:": t})
-        )
-        yield of("code", f"schedule {text}", lambda h, a, t=text: h["config"].update(learning_rate={"schedule": t}))
-        yield of("code", f"config {text}", lambda h, a, t=text: h["config"].update({t: 1}))
-        yield of("code", f"config replaced {text}", lambda h, a, t=text: h.update(config=t))
-    for number in (
-        math.nan,
-        math.inf,
-        1e308,
-        -1,
-        10**15,
-        10**30,
-        0.5,
-        "3",
-        True,
-        None,
-        [],
-        {},
-        [[1]],
-        "NaN",
-        "Infinity",
-    ):
-        label = str(number)[:12]
-        yield of("number", f"gamma {label}", lambda h, a, n=number: h["config"].update(gamma=n if n != 0.5 else 1.5))
-        if number is not None:
-            yield of("number", f"net_arch {label}", lambda h, a, n=number: policy(h).update(net_arch=[n]))
-            yield of(
-                "number", f"learning_rate {label}", lambda h, a, n=number: h["config"].update(learning_rate=bad_rate(n))
-            )
-        yield of("number", f"seed {label}", lambda h, a, n=number: h.update(seed=n))
-        yield of(
-            "number", f"window {label}", lambda h, a, n=number: h.update(stats_window_size=n if n != 10**15 else -3)
-        )
-        yield of("number", f"step {label}", lambda h, a, n=number: h["counters"].update(step=n))
-        yield of(
-            "number",
-            f"rng {label}",
-            lambda h, a, n=number: h.update(rng={"state": n if n != 10**15 and n != 10**30 else -1, "inc": 1}),
-        )
-        yield of("number", f"space {label}", lambda h, a, n=number: h.update(observation_space=n))
-        if number != 0.5:
-            yield of("number", f"dtype {label}", lambda h, a, n=number: h.update(observation_space=box(dtype=n)))
-        yield of("number", f"shape {label}", lambda h, a, n=number: h.update(observation_space=box(shape=[n])))
-        if number not in (10**15, 10**30, 1e308, -1, 0.5):
-            yield of(
-                "number",
-                f"low {label}",
-                lambda h, a, n=number: h.update(
-                    observation_space=box(low=n if n not in (True, "Infinity", math.inf) else "x")
-                ),
-            )
-        yield of(
-            "number",
-            f"choices {label}",
-            lambda h, a, n=number: h.update(observation_space={"Discrete": {"n": n, "start": 0}}),
-        )
-    for arch in (
-        [10**9] * 2,
-        [10**15],
-        [10**30],
-        [1] * 100_000,
-        [8] * 10**5,
-        [[8]],
-        [None],
-        [math.nan],
-        "8",
-        {"os": [1]},
-        {"pi": [10**12]},
-    ):
-        yield of("huge", f"net_arch {str(arch)[:20]}", lambda h, a, v=arch: policy(h).update(net_arch=v))
-    for n in (10**6, 10**9, 10**15, 2**63):
-        yield of(
-            "huge", f"n_blocks {n}", lambda h, a, v=n: policy(h).update(net_arch=None, architecture="simba", n_blocks=v)
-        )
-        yield of("huge", f"width {n}", lambda h, a, v=n: policy(h).update(net_arch=None, architecture="simba", width=v))
-        yield of("huge", f"branches {n}", lambda h, a, v=n: policy(h).update(net_arch=None, state_layers=[v]))
-        yield of(
-            "huge",
-            f"image {n}",
-            lambda h, a, v=n: h.update(
-                policy="CnnPolicy", observation_space=box(shape=[v, 84, 3], dtype="uint8", low=0)
-            ),
-        )
-        yield of(
-            "huge",
-            f"choices {n}",
-            lambda h, a, v=n: h.update(observation_space={"MultiDiscrete": {"nvec": [v], "start": [0]}}),
-        )
-        yield of("huge", f"bits {n}", lambda h, a, v=n: h.update(observation_space={"MultiBinary": {"shape": [v]}}))
-        yield of("huge", f"actions {n}", lambda h, a, v=n: h.update(action_space={"Discrete": {"n": v, "start": 0}}))
-        if "n_critics" in take_apart(content).header["config"]:
-            yield of("huge", f"n_critics {n}", lambda h, a, v=n: h["config"].update(n_critics=v))
-    parts = {f"k{i}": box() for i in range(20_000)}
-    yield of(
-        "huge", "a Dict of 20,000", lambda h, a: h.update(policy="MultiInputPolicy", observation_space={"Dict": parts})
-    )
-    boxes = {"Dict": {f"k{i}": box(shape=[2**19]) for i in range(100)}}
-    yield of("huge", "a Dict of large ones", lambda h, a: h.update(policy="MultiInputPolicy", observation_space=boxes))
+        yield from with_values(content, "code", f"config.{text.replace('.', ' ')}", [1])
+
+    for path in ("config.gamma", "seed", "stats_window_size", "counters.step", "observation_space"):
+        yield from with_values(content, "number", path, NUMBERS)
+    yield from with_values(content, "number", f"{shape}.net_arch", [[n] for n in NUMBERS if n is not None])
+    rates = [n for n in NUMBERS if n not in (None, 10**30)] + [{"schedule": "linear", "start": 1.0, "slope": 3}]
+    yield from with_values(content, "number", "config.learning_rate", rates)
+    yield from with_values(content, "number", "rng.state", [n for n in NUMBERS if n != 10**30])
+    boxes = [box(dtype=n) for n in NUMBERS] + [box(shape=[n]) for n in NUMBERS]
+    boxes += [box(low=n) for n in (math.nan, "3", None, [], {}, "x")]
+    choices = [{"Discrete": {"n": n, "start": 0}} for n in NUMBERS]
+    yield from with_values(content, "number", "observation_space", boxes + choices)
+
+    arches = ([10**9] * 2, [10**30], [1] * 100_000, [[8]], [None], "8", {"os": [1]}, {"pi": [10**12]})
+    yield from with_values(content, "huge", f"{shape}.net_arch", arches)
+    simba = changed(content, lambda h, a: h["config"]["policy_kwargs"].update(net_arch=None, architecture="simba"))
+    branches = changed(content, lambda h, a: h["config"]["policy_kwargs"].update(net_arch=None))
+    image = changed(content, lambda h, a: h.update(policy="CnnPolicy"))
+    yield from with_values(simba, "huge", f"{shape}.n_blocks", LARGE)
+    yield from with_values(simba, "huge", f"{shape}.width", LARGE)
+    yield from with_values(branches, "huge", f"{shape}.state_layers", [[n] for n in LARGE])
+    images = [box(shape=[n, 84, 3], dtype="uint8", low=0) for n in LARGE]
+    yield from with_values(image, "huge", "observation_space", images)
+    spaces = [{"MultiDiscrete": {"nvec": [n], "start": [0]}} for n in LARGE]
+    yield from with_values(content, "huge", "observation_space", [*spaces, *LARGE_SPACES])
+    yield from with_values(content, "huge", "action_space", [{"Discrete": {"n": n, "start": 0}} for n in LARGE])
+    if "n_critics" in header["config"]:
+        yield from with_values(content, "huge", "config.n_critics", LARGE)
+    many = [{"Dict": {f"k{i}": box() for i in range(20_000)}}, {"Dict": {f"k{i}": box([2**19]) for i in range(100)}}]
+    dicts = changed(content, lambda h, a: h.update(policy="MultiInputPolicy"))
+    yield from with_values(dicts, "huge", "observation_space", many)
     for deep in (50, 10_000):
         space = '{"Tuple": [' * deep + json.dumps(box()) + "]}" * deep
-        header = json.dumps(
-            take_apart(content).header
-            | {
-                "observation_space": "HERE",
-                "checksums": {name: checksum(a) for name, a in take_apart(content).arrays.items()},
-            }
-        )
-        yield Variant("deep", f"spaces {deep}", put_together(take_apart(content), header.replace('"HERE"', space)))
-    for key in take_apart(content).header:
-        if key not in ("env_id", "success_threshold"):
-            yield of("missing", key, lambda h, a, k=key: h.pop(k))
-            yield of("of another type", key, lambda h, a, k=key: h.update({k: [] if k != "config" else 3}))
-    for algorithm in ([], {}, 3, None, "sac", "SAC\n", "x" * 100_000):
-        yield of("algorithm", str(algorithm)[:10], lambda h, a, v=algorithm: h.update(algorithm=v))
+        text = text_of(Parts({**header, "observation_space": "HERE"}, take_apart(content).arrays))
+        yield Variant("deep", f"spaces {deep}", put_together(take_apart(content), text.replace('"HERE"', space)))
+
+    for key in header.keys() - {"env_id", "success_threshold"}:
+        yield from with_values(content, "of another type", key, [GONE, [] if key != "config" else 3])
+    yield from with_values(content, "algorithm", "algorithm", ([], {}, 3, None, "sac", "SAC\n", "x" * 100_000))
 
 
 def bad_statistics(content: bytes) -> Iterator[Variant]:
     """Yields files with invalid normalization statistics."""
-
-    def of(name: str, change: Callable[[dict, dict], Any]) -> Variant:
-        return Variant("statistics", name, changed(content, change))
-
     for key in ("clip_obs", "clip_reward", "gamma", "epsilon"):
-        may_be_none = key.startswith("clip")  # nothing is clipped then
-        for value in (
-            math.nan,
-            math.inf,
-            -1.0,
-            "1",
-            {} if may_be_none else None,
-            [],
-            True,
-            10**30 if key == "gamma" else "x",
-        ):
-            yield of(f"{key} {value}", lambda h, a, k=key, v=value: h["settings"].update({k: v}))
+        values = (math.nan, math.inf, -1.0, "1", "x", [], {}, True)  # None: nothing is clipped
+        yield from with_values(content, "statistics", f"settings.{key}", values)
     for key in ("training", "norm_obs", "norm_reward"):
-        for value in (1, "true", None, []):
-            yield of(f"{key} {value}", lambda h, a, k=key, v=value: h["settings"].update({k: v}))
-    for value in ([1], [[]], "keys", {}, ["nothing"], 3):
-        yield of(f"keys {value}", lambda h, a, v=value: h.update(keys=v))
-    for value in (None, [], 3, "x", {}):
-        yield of(f"settings {value}", lambda h, a, v=value: h.update(settings=v))
+        yield from with_values(content, "statistics", f"settings.{key}", (1, "true", None, []))
+    yield from with_values(content, "statistics", "keys", ([1], [[]], "keys", {}, ["nothing"], 3))
+    yield from with_values(content, "statistics", "settings", (None, [], 3, "x", {}))
     for name in ("obs.var", "returns.var", "returns.count"):
-        yield of(f"negative {name}", lambda h, a, n=name: a.update({n: -1 - np.abs(a[n])}))
-        yield of(f"{name} not there", lambda h, a, n=name: a.pop(n))
+        changes = {
+            f"negative {name}": lambda a, n=name: a.update({n: -1 - np.abs(a[n])}),
+            f"{name} gone": lambda a, n=name: a.pop(n),
+        }
+        yield from with_arrays(content, "statistics", changes)
 
 
 def bad_buffers(content: bytes) -> Iterator[Variant]:
     """Yields replay files with counters outside of the ring, or with values that no environment returns."""
-
-    def of(name: str, change: Callable[[dict, dict], Any]) -> Variant:
-        return Variant("buffer", name, changed(content, change))
-
     arrays = take_apart(content).arrays
+    values = (None, [], {}, 3, "x", {"Box": {}}, {"Box": None}, {"Text": 3}, {"Dict": {}}, {"Tuple": []}, GONE)
     for kind in ("observation_space", "action_space"):
-        values = (None, [], {}, 3, "x", {"Box": {}}, {"Box": None}, {"Text": 3}, {"Dict": {}}, {"Tuple": []})
-        for i, value in enumerate((*values, *LARGE_SPACES)):
-            yield of(f"{kind} {i}", lambda h, a, k=kind, v=value: h.update({k: v}))
-        yield of(f"{kind} gone", lambda h, a, k=kind: h.pop(k))
-        yield of(f"{kind} of another", lambda h, a, k=kind: h.update({k: {"MultiBinary": {"shape": [7]}}}))
+        other = {"MultiBinary": {"shape": [7]}}
+        yield from with_values(content, "buffer", kind, (*values, *LARGE_SPACES, other))
+    changes: dict[str, Callable[[dict], Any]] = {}
     # A full ring may start at any row: with another newest row the file is valid.
     is_full = (arrays["head"] >= arrays["kind"].shape[1]).all()
     for name in ("head", "n_steps"):
-        for value in (-2, -1, 0, 10**6, 2**62, 2**63 - 1, -(2**63)):
+        for value in (-1, 0, 10**6, 2**63 - 1, -(2**63)):
             if (name, value) != ("head", 10**6) or not is_full:
-                yield of(f"{name} {value}", lambda h, a, n=name, v=value: a[n].fill(v))
-        yield of(f"{name} of nothing", lambda h, a, n=name: a.update({n: a[n][:0]}))
-        yield of(f"{name} of more", lambda h, a, n=name: a.update({n: np.repeat(a[n], 2)}))
-    for value in (3, 255):
-        yield of(f"kind {value}", lambda h, a, v=value: a["kind"].fill(v))
+                changes[f"{name} {value}"] = lambda a, n=name, v=value: a[n].fill(v)
+        changes[f"{name} of nothing"] = lambda a, n=name: a.update({n: a[n][:0]})
+        changes[f"{name} of more"] = lambda a, n=name: a.update({n: np.repeat(a[n], 2)})
+    changes |= {f"kind {value}": lambda a, v=value: a["kind"].fill(v) for value in (3, 255)}
     # Only older files contain the counters of each row.
     for name in ("since_start", "until_end"):
         for value in (10**6, 2**31 - 1, -1, -(2**31)):
-            yield of(f"{name} {value}", lambda h, a, n=name, v=value: a.update({**counters(a), n: counters(a)[n] + v}))
-        yield of(f"{name} alone", lambda h, a, n=name: only_counter(a, n))
-        yield of(f"{name} wide", lambda h, a, n=name: a.update({**counters(a), n: counters(a)[n].astype(np.int64)}))
-        yield of(f"{name} flat", lambda h, a, n=name: a.update({**counters(a), n: counters(a)[n].ravel()}))
-    for name in ("reward", "action"):
-        yield of(f"{name} not finite", lambda h, a, n=name: a[n].fill(np.nan))
+            changes[f"{name} {value}"] = lambda a, n=name, v=value: with_counters(a, n, lambda c: c + v)
+        changes[f"{name} alone"] = lambda a, n=name: only_counter(a, n)
+        changes[f"{name} wide"] = lambda a, n=name: with_counters(a, n, lambda c: c.astype(np.int64))
+        changes[f"{name} flat"] = lambda a, n=name: with_counters(a, n, np.ravel)
+    changes |= {f"{name} not finite": lambda a, n=name: a[n].fill(np.nan) for name in ("reward", "action")}
     for name in arrays:
-        yield of(f"{name} gone", lambda h, a, n=name: a.pop(n))
-        yield of(f"{name} shorter", lambda h, a, n=name: a.update({n: a[n][:, :-1] if a[n].ndim > 1 else a[n][:-1]}))
+        changes[f"{name} gone"] = lambda a, n=name: a.pop(n)
+        changes[f"{name} shorter"] = lambda a, n=name: a.update({n: a[n][:, :-1] if a[n].ndim > 1 else a[n][:-1]})
+    yield from with_arrays(content, "buffer", changes)
 
 
 def bad_runs(content: bytes) -> Iterator[Variant]:
     """Yields files of a run, or of its rows, whose header has wrong or missing values."""
     parts = take_apart(content)
     values = (
+        GONE,
         None,
         True,
-        0,
         -1,
         2**62,
         0.5,
-        "x",
         "../x",
         [],
         ["x"],
@@ -522,21 +410,16 @@ def bad_runs(content: bytes) -> Iterator[Variant]:
         {"array": "nothing"},
         [[[]]],
     )
-    for name in parts.header:
-        if name not in ("schema", "kind"):
-            yield Variant("run header", f"{name} gone", changed(content, lambda h, a, n=name: h.pop(n)))
-            for value in values:
-                put = lambda h, a, n=name, v=value: h.update({n: v})  # noqa: E731
-                yield Variant("run header", f"{name} {value!r}", changed(content, put))
+    for name in parts.header.keys() - {"schema", "kind"}:
+        yield from with_values(content, "run header", name, values)
+    names = max(parts.arrays)
+    more = ({"array": names}, {"scalar": names}, {"float": "nan"})
     for name in parts.header.get("run", {}).get("dict", {}):
-        yield Variant("run", f"{name} gone", changed(content, lambda h, a, n=name: h["run"]["dict"].pop(n)))
-        for value in (*values, {"array": max(parts.arrays)}, {"scalar": max(parts.arrays)}, {"float": "nan"}):
-            put = lambda h, a, n=name, v=value: h["run"]["dict"].update({n: v})  # noqa: E731
-            yield Variant("run", f"{name} {value!r}", changed(content, put))
+        yield from with_values(content, "run", f"run.dict.{name}", (*values, *more))
     for name in parts.header.get("rows", []):
-        for value in (f"../{name}", name.upper(), name + "\0", "/dev/zero", f"{name}/{name}"):
-            yield Variant("rows", value, changed(content, lambda h, a, v=value: h.update(rows=[v])))
-        yield Variant("rows", "twice", changed(content, lambda h, a, n=name: h.update(rows=[n, n, *h["rows"]][:-1])))
+        wrong = (f"../{name}", name.upper(), name + "\0", "/dev/zero", f"{name}/{name}")
+        twice = [name, name, *parts.header["rows"]][:-1]
+        yield from with_values(content, "rows", "rows", [*([value] for value in wrong), twice])
 
 
 class Sparse(NamedTuple):
@@ -570,6 +453,12 @@ def counters(arrays: dict) -> dict[str, np.ndarray]:
     return {name: np.zeros(arrays["kind"].shape, np.int32) for name in ("since_start", "until_end")}
 
 
+def with_counters(arrays: dict, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Puts the two counters into a file, one of them changed."""
+    both = counters(arrays)
+    arrays |= {**both, name: change(both[name])}
+
+
 def only_counter(arrays: dict, name: str) -> None:
     """Keeps only one of the two counters in a file."""
     for other in counters(arrays):
@@ -592,9 +481,3 @@ def content_of(parts: Parts) -> bytes:
 def box(shape: Any = (3,), dtype: Any = "float32", low: Any = "-inf") -> Any:
     """Returns the description of a Box."""
     return {"Box": {"low": low, "high": "inf", "shape": list(shape), "dtype": dtype}}
-
-
-def bad_rate(number: Any) -> Any:
-    """Returns an invalid learning rate, from a number that may be valid."""
-    fine = isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number < math.inf
-    return {"schedule": "linear", "start": 1.0, "slope": number} if fine else number

@@ -2,16 +2,14 @@
 
 Where the dynamics are deterministic, EnvPool's episodes are replayed in Gymnasium: put where EnvPool's began, and given the
 same actions, it must go the same way. Where an episode began at random is then compared as a distribution. LunarLander has
-random ground and engines whose thrust scatters, so there rewards are computed from what is seen, free fall is compared by
-step, and the rest as distributions: with the standard errors of both sides, and seeds that make each result repeatable.
+random ground and engines whose thrust scatters, so there rewards are computed from what is seen and free fall is compared by
+step.
 """
 
 from __future__ import annotations
 
 import math
-import types
 import warnings
-from collections import Counter
 from typing import Any, NamedTuple
 
 import envpool
@@ -22,7 +20,6 @@ from scipy import stats
 
 from rejeu import presets, spaces
 from rejeu.envs.make import make_vector
-from tests.tiers import exhaustive, only
 
 LANDERS = "LunarLander-v3", "LunarLanderContinuous-v3"
 
@@ -318,60 +315,31 @@ def nothing(vector, obs, rng):
     return np.zeros((vector.n_envs, *vector.action_space.shape), np.float32 if vector.action_space.shape else np.int64)
 
 
-def landing(vector, obs, rng):
-    """The controller that comes with Gymnasium's LunarLander."""
-    from gymnasium.envs.box2d.lunar_lander import heuristic
-
-    continuous = vector.action_space.shape != ()
-    env = types.SimpleNamespace(unwrapped=types.SimpleNamespace(continuous=continuous))
-    action = np.array([heuristic(env, one) for one in obs])
-    return action.astype(np.float32) if continuous else action
-
-
 class Walk(NamedTuple):
     obs: np.ndarray
     action: np.ndarray
     next_obs: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
-    outcomes: list
-    """Of whole episodes: return, length, how it ended."""
 
 
-def walk(vector, policy, episodes_each):
-    """The steps of as many episodes in each environment: ending at the first to finish would favour short ones."""
-    rng, rows, outcomes = np.random.default_rng(0), [], []
-    n = vector.n_envs
-    obs, total, length, played = np.array(vector.reset(), np.float64), np.zeros(n), np.zeros(n, int), np.zeros(n, int)
-    while played.min() < episodes_each:
+def walk(vector, policy, n_steps):
+    """So many steps of all environments."""
+    rng, rows, obs = np.random.default_rng(0), [], np.array(vector.reset(), np.float64)
+    for _ in range(n_steps):
         action = policy(vector, obs, rng)
         step = vector.step(action)
         next_obs = np.array(step.obs, np.float64)
         rows.append((obs, action, next_obs, np.array(step.reward), np.array(step.terminated)))
-        total += step.reward
-        length += 1
         done = step.terminated | step.truncated
-        for i in np.flatnonzero(done):
-            if played[i] < episodes_each:
-                outcomes.append((total[i], length[i], kind(step, next_obs, i)))
-            played[i] += 1
-            total[i] = length[i] = 0
         obs = np.array(vector.reset_done(done), np.float64) if done.any() else next_obs
-    return Walk(*(np.concatenate(part) for part in zip(*rows, strict=True)), outcomes)
-
-
-def kind(step, obs, i):
-    if not step.terminated[i]:
-        return "time limit"
-    if step.reward[i] == 100:
-        return "landed"
-    return "flew off" if abs(obs[i, 0]) >= 1 else "crashed"
+    return Walk(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
 
 @pytest.mark.parametrize("env_id", LANDERS)
 def test_landers_get_the_documented_reward(env_id):
     for vector in both(env_id, 8):
-        seen = walk(vector, anything, 6)
+        seen = walk(vector, anything, 500)
         expected = shaping(seen.next_obs) - shaping(seen.obs) - fuel(seen.action)
         on = ~seen.terminated
         np.testing.assert_allclose(seen.reward[on], expected[on], rtol=0, atol=1e-3)
@@ -383,7 +351,7 @@ def test_landers_fall_alike(env_id):
     """Without engine the state follows from the state before: fitted on the one side, it holds on the other."""
     falls = []
     for vector in both(env_id, 8):
-        seen = walk(vector, nothing, 10)
+        seen = walk(vector, nothing, 600)
         high = (seen.next_obs[:, 1] > 0.6) & ~seen.terminated
         falls.append((np.c_[seen.obs[high, :6], np.ones(high.sum())], seen.next_obs[high, :6]))
     (before, after), (other_before, other_after) = falls
@@ -391,44 +359,3 @@ def test_landers_fall_alike(env_id):
     fitted, held = (np.abs(x @ step - y).mean(axis=0) for x, y in ((before, after), (other_before, other_after)))
     np.testing.assert_array_less(held, 1.5 * fitted + 1e-6)
     np.testing.assert_allclose(held, 0.0, atol=1e-3)
-
-
-@pytest.mark.parametrize("engine", [1, 2, 3])
-@pytest.mark.parametrize("env_id", LANDERS)
-def test_engines_push_alike(env_id, engine):
-    """Thrust scatters, so the changes of velocity and spin by one step are compared as distributions."""
-    changes = []
-    for vector in both(env_id, 10):
-        action = np.full(10, engine)
-        if env_id == "LunarLanderContinuous-v3":
-            action = np.repeat(np.float32([[[0.0, -0.8]], [[0.4, 0.0]], [[0.0, 0.8]]][engine - 1]), 10, axis=0)
-        found = []
-        obs = np.array(vector.reset())
-        for _ in range(30):
-            for _ in range(4):
-                next_obs = np.array(vector.step(action).obs)
-                found.append((next_obs - obs)[:, [2, 3, 5]])
-                obs = next_obs
-            obs = np.array(vector.reset_done(np.ones(10, bool)))
-        changes.append(np.concatenate(found))
-    one, two = changes
-    for column in range(3):
-        assert stats.ks_2samp(one[:, column], two[:, column]).pvalue > 1e-3, column
-
-
-@exhaustive
-@pytest.mark.parametrize(("policy", "episodes_each"), [(anything, 20), (landing, 8)])
-@pytest.mark.parametrize("env_id", only(LANDERS[:1], LANDERS))
-def test_landers_end_alike(env_id, policy, episodes_each):
-    """Returns, lengths and how often each end comes about agree within four standard errors of their difference."""
-    sides = []
-    for vector in both(env_id, 16):
-        returns, lengths, kinds = zip(*walk(vector, policy, episodes_each).outcomes, strict=True)
-        assert all((length == 1000) == (how == "time limit") for length, how in zip(lengths, kinds, strict=True))
-        sides.append((np.array(returns), np.array(lengths), kinds))
-    for one, two in zip(sides[0][:2], sides[1][:2], strict=True):
-        assert abs(one.mean() - two.mean()) < 4 * math.hypot(stats.sem(one), stats.sem(two))
-    n, counts = 16 * episodes_each, [Counter(side[2]) for side in sides]
-    for how in counts[0] | counts[1]:
-        share = (counts[0][how] + counts[1][how]) / (2 * n)
-        assert abs(counts[0][how] - counts[1][how]) / n < 4 * math.sqrt(2 * share * (1 - share) / n), how

@@ -40,11 +40,6 @@ def test_learn_takes_exactly_the_steps_that_were_asked_for(n_envs, total):
     assert agent.replay_buffer.size() == 2 * total
 
 
-def test_learn_returns_the_agent_itself():
-    agent = small_sac(counters(1), learning_starts=NEVER)
-    assert agent.learn(1) is agent
-
-
 def test_num_timesteps_counts_from_the_last_learn_that_reset_it():
     agent = small_sac(counters(1), learning_starts=NEVER).learn(7)
     assert agent.learn(5, reset_num_timesteps=False).num_timesteps == 12
@@ -65,12 +60,6 @@ def test_learn_without_any_limit_is_refused(agent):
 def test_minutes_end_a_run():
     agent = small_sac(counters(1), learning_starts=NEVER).learn(minutes=0.2 / 60)
     assert 1 < agent.num_timesteps < 10**6
-
-
-def test_num_timesteps_survives_saving(tmp_path):
-    agent = small_sac(counters(1), learning_starts=NEVER).learn(7).learn(5)
-    assert agent.num_timesteps == 5
-    assert rejeu.SAC.load(agent.save(tmp_path / "model")).num_timesteps == 5
 
 
 # Updates.
@@ -125,10 +114,6 @@ def test_learning_by_episodes_with_a_number_takes_that_number_for_each():
     calls = count_updates(agent)
     agent.learn(34)
     assert sum(calls) == 6
-
-
-def test_the_counter_of_the_learner_agrees_with_the_agents(agent):
-    assert agent.n_updates == int(agent.state.n_updates) == 12
 
 
 def test_nothing_is_learnt_before_learning_starts():
@@ -380,21 +365,6 @@ def test_deterministic_predictions_repeat_and_others_vary(agent):
     assert len(np.unique(drawn[0])) == 4
 
 
-def test_a_state_is_handed_through(agent):
-    assert agent.predict(np.zeros(3), state="kept")[1] == "kept"
-
-
-def test_predicting_does_not_change_what_training_does(agent):
-    one, two = small_sac(Counter((5,))), small_sac(Counter((5,)))
-    one.learn(15)
-    two.learn(10)
-    for _ in range(3):
-        two.predict(np.zeros((2, 3)))
-        two.predict(np.zeros(3), deterministic=True)
-    two.learn(5, reset_num_timesteps=False)
-    assert_same_parameters(one, two)
-
-
 @pytest.mark.parametrize(
     ("obs", "words"),
     [
@@ -493,29 +463,6 @@ def test_load_on_an_instance_is_an_error_that_shows_the_right_call(agent, tmp_pa
         agent.load(path)
 
 
-def test_a_gradient_step_after_loading_still_moves_the_temperature(agent, tmp_path):
-    """Stable-Baselines3 1.1.0 fixed the opposite."""
-    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"), env=Counter((5,)), learning_starts=4)
-    before = loaded.get_parameters()["log_alpha"]
-    loaded.learn(6)
-    assert loaded.n_updates == agent.n_updates + 2
-    assert loaded.get_parameters()["log_alpha"] != before
-
-
-def test_optimizers_go_on_where_they_stood(agent, tmp_path):
-    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"), env=Counter((5,)))
-    assert loaded.get_parameters()["actor_optimizer.count"] == 12
-    assert np.abs(loaded.get_parameters()["actor_optimizer.mu.head.weight"]).max() > 0
-
-
-def test_learning_goes_on_after_loading_and_collects_learning_starts_steps_first(agent, tmp_path):
-    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"), env=Counter((5,)))
-    loaded.learn(8, reset_num_timesteps=False)
-    assert (loaded.num_timesteps, loaded.n_updates) == (28, 12)
-    loaded.learn(3, reset_num_timesteps=False)
-    assert (loaded.num_timesteps, loaded.n_updates) == (31, 15)
-
-
 def test_another_number_of_environments_collects_learning_starts_steps_before_it_learns():
     """Its buffer is empty: batches would otherwise be copies of the first few steps."""
     agent = small_sac(Counter((5,))).learn(20)
@@ -587,17 +534,6 @@ def test_hindsight_rewards_come_from_the_new_environment():
     agent.set_env(Generous())
     batch = agent.replay_buffer.sample(np.random.default_rng(0), (10,))
     np.testing.assert_array_equal(batch.reward[:8], 7.0)
-
-
-def test_evaluating_in_the_agents_own_environment_gives_up_its_episode_and_no_more():
-    env = Counter((5,))
-    agent = small_sac(env, learning_starts=NEVER).learn(7)
-    assert agent.evaluate(2).lengths.tolist() == [5, 5]
-    agent.learn(6)
-    assert agent.replay_buffer.size() == 13
-    batch = agent.replay_buffer.sample(np.random.default_rng(0), (300,))
-    np.testing.assert_array_equal(batch.next_obs[:, 1], batch.obs[:, 1] + 1)
-    np.testing.assert_array_equal(batch.next_obs[:, 0], batch.obs[:, 0])
 
 
 def test_hindsight_works_with_several_environments_and_unfinished_episodes():

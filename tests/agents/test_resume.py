@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import itertools
 import os
 import re
@@ -12,7 +11,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +21,7 @@ from rejeu import xla
 from rejeu.agents.run_files import copy_run, run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
-from rejeu.io import checkpoint, json_arrays
+from rejeu.io import checkpoint
 from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
@@ -540,85 +538,6 @@ def test_masks_are_carried_too(tmp_path):
     again = rejeu.MaskablePPO.resume(tmp_path, env())
     assert again.resumed.exact
     assert_same(facts(again.learn()), facts(whole))
-
-
-def test_nothing_warns_where_all_is_exact(tmp_path):
-    cut_run(tmp_path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        rejeu.SAC.resume(tmp_path).learn()
-
-
-JUNK = [
-    None,
-    True,
-    -1,
-    2**70,
-    0.5,
-    float("nan"),
-    "text",
-    [],
-    [1, "x"],
-    {},
-    {"a": 1},
-    (1, 2),
-    np.zeros((3, 0)),
-    np.full(9, np.nan),
-]
-
-
-@pytest.mark.parametrize("kind", ["off policy", "on policy"])
-def test_a_checkpoint_full_of_nonsense_is_refused_by_our_own_error_alone(kind, tmp_path):
-    name, settings = ("DQN", {**OFF, "priorities": {}}) if kind == "off policy" else ("PPO", {**SMALL, "n_steps": 16})
-    env = vector("CartPole-v1", 2)
-    with shared_learners(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        rejeu.AGENTS[name]("MlpPolicy", env(), **settings).learn(
-            60, [Checkpoint(tmp_path, every=1000), lambda agent, turn: turn.step < 40]
-        )
-        path = run_files(tmp_path)[0]
-        for other in run_files(tmp_path)[1:]:
-            other.unlink()
-        whole, arrays = checkpoint.read(path, "run")
-        header = {key: value for key, value in whole.items() if key not in checkpoint.RESERVED}
-        read = []
-        for place in [
-            ("rows",),
-            ("run_id",),
-            ("n_envs",),
-            ("env_id",),
-            *(("run", key) for key in header["run"]["dict"]),
-        ]:
-            for junk in (*JUNK, "deleted"):
-                changed, more = copy.deepcopy(header), dict(arrays)
-                holder = changed if len(place) == 1 else changed["run"]["dict"]
-                if isinstance(junk, str) and junk == "deleted":
-                    del holder[place[-1]]
-                elif len(place) == 1:
-                    holder[place[-1]] = junk if isinstance(junk, int | str | list | None) else 0.5
-                else:
-                    holder[place[-1]] = json_arrays.encode(junk, more, "run.junk")
-                checkpoint.write(path, "run", more, changed)
-                try:
-                    rejeu.AGENTS[name].resume(tmp_path, env())
-                    read.append((place[-1], junk))
-                except CheckpointError:
-                    continue
-    # What this run has no use for is not looked at, and of some things there may be none.
-    unused = {"env_id", "seed", "vec_normalize"}
-    assert {place for place, junk in read if place not in unused and junk} <= {"run_id", "reason"}
-
-
-def test_an_environment_that_a_file_names_is_not_imported(tmp_path):
-    cut_run(tmp_path)
-    path = run_files(tmp_path)[0]
-    run_files(tmp_path)[1].unlink()
-    header, arrays = checkpoint.read(path, "run")
-    header["env_id"] = "antigravity:Pendulum-v1"
-    checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
-    with pytest.raises(CheckpointError, match="give it again"):
-        rejeu.SAC.resume(tmp_path)
-    assert "antigravity" not in sys.modules
 
 
 @pytest.mark.parametrize(

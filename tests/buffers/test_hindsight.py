@@ -85,7 +85,7 @@ def histories(draw):
     return n_envs, rows, draw(turns(n_envs))
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     case=histories(),
     strategy=st.sampled_from(STRATEGIES),

@@ -95,7 +95,7 @@ def draw_all(buffer, rng, n: int = 512) -> np.ndarray:
 @given(
     st.integers(1, 40), st.lists(st.tuples(st.integers(0, 39), st.floats(0, 100)), min_size=1, max_size=60), st.data()
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_sum_tree_agrees_with_an_array(n, changes, data):
     tree, array = SumTree(n), np.zeros(n)
     while changes:
@@ -225,7 +225,7 @@ endings = st.lists(
 
 
 @given(st.integers(2, 7), st.integers(1, 3), endings, st.sampled_from([uniform, hindsight]))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_exactly_the_steps_that_are_kept_can_be_drawn(rows, n_envs, course, kind):
     """Tiny rings that wrap, with episodes that end anywhere: neither final observations, heads nor the forgotten."""
     buffer = kind(rows * n_envs, n_envs, alpha=0.5)

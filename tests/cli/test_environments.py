@@ -252,50 +252,6 @@ def test_a_run_folder_imports_nothing_and_says_what_to_type(lie, registered_run,
     assert "evil_env" not in sys.modules
 
 
-@pytest.mark.parametrize(
-    "lie",
-    [
-        {"n_envs": 10**9},
-        {"n_envs": 0},
-        {"evaluate_episodes": 10**9},
-        {"evaluate_every": 0},
-        {"video_every": -1},
-        {"steps": 0},
-        {"minutes": -1.0},
-        {"checkpoint_minutes": float("nan")},
-        {"seed": 2**40},
-        {"success_threshold": float("inf")},
-        {"wrappers": [1]},
-        {"env_kwargs": []},
-    ],
-    ids=json.dumps,
-)
-def test_numbers_of_a_run_folder_are_bounded(lie, registered_run, tmp_path, capsys):
-    shutil.copy(registered_run / "config.json", tmp_path)
-    config = tmp_path / "config.json"
-    config.write_text(json.dumps({**json.loads(config.read_text()), **lie}))
-    ((name, value),) = lie.items()
-    text = json.dumps(value)
-    message = f"{text} is not valid JSON" if text in ("NaN", "Infinity") else name
-    assert f"config.json is damaged: {message}" in error_of(capsys, "resume", str(tmp_path))
-
-
-def test_a_run_folder_of_an_earlier_version_is_read(registered_run, tmp_path):
-    from rejeu.runs import folder as run_folder
-
-    content = json.loads((registered_run / "config.json").read_text())
-    for name in ("env_argument", "env_kwargs", "wrappers", "video_every"):
-        del content[name]
-    (tmp_path / "config.json").write_text(json.dumps({**content, "film_every": 700}))
-    folder = run_folder.RunFolder(tmp_path)
-    config = run_folder.read_config(folder)
-    assert (config.env_argument, config.env_kwargs, config.wrappers) == ("", {}, ())
-    assert config.video_every == 700
-    assert folder.videos == tmp_path / "videos"
-    (tmp_path / "films").mkdir()
-    assert folder.videos == tmp_path / "films"
-
-
 def test_output_to_a_pipe_whose_encoding_lacks_a_character(registered_run, monkeypatch):
     pipe = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", pipe)

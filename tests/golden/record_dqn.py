@@ -1,4 +1,4 @@
-"""Records three gradient steps of Stable-Baselines3's DQN for ``tests/algorithms/test_dqn.py``.
+"""Records three gradient steps of Stable-Baselines3's DQN for ``tests/algorithms/test_recorded_updates.py``.
 
 Run it in an environment with stable-baselines3 (2.9.2 was used)::
 

@@ -95,11 +95,6 @@ def test_settings_may_be_changed_when_loading(trained):
     assert loaded.config.tau == trained[0].config.tau
 
 
-def test_a_misspelt_change_is_named(trained):
-    with pytest.raises(TypeError, match="SAC has no setting 'learning_rat'; did you mean learning_rate"):
-        rejeu.SAC.load(trained[1], learning_rat=1e-5)
-
-
 @pytest.mark.parametrize(
     ("space", "name"),
     [
@@ -157,7 +152,7 @@ def test_a_file_may_be_read_by_whoever_may_read_new_files(trained):
         max_size=4,
     ),
 )
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_arrays_and_any_header_come_back_as_they_were(tmp_path, arrays, header):
     path = checkpoint.write(tmp_path / "any", "rows", arrays, header)
     again, found = checkpoint.read(path, "rows")
@@ -266,57 +261,6 @@ def test_a_missing_file_is_named():
 
 
 # Damage.
-
-
-def load_any(path, buffer_agent):
-    with pytest.raises(CheckpointError):
-        rejeu.SAC.load(path)
-    with pytest.raises(CheckpointError):
-        rejeu.load(path)
-    before = buffer_agent.replay_buffer.size()
-    with pytest.raises(CheckpointError):
-        buffer_agent.load_replay_buffer(path)
-    assert buffer_agent.replay_buffer.size() == before
-
-
-def test_a_file_cut_short_anywhere_is_refused(trained, buffer_file, tmp_path):
-    for whole in (trained[1], buffer_file[1]):
-        content = whole.read_bytes()
-        for length in [*range(0, 12), *np.linspace(12, len(content) - 1, 40, dtype=int)]:
-            path = tmp_path / "cut.safetensors"
-            path.write_bytes(content[:length])
-            load_any(path, buffer_file[0])
-
-
-def test_bytes_of_another_kind_are_refused(buffer_file, tmp_path):
-    rng = np.random.default_rng(0)
-    path = tmp_path / "noise.safetensors"
-    zipped = b"PK\x03\x04" + bytes(100)
-    pickled = b"\x80\x04\x95" + bytes(100)
-    for content in (zipped, pickled, b"", b"{}", b"\xff" * 64, *(rng.bytes(n) for n in (1, 8, 9, 100, 5000))):
-        path.write_bytes(content)
-        load_any(path, buffer_file[0])
-
-
-def test_a_flipped_byte_in_the_header_is_refused_or_harmless(trained, tmp_path):
-    """Whatever the byte becomes, either a CheckpointError is raised or an agent of the right shape results."""
-    content = trained[1].read_bytes()
-    size = 8 + int.from_bytes(content[:8], "little")
-    rng = np.random.default_rng(0)
-    path = tmp_path / "flipped.safetensors"
-    refused = 0
-    for position in rng.integers(0, size, 120):
-        damaged = bytearray(content)
-        damaged[position] ^= 1 << int(rng.integers(8))
-        path.write_bytes(damaged)
-        try:
-            header, arrays = checkpoint.read(path, "agent")
-        except CheckpointError:
-            refused += 1
-        else:
-            assert isinstance(header, dict)
-            assert all(isinstance(a, np.ndarray) for a in arrays.values())
-    assert refused > 20
 
 
 @pytest.mark.parametrize(
@@ -500,20 +444,6 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path, arrays, header, e
         checkpoint.write(path, "rows", arrays, header)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
-
-
-def test_a_folder_that_cannot_be_written_is_an_os_error_that_names_it(trained, tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OSError, match="file"):
-        trained[0].save(tmp_path / "file" / "model")
-    assert (tmp_path / "file").read_text() == "in the way"
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may write everywhere")
-def test_a_read_only_folder_is_an_os_error(trained, tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(PermissionError):
-        trained[0].save(tmp_path / "model")
 
 
 def test_a_file_of_stable_baselines3_s_suffix_is_looked_for_under_ours(trained, tmp_path):

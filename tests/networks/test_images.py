@@ -138,7 +138,7 @@ def plays(draw):
     return n_envs, stack, rows, draw(st.lists(st.one_of(st.just([]), ends), min_size=1, max_size=40))
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(case=plays(), n_steps=st.integers(1, 3), prioritised=st.booleans())
 def test_sampled_stacks_are_those_that_the_agent_saw(case, n_steps, prioritised):
     n_envs, stack, rows, ends = case

@@ -11,7 +11,7 @@ import pytest
 import rejeu
 from rejeu.cli import commands, main, parsing
 from rejeu.errors import CheckpointError
-from rejeu.runs import config, task
+from rejeu.runs import config, folder, task
 from rejeu.runs.config import DecidedRun, RunConfig
 from rejeu.runs.task import Task
 from tests.cli.test_cli import FEWER_FILES, TINY
@@ -63,6 +63,10 @@ def test_files_of_earlier_versions_are_read(tmp_path):
     assert (found.video_every, found.device, found.wrappers, found.n_envs) == (700, "auto", (), 1)
     config.write(path, found)
     assert config.read(path) == found
+    run = folder.RunFolder(tmp_path)
+    assert run.videos == tmp_path / "videos"
+    (tmp_path / "films").mkdir()
+    assert run.videos == tmp_path / "films"
 
 
 @pytest.mark.parametrize(
@@ -78,6 +82,15 @@ def test_files_of_earlier_versions_are_read(tmp_path):
         {"hyperparameters": []},
         {"evaluate_episodes": 10**9},
         {"env_kwargs": {"--import": "evil.py"}},
+        {"env_kwargs": []},
+        {"n_envs": 0},
+        {"evaluate_every": 0},
+        {"film_every": -1},
+        {"steps": 0},
+        {"minutes": -1.0, "steps": None},
+        {"checkpoint_minutes": float("nan")},
+        {"success_threshold": float("inf")},
+        {"wrappers": [1]},
     ],
 )
 def test_what_is_out_of_range_is_damaged(tmp_path, changed):

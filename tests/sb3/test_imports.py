@@ -239,18 +239,6 @@ def test_functions_must_be_functions_and_make_new_environments():
         DummyVecEnv([Corridor, Corridor]).step([0])
 
 
-def test_agents_learn_in_it_and_are_evaluated_in_it():
-    def make():
-        return DummyVecEnv([lambda: gym.make("Pendulum-v1", max_episode_steps=20)] * 2)
-
-    agent = rejeu.SAC("MlpPolicy", make(), learning_starts=20, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0)
-    agent.learn(60)
-    assert (agent.n_envs, agent.num_timesteps, agent.replay_buffer.size()) == (2, 60, 60)
-    assert agent.history["length"].tolist() == [20, 20]
-    assert len(rejeu.evaluate_policy(agent, make(), 4, return_episode_rewards=True)[0]) == 4
-    assert agent.predict(make().reset())[0].shape == (2, 1)
-
-
 def lamps(n):
     return DummyVecEnv([lambda: Lamp("rgb_array")] * n)
 
