@@ -12,7 +12,7 @@ import pytest
 
 from rejeu import spaces
 from rejeu.buffers import device_priorities
-from rejeu.buffers.device import DeviceReplay, below, uploaded
+from rejeu.buffers.device import DeviceReplay, below, download, uploaded
 from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import Ring
@@ -212,20 +212,41 @@ def test_writing_on_the_device_equals_writing_on_the_host(n: int) -> None:
         np.testing.assert_array_equal(one, two, err_msg=table)
 
 
-@pytest.mark.parametrize("parts", [[60], [10, 10, 12, 8, 20]])
-def test_rows_of_the_device_are_written_to_the_host_with_their_counters(parts: list[int]) -> None:
-    ring, total = filled(N_ENVS, 1), 1
-    for part in parts:
-        total += min(part, 10)
-        after = filled(N_ENVS, total)
-        times = ring.head[:, None] + np.arange(ROWS)[None]
-        index = after.base[:, None] + times % ROWS
-        rows = {"obs": [store[index] for store in after.obs], "action": after.action[index]}
-        ring.write(after.head, rows | {"reward": after.reward[index], "kind": after.kind[index]})
-        for name in ("head", "n_steps", "start"):
-            np.testing.assert_array_equal(getattr(ring, name), getattr(after, name), err_msg=name)
-        np.testing.assert_array_equal(ring.records, after.records)
-        np.testing.assert_array_equal(ring.kind, after.kind)
+@pytest.mark.parametrize("n", [5, 60])
+def test_rows_of_the_device_are_copied_to_the_host_with_their_counters(n: int) -> None:
+    ring, expected = filled(N_ENVS, 1), filled(N_ENVS, n)
+    download(ring, uploaded(device_replay(N_ENVS, strategy="future"), expected))
+    for name in ("head", "n_steps"):
+        np.testing.assert_array_equal(getattr(ring, name), getattr(expected, name), err_msg=name)
+    for env in range(N_ENVS):
+        times = np.arange(expected.oldest()[env], expected.head[env] + 1)
+        index, age = expected.index(np.full(len(times), env), times), times - times[0]
+        for name in ("obs.0", "action", "reward", "until_end"):
+            np.testing.assert_array_equal(ring.records[name][index], expected.records[name][index], err_msg=name)
+        since_start = np.minimum(expected.since_start[index], age)  # of an episode whose beginning was overwritten
+        np.testing.assert_array_equal(ring.since_start[index], since_start)
+        np.testing.assert_array_equal(ring.kind[index], expected.kind[index])
+
+
+@pytest.mark.parametrize("n", [5, 60])
+def test_steps_on_the_device_are_undone(n: int) -> None:
+    """What a chunk has overwritten is put back, so that the chunk can be repeated."""
+    ring = filled(N_ENVS, n)
+    priorities = prioritized(ring)
+    replay = device_replay(N_ENVS, priorities=priorities.config)
+    before = uploaded(replay, ring)._replace(priorities=device_priorities.uploaded(priorities, [], 1, BATCH))
+    saved, after = jax.jit(replay.next_rows, static_argnums=1)(before, 11), before
+    for action, reward, terminated, next_obs, ended, first in steps(N_ENVS, 5):
+        after = replay.begin(
+            replay.add(after, action, reward, terminated, next_obs, np.ones(N_ENVS, bool)), first, ended
+        )
+    undone = replay.with_rows(after, saved)
+    assert (after.head != before.head).all()
+    for name in ("obs", "action", "reward", "kind", "head"):
+        for one, two in zip(*(jax.tree.leaves(getattr(x, name)) for x in (undone, before)), strict=True):
+            np.testing.assert_array_equal(one, two, err_msg=name)
+    for name in ("values", "largest"):
+        np.testing.assert_array_equal(getattr(undone.priorities, name), getattr(before.priorities, name), err_msg=name)
 
 
 def test_whole_numbers_from_random_bits_equal_64_bit_arithmetic() -> None:

@@ -27,7 +27,7 @@ from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops import nonfinite
-from rejeu.loops.device.driver import Stops
+from rejeu.loops.device.chunks import Stops
 from rejeu.loops.learner import Learner
 from rejeu.loops.packing import PackedState
 from rejeu.loops.run import Progress, Run, initial_run

@@ -17,7 +17,7 @@ from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.envs.masks import functional_vector
 from rejeu.loops.device import memory
-from rejeu.loops.device.driver import MAX_TURNS, Stops
+from rejeu.loops.device.chunks import MAX_TURNS, Stops
 from rejeu.loops.device.off_policy import most_updates
 from rejeu.loops.run import Progress
 from rejeu.loops.training_call import TrainingCall

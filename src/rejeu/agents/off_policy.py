@@ -26,7 +26,7 @@ from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
 from rejeu.io.records import brief
-from rejeu.loops.device import loops as device_loops
+from rejeu.loops.device import chunks
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
 
@@ -133,7 +133,7 @@ class OffPolicyAgent(Agent):
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
-            return device_loops.off_policy(self.run, self.learner, self.config, n_steps, progress, self.stops)
+            return chunks.train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:

@@ -20,7 +20,7 @@ from rejeu.core import Masked
 from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.envs.masks import make_masked, mask_leaf, n_choices
 from rejeu.exploration.noise import Noise
-from rejeu.loops.device import loops as device_loops
+from rejeu.loops.device import chunks
 from rejeu.loops.on_policy import begin_episodes, on_policy
 from rejeu.loops.run import Progress
 
@@ -90,7 +90,7 @@ class OnPolicyAgent(Agent):
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
-            return device_loops.on_policy(self.run, self.learner, self.config, n_steps, progress, self.stops)
+            return chunks.train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
         return on_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from rejeu import schedules, xla
 from rejeu.agents.base import BaseAgent
 from rejeu.algorithms import config as configs
-from rejeu.loops.timing import time_shares
+from rejeu.loops.run import time_shares
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.history import COLUMNS

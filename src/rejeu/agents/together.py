@@ -27,9 +27,8 @@ from rejeu.envs.functional.registry import is_functional
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt
 from rejeu.loops import nonfinite
-from rejeu.loops.device import loops
-from rejeu.loops.device.driver import Stops
-from rejeu.loops.device.variants import Variants
+from rejeu.loops.device import chunks
+from rejeu.loops.device.chunks import Stops
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.logging import Sink
@@ -213,7 +212,7 @@ def learn_together(
     if progress_bar:
         ordered[0] = [*ordered[0], ProgressBar.of(calls[0])]
     stops = common_stops(agents, calls, ordered)
-    variants = variants_of(first) if differing else None
+    remake = remaking(first) if differing else None
     hyper = [{name: float(getattr(agent.config, name)) for name in differing} for agent in agents]
     active = [*range(len(agents))]
     with ExitStack() as stack:
@@ -225,14 +224,14 @@ def learn_together(
         ]
         try:
             with Interrupt() as interrupt:
-                turns = loops.together(
+                turns = chunks.train(
                     [agent.run for agent in agents],
                     first.learner,
                     first.config,
                     *training.horizon(first, calls[0]),
                     stops,
                     active,
-                    variants,
+                    remake,
                     hyper,
                     devices.local(first.device),
                 )
@@ -296,14 +295,14 @@ def check_differing(agent: Agent, names: Iterable[str]) -> None:
             )
 
 
-def variants_of(agent: Agent) -> Variants:
-    """Returns what makes the algorithm of an agent from other hyperparameters."""
+def remaking(agent: Agent) -> Callable[[Any], Any]:
+    """Returns what makes the algorithm of an agent, and its exploration, from other hyperparameters."""
 
     def make(config: Any) -> Any:
         algorithm = agent.algorithm_of(config)
         return algorithm, exploration.make(algorithm, agent.make_noise())
 
-    return Variants(make)
+    return make
 
 
 def named(turns: Iterator[Any], differing: Sequence[str], agent: Agent) -> Iterator[Any]:

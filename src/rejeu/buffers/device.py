@@ -28,7 +28,7 @@ from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.buffers.strategies import BUILT_IN, STRATEGIES, GoalStrategy, HindsightSteps
 from rejeu.buffers.uniform import bootstrap_discount
-from rejeu.core import PyTree, Transition
+from rejeu.core import PyTree, Transition, copy
 
 RUNNING = np.iinfo(np.int32).max
 """The end of an episode that has not ended."""
@@ -148,6 +148,33 @@ class DeviceReplay:
         kind = put(ring.kind, index, jnp.full(self.n_envs, STEP, jnp.uint8))
         episode = put(ring.episode, index, ring.n_begun - 1) if self.strategy is not None else ring.episode
         return ring._replace(obs=stores, kind=kind, episode=episode, head=head)
+
+    def next_rows(self, ring: DeviceRing, n: int) -> dict[str, Any]:
+        """Returns what adding ``n - 1`` rows to each environment may change, to undo it with :meth:`with_rows`.
+
+        These are the newest rows and those that would be overwritten, and the priorities.
+        """
+        index = self._next_positions(ring.head, n)
+        found: dict[str, Any] = {"obs": [store[index] for store in ring.obs], "head": jnp.copy(ring.head)}
+        found |= {name: getattr(ring, name)[index] for name in ("action", "reward", "kind")}
+        if ring.priorities is not None:
+            found["priorities"] = {
+                name: copy(getattr(ring.priorities, name)) for name in ("values", "largest", "pending")
+            }
+        return found
+
+    def with_rows(self, ring: DeviceRing, found: dict[str, Any]) -> DeviceRing:
+        """Returns the ring as far as :func:`download` reads it, as it was when :meth:`next_rows` returned ``found``."""
+        index = self._next_positions(found["head"], found["kind"].shape[1])
+        obs = [store.at[index].set(rows) for store, rows in zip(ring.obs, found["obs"], strict=True)]
+        parts = {name: getattr(ring, name).at[index].set(found[name]) for name in ("action", "reward", "kind")}
+        if ring.priorities is not None:
+            parts["priorities"] = ring.priorities._replace(**found["priorities"])
+        return ring._replace(obs=obs, head=found["head"], **parts)
+
+    def _next_positions(self, head: Array, n: int) -> Array:
+        """Returns the positions of the newest row of each environment and of those after it, ``(n_envs, n)``."""
+        return self.positions(jnp.arange(self.n_envs)[:, None], head[:, None] + jnp.arange(n)[None])
 
     def oldest(self, ring: DeviceRing) -> Array:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
@@ -407,13 +434,12 @@ def uploaded(replay: DeviceReplay, ring: Ring) -> DeviceRing:
     )
 
 
-def written(replay: DeviceReplay, ring: DeviceRing, first: Array, size: int) -> dict[str, Any]:
-    """Returns ``size`` rows of each environment from the times ``first`` on, as :meth:`Ring.write` takes them."""
-    times = first[:, None] + jnp.arange(size)[None]
-    index = replay.positions(jnp.arange(replay.n_envs)[:, None], times)
-    return {
-        "obs": [store[index] for store in ring.obs],
-        "action": ring.action[index],
-        "reward": ring.reward[index],
-        "kind": ring.kind[index],
-    }
+def download(ring: Ring, source: DeviceRing) -> None:
+    """Copies the content of a ring on the device into one of the host, which has as many rows."""
+    head = np.asarray(source.head).astype(np.int64)
+    used = int(min(head.max() + 1, ring.rows))
+    pairs = zip([*ring.obs, ring.action, ring.reward, ring.kind], [*source.obs, *source[1:4]], strict=True)
+    for store, values in pairs:
+        by_env = (ring.n_envs, ring.rows, *store.shape[1:])
+        store.reshape(by_env)[:, :used] = np.asarray(values).reshape(by_env)[:, :used]
+    ring.recount(head)

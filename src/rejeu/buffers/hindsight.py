@@ -140,7 +140,7 @@ class HerReplayBuffer(BaseReplayBuffer):
             rewards, steps, terminated = self._n_step(rows, relabeled, goal)
             reward = discounted_sum(rewards, self.gamma)
             discount = bootstrap_discount(self.gamma, steps, terminated)
-        following, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
+        _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
         if self.n_steps == 1:
             reward, discount = step["reward"], self.discounts.take(rows.kind)
             if len(goal):
@@ -151,7 +151,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         obs[self.desired][relabeled] = goal
         next_obs[self.desired][relabeled] = goal
         rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
-        return batch(ring, shape, step, obs, reward, following, next_obs, discount, weight, rewards), drawn
+        return batch(ring, shape, step, obs, reward, next_obs, discount, weight, rewards), drawn
 
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.

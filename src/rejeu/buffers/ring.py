@@ -10,13 +10,12 @@ Of stacked frames (``frame_stack``) a row holds the newest only, and the others 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from rejeu.buffers.row_batch import layout_of
 from rejeu.hardware import free_memory
 from rejeu.spaces import Leaf, flat_keys
 
@@ -99,10 +98,8 @@ class Ring:
         self.base = self.all_envs * self.rows
         """Positions of each environment's first row."""
         self.version = 0
-        """Increases when rows are replaced other than by writing new ones."""
+        """Increases when rows are replaced by those of a file."""
         self._keys = flat_keys(obs_structure)
-        self.layout = layout_of(record, len(obs_leaves), obs_structure)
-        """How compiled code takes rows apart; None if it gets the fields."""
 
     def __len__(self) -> int:
         """Number of steps that can be sampled."""
@@ -268,44 +265,6 @@ class Ring:
                         "as they are"
                     )
 
-    def write(self, head: np.ndarray, rows: Mapping[str, Any]) -> None:
-        """Writes rows that another program recorded, such as a training loop on the device.
-
-        Args:
-            head: the new newest times, ``int64 (n_envs,)``, each less than ``rows`` after the present one.
-            rows: ``obs`` (a list), ``action``, ``reward`` and ``kind``, arrays ``(n_envs, n, ...)`` from the present newest
-                row on; what follows the new newest row is ignored.
-        """
-        for env in self.all_envs:
-            before = int(self.head[env])
-            times = np.arange(before, head[env] + 1)
-            index, n = self.base[env] + times % self.rows, len(times)
-            dropped = times[1:] - self.rows
-            gone = self.kind[self.base[env] + dropped[dropped >= 0] % self.rows]
-            stores = zip(
-                [*self.obs, self.action, self.reward], [*rows["obs"], rows["action"], rows["reward"]], strict=True
-            )
-            for store, values in stores:
-                store[index] = values[env, :n]
-            kind = self.kind[index] = rows["kind"][env, :n]
-            self.head[env] = head[env]
-            self.n_steps[env] += np.count_nonzero(kind[:-1] != LAST) - np.count_nonzero(gone != LAST)
-            self._recount_from(int(env), max(int(self.start[env]), int(self.oldest()[env])))
-
-    def _recount_from(self, env: int, first: int) -> None:
-        """Sets the counters of the rows from the time ``first`` on, at which an episode or the oldest row began."""
-        times = np.arange(first, self.head[env] + 1)
-        index = self.base[env] + times % self.rows
-        kind = self.kind[index]
-        since_start, until_end = episode_counters(kind)
-        ends = np.flatnonzero(kind == LAST)
-        since_start[: ends[0] + 1 if len(ends) else len(kind)] += first - int(self.start[env])
-        self.start[env] = self.head[env] - since_start[-1]
-        if self.since_start is not None:
-            self.since_start[index] = since_start
-        if self.until_end is not None:
-            self.until_end[index] = until_end
-
     def stored(self) -> dict[str, np.ndarray]:
         """Returns what files hold of every row, by its name there, ``(n, ...)``; counters follow from ``kind``."""
         obs = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
@@ -325,7 +284,6 @@ class Ring:
                 self.since_start[index] = since_start
             if self.until_end is not None:
                 self.until_end[index] = until_end
-        self.version += 1
 
 
 def episode_counters(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -44,6 +44,7 @@ def restore(ring: Ring, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in own.items():
         array.reshape(ring.n_envs, ring.rows, *array.shape[1:])[:, :used] = arrays[name]
     ring.recount(head.copy())
+    ring.version += 1
 
 
 def check(ring: Ring, found: Mapping[str, Any]) -> None:
@@ -95,6 +96,7 @@ def put_rows(ring: Ring, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
         ValueError: if they are of another ring, or rows are missing; the ring is then empty.
     """
     ring.recount(np.full(ring.n_envs, -1, np.int64))
+    ring.version += 1
     own = ring.stored()
     known = newest = ring.head
     for rows in parts:

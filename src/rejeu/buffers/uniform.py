@@ -13,7 +13,6 @@ import numpy as np
 from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.ring import LAST, TERMINATED, Ring, Rows
-from rejeu.buffers.row_batch import RowTransition, with_rows
 from rejeu.core import Transition
 
 
@@ -116,9 +115,9 @@ class ReplayBuffer(BaseReplayBuffer):
             rewards = np.where(window.valid, self.ring.reward[window.position], np.float32(0.0))
             reward = discounted_sum(rewards, self.gamma)
             steps, discount = window.steps, bootstrap_discount(self.gamma, window.steps, window.terminated)
-        following, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
+        _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
         rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
-        return batch(self.ring, shape, step, obs, reward, following, next_obs, discount, weight, rewards), drawn
+        return batch(self.ring, shape, step, obs, reward, next_obs, discount, weight, rewards), drawn
 
 
 def batch(
@@ -127,18 +126,17 @@ def batch(
     step: np.ndarray,
     obs: list[np.ndarray],
     reward: np.ndarray,
-    following: np.ndarray,
     next_obs: list[np.ndarray],
     discount: np.ndarray,
     weight: np.ndarray | None,
     rewards: np.ndarray | None = None,
 ) -> Transition:
     """Returns transitions in ``shape`` from flat arrays and records; weights are divided by the largest of each batch."""
-    flat = RowTransition(ring.tree(obs), step["action"], reward, ring.tree(next_obs), discount, weight, rewards)
+    flat = Transition(ring.tree(obs), step["action"], reward, ring.tree(next_obs), discount, weight, rewards)
     shaped = flat if len(shape) == 1 else jax.tree.map(lambda array: array.reshape(shape + array.shape[1:]), flat)
     if weight is not None:
-        shaped = shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
-    return shaped if ring.layout is None else with_rows(shaped, step, following, ring.layout)
+        return shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
+    return shaped
 
 
 class Window(NamedTuple):

@@ -9,8 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from rejeu.callbacks.base import TrainedAgent, TrainingCallback, step_before
-from rejeu.loops.run import Progress
-from rejeu.loops.timing import time_shares
+from rejeu.loops.run import Progress, time_shares
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting import notebook
 

@@ -12,7 +12,6 @@ from jax import Array
 
 from rejeu import xla
 from rejeu.algorithms.contract import check_state
-from rejeu.buffers.row_batch import jit_update
 from rejeu.core import TD_ERROR, Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Transition, copy
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
@@ -38,7 +37,7 @@ class Learner:
         self.act = self.sample = jax.jit(partial(self._act, self.explorer))
         if algorithm.recall is None and (noise is not None or algorithm.explorer is not None):
             self.sample = jax.jit(partial(self._act, exploration.plain(algorithm)))
-        self.update = jit_update(self._update)
+        self.update = jax.jit(self._update, donate_argnums=0)
         self.observe = None if algorithm.observe is None else jax.jit(self._observe, donate_argnums=0)
         self.exploit, self.recall = jax.jit(self._exploit), jax.jit(self._recall)
         self.action_values, self.state_value = jax.jit(self._action_values), jax.jit(self._state_value)

@@ -33,8 +33,7 @@ from rejeu.envs.base import Step
 from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import gradient_steps
-from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart
-from rejeu.loops.timing import Timer
+from rejeu.loops.run import Episode, Progress, Run, Timer, clock_of, record_step, restart
 from rejeu.spaces import action_scaler, random_action
 
 

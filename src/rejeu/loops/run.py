@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -21,7 +22,14 @@ from rejeu.envs.base import Step, VectorEnv
 from rejeu.loops.learner import Learner, is_finite
 from rejeu.loops.nonfinite import NonFiniteMonitor
 from rejeu.loops.packing import PackedState
-from rejeu.loops.timing import no_time
+
+PARTS = ("env", "replay", "update")
+"""Stepping environments; storing and sampling; waiting for the device."""
+
+
+def no_time() -> dict[str, float]:
+    """Returns the seconds of all parts, and in total, before training."""
+    return dict.fromkeys((*PARTS, "total"), 0.0)
 
 
 class Episode(NamedTuple):
@@ -66,8 +74,8 @@ class Run:
 
     env: Any
     """The environments, a :class:`VectorEnv`; None for an agent that only predicts."""
-    replay: Any
-    """The replay buffer or the rollout buffer; None for an agent that only predicts."""
+    buffer: Any
+    """The replay buffer or the rollout buffer, None for an agent that only predicts; read it as :attr:`replay`."""
     state: PackedState
     """The algorithm's state, packed (see :class:`Learner`)."""
     key: Array
@@ -107,9 +115,28 @@ class Run:
     """Those of the newest updates, each with the draw of its batch; they set the priorities of the replay buffer one turn
     later."""
     seconds: dict[str, float] = field(default_factory=no_time)
-    """Wall time of the parts of the loop; see :class:`rejeu.loops.timing.Timer`."""
+    """Wall time of the parts of the loop; see :class:`Timer`."""
     next_look: float = 0
     """The environment step of the next check that observations are within their declared bounds."""
+    fetch: Callable[[], None] | None = None
+    """Copies steps from the device to ``buffer``; None if it holds them all."""
+
+    @property
+    def replay(self) -> Any:
+        """``buffer``, with all steps."""
+        if self.fetch is not None:
+            self.copy_replay()
+        return self.buffer
+
+    @replay.setter
+    def replay(self, buffer: Any) -> None:
+        self.buffer, self.fetch = buffer, None
+
+    def copy_replay(self) -> None:
+        """Copies to ``buffer`` what a loop on the device has added to it there."""
+        if self.fetch is not None:
+            fetch, self.fetch = self.fetch, None
+            fetch()
 
 
 def restart(run: Run) -> PyTree:
@@ -172,7 +199,7 @@ def initial_run(
     learner_key, explore_key = jax.random.split(jax.random.PRNGKey(seed))
     return Run(
         env=env,
-        replay=buffer,
+        buffer=buffer,
         state=learner.init(learner_key) if state is None else state,
         key=explore_key,
         rng=np.random.default_rng(seed),
@@ -181,3 +208,47 @@ def initial_run(
         learn_from=learn_from,
         seed=seeds.of_run(seed),
     )
+
+
+class Timer:
+    """Adds the wall time of the parts to ``seconds``: ``with timer("env"): ...``, or between calls of :meth:`lap`."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        """Continues to count in ``seconds``, which is mutated."""
+        self.seconds = seconds
+        self._last = time.perf_counter()
+        self._began = self._last - seconds["total"]
+        self._part: str | None = None
+
+    def __call__(self, part: str) -> Timer:
+        """Returns a context whose time counts as ``part``."""
+        self._part = part
+        return self
+
+    def __enter__(self) -> None:
+        self.lap()
+
+    def __exit__(self, *error: object) -> None:
+        self.lap(self._part)
+
+    def lap(self, part: str | None = None) -> None:
+        """Adds the time since the last call to ``part``, if one is given, and updates the total."""
+        now = time.perf_counter()
+        if part is not None:
+            self.seconds[part] += now - self._last
+        self._last = now
+        self.seconds["total"] = now - self._began
+
+
+def time_shares(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Returns the shares of ``seconds["total"]`` spent in ``env``, ``replay`` and ``update``, and the ``rest``.
+
+    The rest is the loop's own bookkeeping and what runs between its turns: callbacks, evaluations, files. The shares sum
+    to 1; before any time has passed all of it is rest.
+
+    >>> time_shares({"env": 1.0, "replay": 1.0, "update": 5.0, "total": 8.0})
+    {'env': 0.125, 'replay': 0.125, 'update': 0.625, 'rest': 0.125}
+    """
+    total = max(seconds["total"], 1e-9)
+    shares = {part: seconds[part] / total for part in PARTS}
+    return shares | {"rest": 1.0 - sum(shares.values())}

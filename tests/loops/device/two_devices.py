@@ -13,8 +13,8 @@ import numpy as np
 import rejeu
 from rejeu import devices
 from rejeu.callbacks import Checkpoint
-from rejeu.loops.device import sharing
-from rejeu.loops.device.machine import Machine
+from rejeu.loops.device import sharding
+from rejeu.loops.device.trainer import DeviceTrainer, Group
 from tests.agents.test_together import ON_POLICY, SMALL, assert_same_runs
 
 CASES: dict[str, Any] = {
@@ -26,15 +26,15 @@ CASES: dict[str, Any] = {
 def share(name: str) -> None:
     """Compares runs that stop at different steps with single ones, and resumes one of them."""
     kind, env, settings = CASES[name]
-    sharing.MOST_ON_CPU = 1  # so that there are two groups of runs
+    sharding.MOST_ON_CPU = 1  # so that there are two groups of runs
     used: list[int] = []
-    start = Machine.start
+    start = DeviceTrainer.start
 
-    def counted(machine: Machine, limits: Any) -> None:
-        start(machine, limits)
-        used.append(len(jax.tree.leaves(machine.carry.state)[0].sharding.device_set))
+    def counted(trainer: DeviceTrainer, group: Group, limits: Any) -> None:
+        start(trainer, group, limits)
+        used.append(len(jax.tree.leaves(group.carry.state)[0].sharding.device_set))
 
-    Machine.start = counted  # type: ignore[method-assign]
+    DeviceTrainer.start = counted  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder:
 
         def callbacks(agent: Any) -> list[Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from rejeu import devices
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.envs.functional.vector import reset_all
-from rejeu.loops.device.transfer import vector_of
+from rejeu.loops.device.trainer import vector_of
 from rejeu.loops.learner import Learner
 from rejeu.loops.run import Run
 
@@ -55,8 +55,8 @@ def of_run(run: Run, learner: Learner, batch_size: int) -> int:
     update = COPIES * total(leaves) + 4 * rows * outputs
     if run.env.backend != "jax":
         return update
-    players = jax.eval_shape(lambda: reset_all(vector_of(run).env, jax.random.key(0), run.env.n_envs))
-    return update + total(jax.tree.leaves(players)) + of_experience(run.replay)
+    episodes = jax.eval_shape(lambda: reset_all(vector_of(run).env, jax.random.key(0), run.env.n_envs))
+    return update + total(jax.tree.leaves(episodes)) + of_experience(run.replay)
 
 
 def of_experience(buffer: Any) -> int:

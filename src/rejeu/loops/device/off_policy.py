@@ -7,35 +7,31 @@ environment step, so a run needs no state of a generator.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
+from rejeu import spaces
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.device import DeviceReplay, DeviceRing, DeviceRows
+from rejeu.buffers import device_priorities
+from rejeu.buffers.device import DeviceReplay, DeviceRing, DeviceRows, download, uploaded
 from rejeu.buffers.device_priorities import Pending, noted
-from rejeu.core import Algorithm, Clock, Explorer, Metrics, PyTree, Transition
+from rejeu.buffers.prioritized import Draw
+from rejeu.core import Clock, PyTree, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
 from rejeu.loops.device.actions import random_action
-from rejeu.loops.device.turns import (
-    Learned,
-    Limits,
-    Outcome,
-    Players,
-    Report,
-    begun,
-    kept_steps,
-    learn,
-    no_outcome,
-    nothing_learned,
-    play,
-    report_of,
-)
-from rejeu.loops.device.variants import Variants
-from rejeu.loops.packing import Packing
+from rejeu.loops.device.program import Carry, Learned, Limits, Loop, Program, step_envs
+from rejeu.loops.device.sharding import over_runs
+from rejeu.loops.device.trainer import DeviceTrainer, capacity_of
+from rejeu.loops.off_policy import begin_episodes
+from rejeu.loops.run import Run
 from rejeu.prng import nth
 
 DRAWS = 2**32 - 1
@@ -55,108 +51,40 @@ class Counts(NamedTuple):
     """Gradient steps of the last turn, whose TD errors set priorities in the next, ``int32[]``."""
 
 
-class Carry(NamedTuple):
-    """What a chunk passes on, apart from the replay buffer."""
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyProgram(Program):
+    """Turns with a replay buffer."""
 
-    state: PyTree
-    """The algorithm's state, packed between chunks."""
-    key: Array
-    """Root of the random numbers, ``uint32[2]``."""
-    explorer: PyTree
-    """The state of exploration."""
-    action: Array
-    """Chosen for the observations, not yet taken; in the algorithm's range."""
-    players: Players
-    counts: Counts
-    in_a_row: Array
-    """How many of the newest gradient steps were not finite, ``int32[]``."""
-    hyper: dict[str, Array]
-    """Hyperparameters that differ between runs; see :class:`Variants`."""
-
-
-class Loop(NamedTuple):
-    """What the turns of a chunk pass on. The states in ``carry`` and ``learned`` are the same."""
-
-    carry: Carry
-    ring: DeviceRing
-    learned: Learned
-    outcome: Outcome
-
-
-@dataclass(frozen=True)
-class OffPolicyProgram:
-    """What the program is compiled for. Hashable."""
-
-    algorithm: Algorithm
-    explorer: Explorer
-    config: OffPolicyConfig
     replay: DeviceReplay
-    packing: Packing
-    """Of the algorithm's state."""
-    capacity: int
-    """Turns of a chunk at most."""
-    skips: bool
-    """Whether updates that leave NaN are undone."""
-    stops_at_episode: bool
-    """Whether a chunk ends with the first turn in which an episode ends."""
-    variants: Variants | None = None
-    """What makes the algorithm of runs whose hyperparameters differ."""
 
-    def chunk(
-        self, env: FunctionalEnv, carry: Carry, ring: DeviceRing, limits: Limits
-    ) -> tuple[Carry, DeviceRing, Report]:
-        """Returns carry, replay buffer and report after a number of turns."""
-        program = self if self.variants is None else self.variants.applied(self, carry.hyper)
-        no_log, first_episode = carry.players.log, carry.players.episode
-        state = program.packing.unpack(carry.state)
-        carry = carry._replace(state=None, players=begun(carry.players, program.capacity))
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: DeviceRing) -> Transition:
+        return draw(self.replay, env, experience, nth(carry.key, jnp.uint32(0)), jnp.float32(0))[0]
 
-        def update(state: PyTree, ring: DeviceRing, key: Array) -> tuple[PyTree, Metrics]:
-            clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
-            batch, _ = draw(program.replay, env, ring, nth(key, jnp.uint32(0)), clock.progress)
-            return program.algorithm.update(state, batch, clock)
-
-        learned = nothing_learned(update, state, carry.in_a_row, ring, carry.key)
-        loop = Loop(carry, ring, learned, no_outcome(carry.players, carry.action))
-
-        def continues(loop: tuple[Array, Loop]) -> Array:
-            more = loop[0] < limits.n_turns
-            return more & (loop[1].carry.players.episode == first_episode) if program.stops_at_episode else more
-
-        def one(loop: tuple[Array, Loop]) -> tuple[Array, Loop]:
-            return loop[0] + 1, turn(program, env, loop[1], limits, loop[0])
-
-        _, loop = jax.lax.while_loop(continues, one, (jnp.int32(0), loop))
-        report = report_of(loop.learned, loop.carry.players, loop.outcome)
-        carry = loop.carry._replace(
-            state=program.packing.pack(loop.learned.state),
-            players=loop.carry.players._replace(log=no_log),
-            in_a_row=loop.learned.in_a_row,
-        )
-        return carry, loop.ring, report
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
+        one = lambda loop: (loop[0] + 1, take_turn(self, env, loop[1], limits, loop[0]))  # noqa: E731
+        return jax.lax.while_loop(lambda loop: may_go_on(*loop), one, (jnp.int32(0), loop))[1]
 
 
-def turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
+def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
     """Returns what the ``i``-th turn of a chunk passes on."""
-    config, algorithm, replay, carry = program.config, program.algorithm, program.replay, loop.carry
-    kept = kept_steps(carry.counts.step, limits.last, replay.n_envs)
-    players, outcome = play(env, carry.players, carry.action, kept, config.gamma, i)
-    ring = replay.add(loop.ring, carry.action, outcome.reward, outcome.terminated, outcome.obs, kept)
-    ring = replay.begin(ring, players.obs, players.ended)
-    learned = loop.learned
+    config, algorithm, replay, before = program.config, program.algorithm, program.replay, loop.carry
+    assert before.action is not None
+    loop = step_envs(program, env, loop, before.action, limits, i)
+    result, episodes, learned = loop.result, loop.carry.episodes, loop.learned
+    ring = replay.add(loop.experience, before.action, result.reward, result.terminated, result.obs, result.kept)
+    ring = replay.begin(ring, episodes.obs, episodes.ended)
     if algorithm.observe is not None:
-        learned = learned._replace(state=algorithm.observe(learned.state, players.obs, players.running_return))
-    n_ended = (players.episode - carry.players.episode).astype(jnp.int32)
-    n, counts = due(config, carry.counts, jnp.sum(kept, dtype=jnp.int32), n_ended, limits.learn_from)
-    clock = Clock(counts.step, players.episode, limits.progress[i + 1])
-    n_pending = jnp.where(n <= limits.most_updates, carry.counts.pending, 0)
-    carry = carry._replace(players=players, counts=counts)
-    root = draws(carry.key, clock.step)
+        learned = learned._replace(state=algorithm.observe(learned.state, episodes.obs, episodes.running_return))
+    n_ended = (episodes.n_finished - before.episodes.n_finished).astype(jnp.int32)
+    n, counts = due(config, before.counts, jnp.sum(result.kept, dtype=jnp.int32), n_ended, limits.learn_from)
+    clock = Clock(counts.step, episodes.n_finished, limits.progress[i + 1])
+    n_pending = jnp.where(n <= limits.most_updates, before.counts.pending, 0)
+    carry, root = loop.carry._replace(counts=counts), draws(before.key, clock.step)
 
     def one(u: Array, passed: tuple[Learned, Pending | None]) -> tuple[Learned, Pending | None]:
         learned, pending = passed
         batch, rows = draw(replay, env, ring, jax.random.fold_in(root, u + 1), clock.progress)
-        learned, td_error = learn(algorithm, learned, batch, clock, program.skips)
+        learned, td_error = program.learn(learned, batch, clock)
         if pending is not None and td_error is not None:
             pending = noted(pending, u, rows.position, rows.time, td_error)
         return learned, pending
@@ -170,7 +98,7 @@ def turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limi
     ring = replay.update_priorities(ring, n_pending)  # all batches of the turn have been drawn
     if pending is not None and ring.priorities is not None:
         ring = ring._replace(priorities=ring.priorities._replace(pending=pending))
-    return Loop(carry, ring, learned, outcome)
+    return loop._replace(carry=carry, experience=ring, learned=learned)
 
 
 def draws(key: Array, step: Array) -> Array:
@@ -180,16 +108,17 @@ def draws(key: Array, step: Array) -> Array:
 
 def choose(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, state: PyTree, clock: Clock) -> Carry:
     """Returns the carry with the actions of the next turn; see :func:`rejeu.loops.off_policy.choose`."""
-    players = carry.players
+    episodes, before = carry.episodes, carry.action
+    assert before is not None
 
     def explored() -> tuple[Array, PyTree]:
         actor, key = program.algorithm.actor(state), nth(carry.key, clock.step)
-        action, explorer = program.explorer.act(carry.explorer, actor, players.obs, players.ended, key, clock)
-        return action.astype(carry.action.dtype), explorer
+        action, explorer = program.explorer.act(carry.explorer, actor, episodes.obs, episodes.ended, key, clock)
+        return action.astype(before.dtype), explorer
 
     def random() -> tuple[Array, PyTree]:
         key = jax.random.fold_in(draws(carry.key, clock.step), 0)
-        return random_action(env.action_space, program.replay.n_envs, key).astype(carry.action.dtype), carry.explorer
+        return random_action(env.action_space, program.n_envs, key).astype(before.dtype), carry.explorer
 
     if program.config.learning_starts:
         action, explorer = jax.lax.cond(clock.step < program.config.learning_starts, random, explored)
@@ -237,3 +166,138 @@ def most_updates(config: OffPolicyConfig, n_envs: int) -> int | None:
     if config.gradient_steps != -1:
         return (every - 1 + n_envs) // every * config.gradient_steps
     return every - 1 + n_envs if isinstance(config.train_freq, int) else None
+
+
+class OffPolicyTrainer(DeviceTrainer):
+    """Trains runs with a replay buffer. Mutable."""
+
+    def make_program(self, run: Run, config: OffPolicyConfig, **settings: Any) -> OffPolicyProgram:
+        rows = run.buffer.ring.rows
+        capacity = min(capacity_of(run.env.n_envs), (rows - 1) // 2)
+        return OffPolicyProgram(config=config, replay=replay_of(run, config), capacity=capacity, **settings)
+
+    def begin_episodes(self, run: Run) -> None:
+        begin_episodes(run)
+
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        return False
+
+    def carry_of(self, run: Run, progress: float) -> Carry:
+        action = run.action
+        if action is None:  # of its shape
+            action = spaces.random_action(run.env.action_space, run.env.n_envs, np.random.default_rng(0))
+        pending = sum(len(draw.position) for draw, _ in run.td_errors) // self.program.replay.batch_size
+        counts = Counts(
+            jnp.uint32(run.step), jnp.int32(run.owed), jnp.int32(run.steps_since_update), jnp.int32(pending)
+        )
+        carry = self.common_carry(run, counts, jnp.array(action))
+        if run.action is None:
+            run.action = np.array(self.compiled(first_action)(carry, np.float32(progress)))
+            carry = carry._replace(action=jnp.array(run.action))
+        return carry
+
+    def uploaded(self, run: Run) -> DeviceRing:
+        replay, buffer = self.program.replay, run.replay
+        ring = uploaded(replay, buffer.ring)
+        if buffer.priorities is None:
+            return ring
+        sizes = replay.most_updates, replay.batch_size
+        run.td_errors = [pair for pair in run.td_errors if pair[0].version == buffer.ring.version]
+        if not device_priorities.fit(run.td_errors, *sizes):
+            buffer.update_priorities(run.td_errors)
+            run.td_errors = []
+        return ring._replace(priorities=device_priorities.uploaded(buffer.priorities, run.td_errors, *sizes))
+
+    def saved(self, experience: DeviceRing, n_turns: int) -> DeviceRing:
+        size = rounded_up(2 * n_turns + 1, self.program.replay.rows)  # a turn may add a step and a new episode
+        return self.compiled(partial(rows_to_be_written, size, self.mesh, self.size))(experience)
+
+    def put_back(self, experience: DeviceRing, saved: DeviceRing) -> DeviceRing:
+        return self.compiled(partial(rows_put_back, self.mesh, self.size), donate_argnums=1)(experience, saved)
+
+    def download(self, run: Run, experience: DeviceRing, counts: Counts) -> None:
+        download(run.buffer.ring, experience)
+        priorities = experience.priorities
+        if priorities is None:
+            return
+        ring = run.buffer.ring
+        values = np.asarray(priorities.values)[: ring.rows * ring.n_envs]
+        run.buffer.priorities.load(values.astype(np.float64), float(priorities.largest))
+        run.td_errors = [
+            (Draw(position.astype(np.int64), time.astype(np.int64), ring.version), jnp.array(td_error))
+            for position, time, td_error in zip(
+                *(np.asarray(part)[: int(counts.pending)] for part in priorities.pending), strict=True
+            )
+        ]
+
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        run.action = np.array(carry.action)
+        run.owed, run.steps_since_update = int(carry.counts.owed), int(carry.counts.since_update)
+
+    def bad_batch(self, carry: Carry, experience: DeviceRing, clock: Clock, number: int) -> Transition:
+        return self.compiled(drawn)(experience, carry.key, clock, np.uint32(number + 1))
+
+
+def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, progress: Any) -> Array:
+    """Returns the first actions of a run."""
+    program = program.with_hyperparameters(carry.hyper)
+    clock = Clock(carry.counts.step, carry.episodes.n_finished, progress)
+    return choose(program, env, carry, program.packing.unpack(carry.state), clock).action
+
+
+def drawn(
+    program: OffPolicyProgram, env: FunctionalEnv, ring: DeviceRing, key: Array, clock: Clock, number: Any
+) -> Transition:
+    """Returns the batch of a gradient step of a turn."""
+    return draw(program.replay, env, ring, jax.random.fold_in(draws(key, clock.step), number), clock.progress)[0]
+
+
+def rows_to_be_written(
+    size: int, mesh: Mesh | None, n: int, program: OffPolicyProgram, env: Any, ring: DeviceRing
+) -> Any:
+    """Returns what a chunk may change of the replay buffers of ``n`` runs; see :meth:`DeviceReplay.next_rows`."""
+    return over_runs(lambda ring: program.replay.next_rows(ring, size), n, mesh, (0,), 0)(ring)
+
+
+def rows_put_back(
+    mesh: Mesh | None, n: int, program: OffPolicyProgram, env: Any, ring: DeviceRing, rows: Any
+) -> DeviceRing:
+    """Returns the replay buffers of ``n`` runs before a chunk."""
+    return over_runs(program.replay.with_rows, n, mesh, (0, 0), 0)(ring, rows)
+
+
+def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:
+    """Returns how batches are drawn on the device from the replay buffer of a run."""
+    buffer, hindsight = run.buffer, config.hindsight
+    ring = buffer.ring
+    paths = [leaf.path for leaf in ring.obs_leaves]
+    goals: dict[str, Any] = {} if hindsight is None else {
+        "strategy": hindsight.goal_selection_strategy,
+        "n_sampled_goal": hindsight.n_sampled_goal,
+        "achieved": paths.index("achieved_goal"),
+        "desired": paths.index("desired_goal"),
+    }  # fmt: skip
+    return DeviceReplay(
+        ring.rows,
+        ring.n_envs,
+        ring.obs_structure,
+        config.gamma,
+        config.batch_size,
+        config.n_steps,
+        buffer.each_reward,
+        **goals,
+        priorities=config.priorities,
+        most_updates=1 if config.priorities is None else most_updates(config, ring.n_envs) or 1,
+    )
+
+
+def rounded_up(n: int, most: int) -> int:
+    """Returns one of few sizes that is at least ``n``, and at most ``most``, since each is compiled.
+
+    >>> rounded_up(5, 10_000), rounded_up(70, 10_000), rounded_up(70, 100)
+    (64, 512, 100)
+    """
+    size = 64
+    while size < n:
+        size *= 8
+    return min(size, most)

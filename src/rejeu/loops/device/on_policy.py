@@ -5,33 +5,26 @@ Everything happens in the order of the host's loop, with the same functions of t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from rejeu.algorithms.rollout_config import RolloutConfig
-from rejeu.core import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout
+from rejeu.core import Clock, PyTree, Rollout
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.loops.device.turns import (
-    Learned,
-    Limits,
-    Outcome,
-    Players,
-    Report,
-    begun,
-    kept_steps,
-    learn,
-    no_outcome,
-    nothing_learned,
-    play,
-    report_of,
-)
-from rejeu.loops.device.variants import Variants
-from rejeu.loops.packing import Packing
+from rejeu.loops.device.program import Carry, Limits, Loop, Program, step_envs
+from rejeu.loops.device.trainer import DeviceTrainer, capacity_of
+from rejeu.loops.on_policy import begin_episodes
+from rejeu.loops.run import Run
 from rejeu.prng import nth
+
+FIELDS = ("action", "reward", "discount", "ended", "valid", "running_return")
+"""Arrays of a rollout buffer that have the same names on the device."""
 
 
 class Counts(NamedTuple):
@@ -41,23 +34,6 @@ class Counts(NamedTuple):
     """Environment steps, ``uint32[]``."""
     length: Array
     """Turns of the current rollout, ``int32[]``."""
-
-
-class Carry(NamedTuple):
-    """What a chunk passes on, apart from the rollout."""
-
-    state: PyTree
-    """The algorithm's state, packed between chunks."""
-    key: Array
-    """Root of the random numbers, ``uint32[2]``."""
-    explorer: PyTree
-    """The state of exploration or of a recurrent policy."""
-    players: Players
-    counts: Counts
-    in_a_row: Array
-    """How many of the newest updates were not finite, ``int32[]``."""
-    hyper: dict[str, Array]
-    """Hyperparameters that differ between runs; see :class:`Variants`."""
 
 
 class Steps(NamedTuple):
@@ -77,115 +53,70 @@ class Steps(NamedTuple):
     """The state of a recurrent policy before the first step."""
 
 
-class Loop(NamedTuple):
-    """What the turns of a chunk pass on. The state is that in ``learned``."""
+@dataclass(frozen=True, kw_only=True)
+class OnPolicyProgram(Program):
+    """Turns that fill a rollout, and updates on all of it."""
 
-    carry: Carry
-    steps: Steps
-    learned: Learned
-    outcome: Outcome
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: Steps) -> Rollout:
+        return rollout_of(experience, jnp.int32(0))
 
-
-@dataclass(frozen=True)
-class OnPolicyProgram:
-    """What the program is compiled for. Hashable."""
-
-    algorithm: Algorithm
-    explorer: Explorer
-    config: RolloutConfig
-    n_envs: int
-    packing: Packing
-    """Of the algorithm's state."""
-    capacity: int
-    """Turns of a chunk at most."""
-    skips: bool
-    """Whether updates that leave NaN are undone."""
-    stops_at_episode: bool
-    """Whether a chunk ends with the first turn in which an episode ends."""
-    variants: Variants | None = None
-    """What makes the algorithm of runs whose hyperparameters differ."""
-
-    def chunk(self, env: FunctionalEnv, carry: Carry, steps: Steps, limits: Limits) -> tuple[Carry, Steps, Report]:
-        """Returns carry, rollout and report after a number of turns."""
-        program = self if self.variants is None else self.variants.applied(self, carry.hyper)
-        no_log, first_episode = carry.players.log, carry.players.episode
-        state = program.packing.unpack(carry.state)
-        carry = carry._replace(state=None, players=begun(carry.players, program.capacity))
-
-        def update(state: PyTree, steps: Steps) -> tuple[PyTree, Metrics]:
-            clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
-            return program.algorithm.update(state, rollout_of(steps, jnp.int32(0)), clock)
-
-        learned = nothing_learned(update, state, carry.in_a_row, steps)
-        loop = Loop(carry, steps, learned, no_outcome(carry.players, steps.action[0]))
-
-        def may_go_on(i: Array, loop: Loop) -> Array:
-            more = i < limits.n_turns
-            return more & (loop.carry.players.episode == first_episode) if program.stops_at_episode else more
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
+        n_steps = self.config.n_steps
 
         def fills(inner: tuple[Array, Loop]) -> Array:
-            return may_go_on(*inner) & (inner[1].carry.counts.length < program.config.n_steps)
+            return may_go_on(*inner) & (inner[1].carry.counts.length < n_steps)
 
         def one_turn(inner: tuple[Array, Loop]) -> tuple[Array, Loop]:
             i, loop = inner
-            return i + 1, turn(program, env, loop, limits, i)
+            return i + 1, take_turn(self, env, loop, limits, i)
 
         def one_rollout(outer: tuple[Array, Loop, Array]) -> tuple[Array, Loop, Array]:
             i, loop = jax.lax.while_loop(fills, one_turn, outer[:2])
             counts = loop.carry.counts
-            is_done = (counts.length == program.config.n_steps) | (limits.uses_part & (counts.step == limits.last))
+            is_done = (counts.length == n_steps) | (limits.uses_part & (counts.step == limits.last))
             is_done &= outer[2] < limits.most_updates
-            clock = Clock(counts.step, loop.carry.players.episode, limits.progress[i])
-            loop = jax.lax.cond(is_done, lambda loop: end_of_rollout(program, loop, clock), lambda loop: loop, loop)
+            clock = Clock(counts.step, loop.carry.episodes.n_finished, limits.progress[i])
+            loop = jax.lax.cond(is_done, lambda loop: end_of_rollout(self, loop, clock), lambda loop: loop, loop)
             return i, loop, outer[2] + is_done
 
         begin = (jnp.int32(0), loop, jnp.int32(0))
-        _, loop, _ = jax.lax.while_loop(lambda outer: may_go_on(*outer[:2]), one_rollout, begin)
-        report = report_of(loop.learned, loop.carry.players, loop.outcome)
-        carry = loop.carry._replace(
-            state=program.packing.pack(loop.learned.state),
-            players=loop.carry.players._replace(log=no_log),
-            in_a_row=loop.learned.in_a_row,
-        )
-        return carry, loop.steps, report
+        return jax.lax.while_loop(lambda outer: may_go_on(*outer[:2]), one_rollout, begin)[1]
 
 
-def turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
+def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
     """Returns what the ``i``-th turn of a chunk passes on, apart from the update."""
-    config, carry, steps = program.config, loop.carry, loop.steps
-    counts, before, t = carry.counts, carry.players, carry.counts.length
-    clock = Clock(counts.step, before.episode, limits.progress[i])
-    actor = program.algorithm.actor(loop.learned.state)
-    action, explorer = program.explorer.act(
-        carry.explorer, actor, before.obs, before.ended, nth(carry.key, clock.step), clock
-    )
+    config, carry, steps = program.config, loop.carry, loop.experience
+    counts, before, t = carry.counts, carry.episodes, carry.counts.length
+    clock = Clock(counts.step, before.n_finished, limits.progress[i])
+    actor, key = program.algorithm.actor(loop.learned.state), nth(carry.key, clock.step)
+    action, explorer = program.explorer.act(carry.explorer, actor, before.obs, before.ended, key, clock)
     action = action.astype(steps.action.dtype)
-    kept = kept_steps(counts.step, limits.last, program.n_envs)
-    players, outcome = play(env, before, action, kept, config.gamma, i)
+    loop = step_envs(program, env, loop, action, limits, i)
+    result, episodes = loop.result, loop.carry.episodes
     put = lambda stores, values: jax.tree.map(lambda s, v: s.at[t].set(v.astype(s.dtype)), stores, values)  # noqa: E731
     steps = Steps(
         put(steps.obs, before.obs),
-        put(steps.next_obs, outcome.obs),
+        put(steps.next_obs, result.obs),
         put(steps.action, action),
-        put(steps.reward, outcome.reward),
-        put(steps.discount, jnp.where(outcome.terminated, 0.0, config.gamma)),
-        put(steps.ended, players.ended),
-        put(steps.valid, kept),
-        put(steps.running_return, players.running_return),
+        put(steps.reward, result.reward),
+        put(steps.discount, jnp.where(result.terminated, 0.0, config.gamma)),
+        put(steps.ended, episodes.ended),
+        put(steps.valid, result.kept),
+        put(steps.running_return, episodes.running_return),
         steps.started,
         steps.carry,
     )
-    counts = Counts(counts.step + jnp.sum(kept, dtype=jnp.uint32), t + 1)
-    return Loop(carry._replace(explorer=explorer, players=players, counts=counts), steps, loop.learned, outcome)
+    counts = Counts(counts.step + jnp.sum(result.kept, dtype=jnp.uint32), t + 1)
+    return loop._replace(carry=loop.carry._replace(explorer=explorer, counts=counts), experience=steps)
 
 
 def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
     """Returns what is passed on after learning from the rollout; the next one begins."""
-    carry, batch = loop.carry, rollout_of(loop.steps, loop.carry.counts.length)
-    learned, _ = learn(program.algorithm, loop.learned, batch, clock, program.skips)
-    steps = loop.steps._replace(started=carry.players.ended, carry=carry.explorer)
+    carry = loop.carry
+    learned, _ = program.learn(loop.learned, rollout_of(loop.experience, carry.counts.length), clock)
+    steps = loop.experience._replace(started=carry.episodes.ended, carry=carry.explorer)
     counts = carry.counts._replace(length=jnp.zeros_like(carry.counts.length))
-    return loop._replace(carry=carry._replace(counts=counts), steps=steps, learned=learned)
+    return loop._replace(carry=carry._replace(counts=counts), experience=steps, learned=learned)
 
 
 def rollout_of(steps: Steps, length: Any) -> Rollout:
@@ -203,3 +134,64 @@ def rollout_of(steps: Steps, length: Any) -> Rollout:
         steps.started,
         steps.carry,
     )
+
+
+class OnPolicyTrainer(DeviceTrainer):
+    """Trains runs with a rollout buffer. Mutable."""
+
+    def make_program(self, run: Run, config: RolloutConfig, **settings: Any) -> OnPolicyProgram:
+        return OnPolicyProgram(config=config, capacity=capacity_of(run.env.n_envs), **settings)
+
+    def begin_episodes(self, run: Run) -> None:
+        begin_episodes(run, self.program.config)
+
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        """Returns whether the rollout that is under way at the step ``last`` is learned from.
+
+        It begins in this chunk or holds the steps of the buffer.
+        """
+        n_steps, n_envs = self.program.config.n_steps, run.env.n_envs
+        if last is None or run.step + n_turns * n_envs < last:
+            return False
+        length = run.replay.length
+        turns, size = (length + n_turns) % n_steps, run.replay.size() + last - run.step
+        if length + n_turns >= n_steps:
+            size = turns * n_envs - (run.step + n_turns * n_envs - last)
+        return bool(turns) and self.program.config.learns_from_part(size, n_envs)
+
+    def carry_of(self, run: Run, progress: float) -> Carry:
+        return self.common_carry(run, Counts(jnp.uint32(run.step), jnp.int32(run.replay.length)), None)
+
+    def uploaded(self, run: Run) -> Steps:
+        buffer = run.replay
+        tree = lambda stores: jax.tree.unflatten(buffer.obs_structure, [jnp.array(x) for x in stores])  # noqa: E731
+        return Steps(
+            tree(buffer.obs),
+            tree(buffer.next_obs),
+            **{name: jnp.array(getattr(buffer, name)) for name in FIELDS},
+            started=jnp.array(buffer.started),
+            carry=jax.tree.map(jnp.array, run.carry if buffer.carry == () else buffer.carry),
+        )
+
+    def saved(self, experience: Steps, n_turns: int) -> Steps:
+        return experience  # which is not donated
+
+    def put_back(self, experience: Steps, saved: Steps) -> Steps:
+        return saved
+
+    def download(self, run: Run, experience: Steps, counts: Counts) -> None:
+        buffer, n = run.buffer, int(counts.length)
+        buffer.length = n
+        if n:
+            pairs = [(getattr(buffer, name), getattr(experience, name)) for name in FIELDS]
+            for stores, values in ((buffer.obs, experience.obs), (buffer.next_obs, experience.next_obs)):
+                pairs += zip(stores, jax.tree.leaves(values), strict=True)
+            for host, device in pairs:
+                host[:n] = np.asarray(device)[:n]
+        buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
+
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        """Does nothing: the length of the rollout is copied with it."""
+
+    def bad_batch(self, carry: Carry, experience: Steps, clock: Clock, number: int) -> Rollout:
+        return rollout_of(experience, carry.counts.length)

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from rejeu.core import PyTree
-from rejeu.loops.device.transfer import stacked
 
 T = TypeVar("T")
 RUNS = "runs"
@@ -64,18 +64,43 @@ def spread(make: Callable[[T], PyTree], runs: Sequence[T], mesh: Mesh | None) ->
     return jax.tree.map(joined, *shares)
 
 
-def over_runs(function: Callable[..., Any], mesh: Mesh | None, in_axes: Any, out_axes: Any) -> Callable[..., Any]:
+def over_runs(
+    function: Callable[..., Any], n: int, mesh: Mesh | None, in_axes: Any, out_axes: Any
+) -> Callable[..., Any]:
     """Returns ``function`` of one run for all: ``jax.vmap``, and each device computes its share.
 
     Args:
         function: of one run.
+        n: the number of runs; a single one has no axis.
         mesh: the devices.
         in_axes: 0 for arguments with an axis of runs, None for those without one; trees as for ``jax.vmap``.
         out_axes: likewise of the results.
     """
+    if n == 1:
+        return function
     mapped = jax.vmap(function, in_axes, out_axes)
     if mesh is None:
         return mapped
     spec = lambda axis: PartitionSpec() if axis is None else PartitionSpec(RUNS)  # noqa: E731
     specs = lambda axes: jax.tree.map(spec, axes, is_leaf=lambda axis: axis is None)  # noqa: E731
     return jax.shard_map(mapped, mesh=mesh, in_specs=specs(in_axes), out_specs=specs(out_axes), check_vma=False)
+
+
+def stacked(trees: Sequence[PyTree]) -> PyTree:
+    """Returns trees of equal structure as one on the device, whose leaves have a leading axis."""
+
+    def joined(*leaves: Any) -> jax.Array:
+        on_host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
+        return jnp.array(np.stack(leaves)) if on_host else jnp.stack(leaves)
+
+    return jax.tree.map(joined, *trees)
+
+
+def unstacked(tree: PyTree, n: int) -> list[PyTree]:
+    """Returns the ``n`` trees of which :func:`stacked` made one; a single one has no leading axis."""
+    return [tree] if n == 1 else [jax.tree.map(lambda leaf, i=i: leaf[i], tree) for i in range(n)]
+
+
+def copies(tree: PyTree) -> PyTree:
+    """Returns copies of arrays on the host."""
+    return jax.tree.map(np.array, jax.device_get(tree))

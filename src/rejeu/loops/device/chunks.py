@@ -6,21 +6,23 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.loops.checks import check_state
-from rejeu.loops.device.turns import NO_LIMIT, Limits
+from rejeu.loops.device.off_policy import OffPolicyTrainer
+from rejeu.loops.device.on_policy import OnPolicyTrainer
+from rejeu.loops.device.program import NO_LIMIT, Limits
+from rejeu.loops.device.sharding import group_size
+from rejeu.loops.device.trainer import MAX_TURNS, DeviceTrainer, Remake
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import NonFiniteUpdate
-from rejeu.loops.run import Progress, Run
-from rejeu.loops.timing import Timer
+from rejeu.loops.run import Progress, Run, Timer
 
 SECONDS = 0.2
 """Wall time of a chunk that is aimed at: progress bar, callbacks and Ctrl-C wait for its end."""
-MAX_TURNS = 1000
-"""Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
-LOG_SIZE = 2**18
-"""Entries of a chunk's log of episodes at most: turns times environments."""
 ALL = 2**31 - 1
 
 
@@ -33,28 +35,41 @@ class Stops(NamedTuple):
     """Chunks end with every turn in which an episode ends."""
 
 
+def train_one(
+    run: Run, learner: Learner, config: Any, n_steps: int | None, progress: Callable[[Any], Any], stops: Stops
+) -> Iterator[Progress]:
+    """Trains a run; the arguments are those of :func:`train`, which see."""
+    for (turn,) in train([run], learner, config, n_steps, progress, stops, [0]):
+        assert turn is not None
+        yield turn
+
+
 def train(
-    machine: Any,
     runs: Sequence[Run],
     learner: Learner,
+    config: OffPolicyConfig | RolloutConfig,
     n_steps: int | None,
     progress: Callable[[Any], Any],
     stops: Stops,
-    begin: Callable[[Run], None],
-    active: Sequence[int] = (0,),
+    active: Sequence[int],
+    remake: Remake | None = None,
+    hyper: Sequence[dict[str, float]] | None = None,
+    devices: Sequence[jax.Device] = (),
 ) -> Iterator[list[Progress | None]]:
     """Trains runs of equal settings for exactly ``n_steps`` environment steps each; yields after every chunk.
 
     Args:
-        machine: the program, a :class:`rejeu.loops.device.machine.Machine` or one with its methods.
         runs: mutated; consistent whenever the generator has yielded.
-        learner: the algorithm.
+        learner: of one of them.
+        config: its hyperparameters.
         n_steps: over all environments of a run; None: until the caller stops.
         progress: returns the progress of schedules after a number of steps, or an array of it after an array of numbers.
         stops: where chunks must end.
-        begin: starts episodes in the environments of a run.
         active: indices of the runs that are trained, ascending. The caller may remove some between chunks: such runs stay
             as they are, and None stands for what they did. There must be one.
+        remake: makes the algorithm, if hyperparameters differ.
+        hyper: those that differ, by run.
+        devices: of which each computes some of the runs; none for JAX's default device.
 
     Raises:
         BadEnvironmentError: if a reward or an observation is not finite.
@@ -62,7 +77,10 @@ def train(
         NonFiniteUpdate: if an update leaves numbers that are not finite.
         ValueError: if the steps are too many to be counted with 32 bits.
     """
-    n_envs, first = runs[0].env.n_envs, runs[active[0]].step
+    kind = OnPolicyTrainer if isinstance(config, RolloutConfig) else OffPolicyTrainer
+    size = group_size(len(runs), devices)
+    trainer: DeviceTrainer = kind(runs, learner, config, stops.at_episodes, size, devices, remake, hyper)
+    first = runs[active[0]].step
     last = None if n_steps is None else first + n_steps
     if last is not None and last >= NO_LIMIT:
         raise ValueError(
@@ -71,8 +89,25 @@ def train(
         )
     for run in runs:
         check_state(run, learner)
+    try:
+        yield from take_chunks(trainer, first, last, progress, stops, active)
+    finally:
+        for run in runs:
+            run.copy_replay()
+
+
+def take_chunks(
+    trainer: DeviceTrainer,
+    first: int,
+    last: int | None,
+    progress: Callable[[Any], Any],
+    stops: Stops,
+    active: Sequence[int],
+) -> Iterator[list[Progress | None]]:
+    """Takes chunks from the step ``first`` to the step ``last``; see :func:`train`."""
+    runs, capacity, n_envs = trainer.runs, trainer.program.capacity, trainer.program.n_envs
     timers = [Timer(run.seconds) for run in runs]
-    pace = Pace(machine.capacity)
+    pace = Pace(capacity)
     known, trained = list[Any](), list[int]()
     while active and (last is None or runs[active[0]].step < last):
         leader = runs[active[0]]
@@ -80,10 +115,10 @@ def train(
             timer.lap()
         for run in runs:
             if run.obs is None or run.env.must_reset:
-                begin(run)
+                trainer.begin_episodes(run)
         if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
             trained = [*active]
-            machine.push(runs, leader, float(progress(leader.step - first)))
+            trainer.push(float(progress(leader.step - first)), leader)
         for timer in timers:
             timer.lap("replay")
         step = leader.step
@@ -93,20 +128,20 @@ def train(
         limits = Limits(
             np.int32(n_turns),
             np.uint32(NO_LIMIT if last is None else last),
-            schedule(progress, step - first, n_turns, n_envs, machine.capacity, last, first),
+            schedule(progress, step - first, n_turns, n_envs, capacity, last, first),
             np.int32(ALL),
             np.uint32(leader.learn_from),
-            np.bool_(machine.uses_part(leader, n_turns, last)),
+            np.bool_(trainer.uses_part(leader, n_turns, last)),
         )
         began = time.perf_counter()
-        machine.call(limits)
+        trainer.take(limits, active)
         for i in active:
-            if machine.fault(i):
-                raise_fault(machine, i, runs[i], limits)
+            if trainer.fault(i):
+                raise_fault(trainer, i, limits)
         turns: list[Progress | None] = [None] * len(runs)
         for i in active:
             timers[i].lap("update")
-            turns[i] = machine.pull(i, runs[i])
+            turns[i] = trainer.pull(i)
             timers[i].lap("replay")
         pace.note(n_turns, time.perf_counter() - began)
         if step <= leader.learn_from <= leader.step:
@@ -115,10 +150,10 @@ def train(
         yield turns
 
 
-def raise_fault(machine: Any, which: int, run: Run, limits: Limits) -> None:
+def raise_fault(trainer: DeviceTrainer, which: int, limits: Limits) -> None:
     """Raises the error of a run in a chunk; an error of an update says which run it is."""
     try:
-        machine.raise_fault(which, run, limits)
+        trainer.raise_fault(which, limits)
     except NonFiniteUpdate as error:
         error.which = which
         raise
@@ -126,7 +161,7 @@ def raise_fault(machine: Any, which: int, run: Run, limits: Limits) -> None:
 
 def held(runs: Sequence[Run]) -> list[Any]:
     """Returns the objects of the runs that others may replace between chunks."""
-    return [one for run in runs for one in (run.state, run.obs, run.action, run.replay, run.env)]
+    return [one for run in runs for one in (run.state, run.obs, run.action, run.buffer, run.env)]
 
 
 def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
@@ -165,8 +200,3 @@ class Pace:
             return
         wanted = int(n_turns * SECONDS / max(seconds, 1e-6))
         self.turns = min(max(wanted, 1), 8 * self.turns, self._capacity)
-
-
-def capacity_of(n_envs: int) -> int:
-    """Returns the turns of a chunk at most, for that number of environments."""
-    return max(min(MAX_TURNS, LOG_SIZE // n_envs), 1)
