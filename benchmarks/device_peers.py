@@ -4,7 +4,8 @@
     python benchmarks/device_peers.py --cases dqn --libraries rejeu rejax --rejax-python PATH --rounds 1 --out /tmp/out.json
 
 PPO and DQN are trained on CartPole-v1 and SAC on Pendulum-v1, with Rejax's default settings of DQN and SAC, and rollouts of
-16 environments and 128 steps for PPO. ``SETTINGS`` has each setting under its name in each library, and ``DIFFERENCES`` what
+8 and 16 environments and 128 steps, four epochs and four minibatches for PPO.
+``SETTINGS`` has each setting under its name in each library, and ``DIFFERENCES`` what
 remains different. rejeu and Rejax train in environments in JAX, Stable-Baselines3 in Gymnasium's.
 
 Every measurement is a process of its own, and the libraries take turns. Steps per second are those after compilation, with a
@@ -71,8 +72,12 @@ OFF_POLICY: tuple[Names, ...] = (
     (("tau", 0.01), ("polyak", 0.99), ("tau", 0.01)),
     (("target_update_interval", 1), ("target_update_freq", 1), ("target_update_interval", 1)),
 )
-SETTINGS: dict[str, tuple[Names, ...]] = {
-    "ppo": (
+
+
+def ppo(n_envs: int) -> tuple[Names, ...]:
+    """Returns the settings of PPO with four minibatches of a rollout."""
+    size = n_envs * 128 // 4
+    return (
         same("learning_rate", 3e-4),
         same("gamma", 0.99),
         same("gae_lambda", 0.95),
@@ -80,13 +85,18 @@ SETTINGS: dict[str, tuple[Names, ...]] = {
         same("vf_coef", 0.5),
         (("n_steps", 128), ("num_steps", 128), ("n_steps", 128)),
         (("n_epochs", 4), ("num_epochs", 4), ("n_epochs", 4)),
-        (("batch_size", 256), ("num_minibatches", 8), ("batch_size", 256)),  # of 16 * 128 steps
+        (("batch_size", size), ("num_minibatches", 4), ("batch_size", size)),
         (("clip_range", 0.2), ("clip_eps", 0.2), ("clip_range", 0.2)),
         (("clip_range_vf", 0.2), None, ("clip_range_vf", 0.2)),  # Rejax clips values by clip_eps
-        (("max_grad_norm", None), ("max_grad_norm", float("inf")), ("max_grad_norm", float("inf"))),
+        same("max_grad_norm", 0.5),
         (NET, ("agent_kwargs.hidden_layer_sizes", [64, 64]), NET),
-        ((ACTIVATION, "silu"), ("agent_kwargs.activation", "swish"), (ACTIVATION, "SiLU")),
-    ),
+        ((ACTIVATION, "tanh"), ("agent_kwargs.activation", "tanh"), (ACTIVATION, "Tanh")),
+    )
+
+
+SETTINGS: dict[str, tuple[Names, ...]] = {
+    "ppo": ppo(16),
+    "ppo8": ppo(8),
     "dqn": (
         *OFF_POLICY,
         (("double_q", True), ("ddqn", True), None),
@@ -114,8 +124,10 @@ DIFFERENCES = {
     ],
     "ppo": [
         "Rejax takes the larger of two value losses where rejeu and Stable-Baselines3 clip the value.",
+        "Rejax limits each element of a gradient where rejeu and Stable-Baselines3 limit its norm.",
         "rejeu computes log-probabilities and values at the end of the rollout, and those of all true successors.",
     ],
+    "ppo8": ["See ppo."],
     "dqn": [
         "Stable-Baselines3 has no double Q-learning, which is one network pass less, and the Huber loss.",
         "rejeu's squared loss is twice Rejax's.",
@@ -140,6 +152,7 @@ class Case(NamedTuple):
 
 CASES = {
     "ppo": Case("PPO", "CartPole-v1", 16, 20 * 16 * 128),
+    "ppo8": Case("PPO", "CartPole-v1", 8, 40 * 8 * 128),
     "dqn": Case("DQN", "CartPole-v1", 1, 2_560),
     "sac": Case("SAC", "Pendulum-v1", 1, 2_560),
 }

@@ -49,14 +49,15 @@ class Result:
         >>> find_result("Pendulum-v1", "TD3").figures
         '-156.2 (-158.2 to -154.2)'
         """
-        show = _percent if self.measure == "success rate" else _one_decimal
+        show = _percent if self.measure == "success rate" else _number
         if self.low == self.high:
             return show(self.mean)
         return f"{show(self.mean)} ({show(self.low).removesuffix(' %')} to {show(self.high)})"
 
 
-def _one_decimal(number: float) -> str:
-    return f"{number:.1f}"
+def _number(number: float) -> str:
+    """Returns a return with one decimal, or with two if it is below 1."""
+    return f"{number:.{1 if abs(number) >= 1 else 2}f}"
 
 
 def _percent(share: float) -> str:
