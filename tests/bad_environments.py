@@ -363,11 +363,13 @@ EVERY: dict[str, Fault] = {
     ),
     "two keys only": Fault(TwoKeysOnly, "error", "the observation only", "the observation only, expected .obs, info"),
     "no seed": Fault(NoSeed, "error", r"NoSeed.reset\(\) takes no seed", r"NoSeed.reset\(\) takes no seed, expected"),
-    "unrepeatable": Fault(Unrepeatable, "warning", "two resets with one seed .*super", None),
+    "unrepeatable": Fault(
+        Unrepeatable, "warning", r"env_checker: .*does not call `super\(\).reset\(seed=seed\)`", None
+    ),
     "folded limit": Fault(FoldedLimit, "warning", "terminated at its time limit of 10 steps.*truncated=True", None),
     "folded in info": Fault(FoldedInInfo, "error", "'TimeLimit.truncated'.* truncated=False", None),
     "endless": Fault(Endless, "warning", r"no episode ended in .* steps; .*max_episode_steps", None),
-    "same array": Fault(SameArray, "warning", "same array .*rejeu copies .*return a copy", None),
+    "same array": Fault(SameArray, "warning", "env_checker: .*share an object", None),
     "odd reward": Fault(OddReward, "error", "step gave the reward .* compute_reward .* they must agree", None),
     "reward needs info": Fault(RewardNeedsInfo, "error", "with an empty info", None),
     "mean reward": Fault(MeanReward, "error", "of many goals at once .* of the same goals one by one", None),

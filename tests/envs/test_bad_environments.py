@@ -160,18 +160,25 @@ def test_what_an_environment_raises_itself_is_raised_as_it_is():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("scalar", r"Scalar, environment 0, step 3: it returned the observation of shape \(\), expected \(3,\)"),
-        ("too long", r"environment 0, step 3: it returned the observation of shape \(4,\)"),
-        ("nested shape", r"environment 0, step 3: it returned the observation under 'arm.angles' of shape \(3,\)"),
-        ("four values", r"environment 0, step 3: not enough values to unpack .*; step must return \(obs, reward, term"),
+        ("scalar", r"Scalar, environment 0, step 3: step returned the observation of shape \(\), expected \(3,\)"),
+        ("too long", r"environment 0, step 3: step returned the observation of shape \(4,\)"),
+        ("nested shape", r"environment 0, step 3: step returned the observation under 'arm.angles' of shape \(3,\)"),
+        ("four values", r"environment 0, step 3: step returned 4 values .*, expected \(obs, reward, term"),
         ("nan reward", r"returned the reward nan in environment 0 after 4 steps"),
-        ("only observation", r"environment 0, the first reset: .*rejeu.check_env"),
+        ("only observation", r"environment 0, the first reset: reset returned the observation only"),
     ],
 )
 def test_vectors_that_were_given_are_explained(name, words):
     env = SyncVectorEnv([EVERY[name].make] * 2, autoreset_mode=AutoresetMode.DISABLED)
     with pytest.raises(BadEnvironmentError, match=words):
-        walk(GymnasiumVector(env))
+        walk(make_vector(env))
+
+
+def test_wrapped_vectors_that_were_given_are_explained():
+    env = SyncVectorEnv([EVERY["too long"].make] * 2, autoreset_mode=AutoresetMode.DISABLED)
+    words = r"one of the environments, step 3: ValueError: .*see rejeu.check_env\(env\)"
+    with pytest.raises(BadEnvironmentError, match=words):
+        walk(GymnasiumVector(gym.wrappers.vector.RecordEpisodeStatistics(env)))
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # by which Gymnasium shows the traceback

@@ -78,7 +78,7 @@ BOX = gym.spaces.Box
     ],
 )
 def test_advice_on_observations(space, said):
-    found = advice_on_observations(space)
+    found = [*advice_on_observations(space)]
     assert len(found) == len(said)
     for line, part in zip(found, said, strict=True):
         assert part in line

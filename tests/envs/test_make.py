@@ -88,6 +88,17 @@ def test_all_gymnasium_vectors_walk_like_the_one_in_process(mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
+def test_the_environments_of_a_synchronous_vector_are_stepped_one_by_one(mode):
+    given = SyncVectorEnv(counters(), autoreset_mode=mode)
+    vector = make_vector(given, seed=7)
+    assert isinstance(vector, InProcess)
+    assert vector.envs == given.envs
+    for one, two in zip(walk(in_process()), walk(vector), strict=True):
+        for left, right in zip(one, two, strict=True):
+            np.testing.assert_array_equal(left, right)
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_worker_processes_walk_like_the_one_in_process(mode):
     vector = GymnasiumVector(AsyncVectorEnv(counters(), autoreset_mode=mode, context="forkserver"), seed=7)
     assert vector.backend == "gymnasium-async"

@@ -204,9 +204,9 @@ def test_answers_that_nobody_fetched_are_dropped():
     """As after a Ctrl-C that came between question and answer."""
     vector = make("nothing")
     vector.reset()
-    vector.workers.send({i: ("step", np.zeros(1, np.float32), False) for i in range(2)})
+    vector.workers.send({i: ("step", np.zeros(1, np.float32)) for i in range(2)})
     np.testing.assert_array_equal(vector.step(actions(0, 0)).obs[:, 1], 2)
-    vector.workers.send({0: ("step", np.zeros(1, np.float32), False)})
+    vector.workers.send({0: ("step", np.zeros(1, np.float32))})
     np.testing.assert_array_equal(vector.reset_done(np.array([True, False]))[:, 1], [0, 2])
     vector.close()
 
@@ -396,5 +396,5 @@ def test_where_a_script_stands_is_told_from_its_text(tmp_path):
 
 def test_worker_processes_do_not_import_jax():
     """It would take a second and 100 MB in each of them."""
-    code = "import sys, rejeu.envs.workers.calls, tests.worker_environments; print('jax' in sys.modules)"
+    code = "import sys, rejeu.envs.workers.process, tests.worker_environments; print('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -243,6 +243,21 @@ def success_of(info: dict[str, Any]) -> float:
         )
     value = info.get("is_success", info.get("success"))
     return float("nan") if value is None else float(np.all(value))
+
+
+def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.ndarray, active: np.ndarray) -> Step:
+    """Steps environments that can only be stepped together, and returns the step of the ``active`` ones.
+
+    The others get an action of one that is active, and keep their observations ``before``, ``(n_envs, ...)``.
+    """
+    rest = ~active
+    kept = jax.tree.map(lambda leaf: leaf[rest], before)
+    action = np.array(action)
+    action[rest] = action[np.argmax(active)]
+    step = step_all(action)
+    reward = np.where(active, step.reward, np.float32(0.0))
+    terminated, truncated = step.terminated & active, step.truncated & active
+    return step._replace(obs=replaced(step.obs, rest, kept), reward=reward, terminated=terminated, truncated=truncated)
 
 
 def replaced(batch: Any, rows: np.ndarray, part: Any) -> Any:

@@ -6,7 +6,7 @@ import copy
 import re
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 
-from rejeu.envs import batching, validation
+from rejeu.envs import validation
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain
 
@@ -33,6 +33,10 @@ SEED = 0
 
 SCALED = "; rejeu scales actions itself, so nothing needs to be changed for it"
 """What is added to Gymnasium's advice on the range of actions."""
+
+
+Level = Literal["error", "warning"]
+"""An error stops training or makes its result wrong; a warning may be intended."""
 
 
 class Effort(NamedTuple):
@@ -52,8 +56,7 @@ QUICK = Effort(500, 20, 1.0, is_patient=False)
 class Finding(NamedTuple):
     """A problem found in an environment."""
 
-    level: Literal["error", "warning"]
-    """An error stops training or makes its result wrong; a warning may be intended."""
+    level: Level
     text: str
     """What was received, what was expected, and the fix."""
 
@@ -73,8 +76,8 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
 
     Errors: observations whose structure, shape or dtype differs from the space, numbers that are not finite, rewards and
     flags of the wrong type, a reset without seed or info, a ``compute_reward`` that disagrees with ``step``. Warnings:
-    numbers outside of the bounds, time limits reported as ``terminated``, episodes that never end, arrays that are reused,
-    resets that a seed does not reproduce, warnings of Gymnasium's checker, and observations that are hard to learn from.
+    numbers outside of the bounds, time limits reported as ``terminated``, episodes that never end, what Gymnasium's checker
+    finds (such as resets that a seed does not reproduce), and observations that are hard to learn from.
     :func:`findings` returns all of them; ``rejeu check ENV`` prints them.
 
     Args:
@@ -107,9 +110,7 @@ def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
     >>> findings(gym.make("Acrobot-v1"))
     []
     """
-    found, has_steps = _played(env, Effort(seconds=MOST_SECONDS))
-    if has_steps:
-        _check_repeats(env, found)
+    found = _played(env, Effort(seconds=MOST_SECONDS))
     if all(finding.level == "warning" for finding in found.values()):
         for text in _gymnasium_messages(env, skip_render_check):
             found[text] = Finding("warning", text)
@@ -120,24 +121,24 @@ def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
 
 def quick_findings(env: gym.Env) -> list[Finding]:
     """Returns the errors that :func:`findings` returns, and whether episodes never end, from few steps."""
-    found, _ = _played(env, QUICK)
+    found = _played(env, QUICK)
     return [finding for key, finding in found.items() if finding.level == "error" or key == "endless"]
 
 
-def _played(env: gym.Env, effort: Effort) -> tuple[dict[str, Finding], bool]:
-    """Returns what random steps show, by kind, and whether the environment could be stepped."""
+def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
+    """Returns what random steps show, by kind."""
     if not isinstance(env, gym.Env):
         raise TypeError(f"env must be a gymnasium.Env, got {type(env).__name__}; derive its class from gymnasium.Env")
     try:
         leaves(env.observation_space)
         check_action_space(env.action_space)
     except TypeError as error:
-        return {"space": Finding("error", str(error))}, False
+        return {"space": Finding("error", str(error))}
     found: dict[str, Finding] = {}
     seen = _play(env, found, effort)
     if seen and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
         found |= {finding.text: finding for finding in goal_findings(env, seen)}
-    return found, seen is not None and not {"reset", "seed"} & found.keys()
+    return found
 
 
 def check_action_space(space: gym.Space) -> None:
@@ -155,8 +156,7 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     if (fault := validation.seed_fault(env)) is not None:
         found["seed"] = Finding("error", fault)
         env = env.unwrapped  # wrappers pass a seed on
-    obs = _reset(env, found, None if fault else SEED)
-    if obs is None:
+    if _reset(env, found, None if fault else SEED) is None:
         with suppress(Exception):  # whatever step raises after a wrong reset
             _check_step(env.step(env.action_space.sample()), space, found)
         return None
@@ -164,7 +164,6 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     limit, length = known_limit(env), 0
     lengths: list[int] = []
     at_limit: list[bool] = []
-    kept = _copied(space, obs)
     until = time.monotonic() + effort.seconds
     while len(seen) < effort.most_steps and not (len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES):
         is_endless = effort.is_patient and not lengths and limit is None
@@ -173,14 +172,8 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
         answer = env.step(env.action_space.sample())
         if not _check_step(answer, space, found):
             return None
-        if _rewritten(space, obs, kept, answer[0]):
-            text = (
-                "step returns the same array each time and writes the next observation into it; rejeu copies "
-                "observations, but other code that keeps them sees them change: return a copy"
-            )
-            found.setdefault("same array", Finding("warning", text))
         obs, reward, terminated, truncated, info = validation.convert_step(answer)
-        kept = _copied(space, obs)
+        kept = jax.tree.map(np.array, plain(space, obs))
         seen.append(Seen(kept, reward, terminated, truncated, copy.deepcopy(info)))
         length += 1
         if terminated or truncated:
@@ -188,10 +181,8 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
             if length == limit:
                 at_limit.append(terminated)
             length = 0
-            obs = _reset(env, found)
-            if obs is None:
+            if _reset(env, found) is None:
                 return None
-            kept = _copied(space, obs)
     if len(at_limit) >= ENOUGH_EPISODES and all(at_limit):
         text = (
             f"every one of {len(at_limit)} episodes that came so far terminated at its time limit of {limit} steps; if "
@@ -277,49 +268,6 @@ def known_limit(env: gym.Env) -> int | None:
     return None
 
 
-def _copied(space: gym.Space, obs: Any) -> Any:
-    return jax.tree.map(np.array, plain(space, obs))
-
-
-def _rewritten(space: gym.Space, before: Any, kept: Any, after: Any) -> bool:
-    """Returns whether an array returned earlier is one that was returned again, with other numbers."""
-    return any(
-        isinstance(old, np.ndarray)
-        and np.may_share_memory(old, new)
-        and not np.array_equal(old, copied, equal_nan=True)
-        for old, copied, new in zip(*(jax.tree.leaves(plain(space, one)) for one in (before, kept, after)), strict=True)
-        if np.asarray(new).dtype.kind in "fiub"
-    )
-
-
-def _check_repeats(env: gym.Env, found: dict[str, Finding]) -> None:
-    """Warns where one seed does not give the same episode twice."""
-    space, walks = env.observation_space, []
-    env.action_space.seed(SEED)
-    actions = [env.action_space.sample() for _ in range(5)]
-    for _ in range(2):
-        walk = [_copied(space, batching.reset_env(env, SEED)[0])]
-        for action in actions:
-            obs, _, terminated, truncated, _ = validation.convert_step(env.step(action))
-            walk.append(_copied(space, obs))
-            if terminated or truncated:
-                break
-        walks.append(walk)
-    same = [
-        jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), one, two))
-        for one, two in zip(*walks, strict=False)
-    ]
-    fix = "draw everything from self.np_random"
-    if not same[0]:
-        text = (
-            f"two resets with one seed gave different observations; call super().reset(seed=seed) in reset, and {fix}"
-        )
-        found["repeat"] = Finding("warning", text)
-    elif not all(same) or len(walks[0]) != len(walks[1]):
-        text = f"one seed and the same actions led to different observations; {fix}"
-        found["repeat"] = Finding("warning", text)
-
-
 def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
     """Returns the warnings and errors of Gymnasium's own checker."""
     with warnings.catch_warnings(record=True) as caught:
@@ -338,103 +286,83 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
 
 
 def goal_findings(env: gym.Env, seen: Sequence[Seen]) -> list[Finding]:
-    """Returns the problems with the goals of an environment, from some of its steps."""
+    """Returns the problems with the goals of an environment, from some of its steps: the first of each function."""
     try:
         check_goal_space(env.observation_space)
     except ValueError as error:
         return [Finding("error", str(error))]
     if not env.has_wrapper_attr("compute_reward"):
-        return [
-            Finding(
-                "error",
-                "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
-                "there is none; add it, for hindsight replay",
-            )
-        ]
+        text = (
+            "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
+            "there is none; add it, for hindsight replay"
+        )
+        return [Finding("error", text)]
     ended = [one for one in seen if one.terminated][: MOST_GOALS // 4]
     rows = [*seen[:MOST_GOALS], *ended]
-    found = _check_goal_function("compute_reward", env.get_wrapper_attr("compute_reward"), rows)
-    if env.has_wrapper_attr("compute_terminated"):
-        found += _check_goal_function("compute_terminated", env.get_wrapper_attr("compute_terminated"), rows)
-    return found
+    names = [name for name in ("compute_reward", "compute_terminated") if env.has_wrapper_attr(name)]
+    first = [next(_goal_faults(name, env.get_wrapper_attr(name), rows), None) for name in names]
+    return [Finding(*fault) for fault in first if fault is not None]
 
 
-def _check_goal_function(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> list[Finding]:
-    """Returns the worst problem with ``compute_reward`` or ``compute_terminated``."""
+def _goal_faults(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> Iterator[tuple[Level, str]]:
+    """Yields the problems with ``compute_reward`` or ``compute_terminated``, the worst first."""
     for row in rows:
         own = function(*_goals(row), row.info)
         if np.shape(own) != ():
-            return [
-                Finding(
-                    "error", f"{name} returned the shape {np.shape(own)} of one goal, expected one number; index it"
-                )
-            ]
-        if (finding := _against_step(name, own, row)) is not None:
-            return [finding]
+            yield "error", f"{name} returned the shape {np.shape(own)} of one goal, expected one number; index it"
+        yield from _against_step(name, own, row)
         alone = _attempt(function, *_goals(row), {})
         if isinstance(alone, Exception) or not _agree(own, alone):
-            return [
-                Finding(
-                    "error",
-                    f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; "
-                    "hindsight replay keeps no infos: let it depend on the goals alone",
-                )
-            ]
-    return _check_batches(name, function, rows)
+            yield (
+                "error",
+                f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; "
+                "hindsight replay keeps no infos: let it depend on the goals alone",
+            )
+    yield from _against_batches(name, function, rows)
 
 
-def _against_step(name: str, own: Any, row: Seen) -> Finding | None:
-    """Returns the difference between a step and the function for one goal."""
-    if name == "compute_terminated":
-        if bool(own) == row.terminated:
-            return None
-        level: Any = "error" if own else "warning"
-        text = (
-            f"compute_terminated gave {bool(own)} where step gave terminated={row.terminated}; hindsight replay goes by the "
-            "former: let step return it too"
-            + ("" if own else ", unless something else than the goal ended the episode")
+def _against_step(name: str, own: Any, row: Seen) -> Iterator[tuple[Level, str]]:
+    """Yields the difference between a step and the function for one goal."""
+    if name == "compute_terminated" and bool(own) != row.terminated:
+        yield (
+            "error" if own else "warning",
+            f"compute_terminated gave {bool(own)} where step gave terminated={row.terminated}; hindsight replay goes by "
+            "the former: let step return it too"
+            + ("" if own else ", unless something else than the goal ended the episode"),
         )
-        return Finding(level, text)
-    if _agree(own, row.reward):
-        return None
-    text = f"step gave the reward {row.reward}, and compute_reward of the same goals {own}"
-    if row.terminated:
-        return Finding("warning", f"{text}, where the episode ended; hindsight replay will not know of the difference")
-    return Finding("error", f"{text}; they must agree: let step call compute_reward")
+    if name == "compute_reward" and not _agree(own, row.reward):
+        text = f"step gave the reward {row.reward}, and compute_reward of the same goals {own}"
+        if row.terminated:
+            yield "warning", f"{text}, where the episode ended; hindsight replay will not know of the difference"
+        yield "error", f"{text}; they must agree: let step call compute_reward"
 
 
-def _check_batches(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> list[Finding]:
-    """Returns the difference between the results for many goals at once and for each alone."""
+def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> Iterator[tuple[Level, str]]:
+    """Yields the difference between the results for many goals at once and for each alone."""
     achieved, desired = (np.array([_goals(row)[k] for row in rows]) for k in range(2))
     achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
     single = [_attempt(function, a, d, {}) for a, d in zip(achieved, desired, strict=True)]
-    if (raised := next((one for one in single if isinstance(one, Exception)), None)) is not None:
-        return [
-            Finding(
+    for one in single:
+        if isinstance(one, Exception):
+            yield (
                 "error",
-                f"{name} of goals of other steps {_describe_result(raised)}; it must take any goals of the space",
+                f"{name} of goals of other steps {_describe_result(one)}; it must take any goals of the space",
             )
-        ]
     whole = _attempt(function, achieved, desired, {})
     if isinstance(whole, Exception) or np.shape(whole) != (len(achieved),):
         what = _describe_result(whole) if isinstance(whole, Exception) else f"gave the shape {np.shape(whole)}"
-        return [
-            Finding(
-                "warning",
-                f"{name} of {len(achieved)} goals at once {what}, expected ({len(achieved)},); rejeu then calls it row by "
-                "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does",
-            )
-        ]
-    if not _agree(whole, np.array(single)):
+        yield (
+            "warning",
+            f"{name} of {len(achieved)} goals at once {what}, expected ({len(achieved)},); rejeu then calls it row by "
+            "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does",
+        )
+    elif not _agree(whole, np.array(single)):
         at = int(np.flatnonzero(~np.isclose(whole, single, rtol=1e-4, atol=1e-5))[0])
-        return [
-            Finding(
-                "error",
-                f"{name} of many goals at once gave {whole[at]} in row {at}, and {single[at]} of the same goals one by one; "
-                "compute each row by itself: over the last axis",
-            )
-        ]
-    return []
+        yield (
+            "error",
+            f"{name} of many goals at once gave {whole[at]} in row {at}, and {single[at]} of the same goals one by one; "
+            "compute each row by itself: over the last axis",
+        )
 
 
 def _goals(row: Seen) -> tuple[Any, Any]:
@@ -459,39 +387,25 @@ def _describe_result(result: Any) -> str:
     return f"raised {type(result).__name__}: {result}" if isinstance(result, Exception) else f"{result}"
 
 
-def advice_on_observations(space: spaces.Space, path: str = "") -> list[str]:
-    """Returns advice on an observation space, one sentence each: nothing fails, but learning may be slower."""
+def advice_on_observations(space: spaces.Space, path: str = "") -> Iterator[str]:
+    """Yields advice on an observation space, one sentence each: nothing fails, but learning may be slower."""
     where = f" under {path!r}" if path else ""
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        found = []
-        for key, part in parts:
+        for key, part in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
             name = f"{path}.{key}".lstrip(".")
             if isinstance(part, spaces.Dict | spaces.Tuple):
-                found.append(
-                    f"the observation under {name!r} is nested; rejeu takes it, Stable-Baselines3 takes one level only"
-                )
-            found += advice_on_observations(part, name)
-        return found
-    if not isinstance(space, spaces.Box):
-        return []
-    if len(space.shape) == 3:
-        return _advice_on_image(space, where)
-    if len(space.shape) > 1:
-        return [f"the observation{where} has the shape {space.shape}; arrays of two axes are flattened"]
-    if space.dtype != np.float32 and space.dtype != np.uint8:
-        return [f"the observation{where} has the dtype {space.dtype}; use float32, which it is turned into"]
-    return []
-
-
-def _advice_on_image(space: spaces.Box, where: str) -> list[str]:
-    found = []
-    if space.dtype != np.uint8:
-        found.append(f"the image{where} has the dtype {space.dtype}; only uint8 images go through convolutions")
-    elif np.any(space.low != 0) or np.any(space.high != 255):
-        found.append(f"the image{where} has other bounds than 0 and 255; it is divided by 255 in any case")
-    if min(sorted(space.shape)[1:]) < 36 and space.dtype == np.uint8:
-        found.append(
-            f"the image{where} has the shape {space.shape}; below 36x36 small convolutions are used, below 8x8 none"
-        )
-    return found
+                yield f"the observation under {name!r} is nested; rejeu takes it, Stable-Baselines3 takes one level only"
+            yield from advice_on_observations(part, name)
+    elif not isinstance(space, spaces.Box):
+        return
+    elif len(space.shape) == 3:
+        if space.dtype != np.uint8:
+            yield f"the image{where} has the dtype {space.dtype}; only uint8 images go through convolutions"
+        elif np.any(space.low != 0) or np.any(space.high != 255):
+            yield f"the image{where} has other bounds than 0 and 255; it is divided by 255 in any case"
+        if min(sorted(space.shape)[1:]) < 36 and space.dtype == np.uint8:
+            yield f"the image{where} has the shape {space.shape}; below 36x36 small convolutions are used, below 8x8 none"
+    elif len(space.shape) > 1:
+        yield f"the observation{where} has the shape {space.shape}; arrays of two axes are flattened"
+    elif space.dtype != np.float32 and space.dtype != np.uint8:
+        yield f"the observation{where} has the dtype {space.dtype}; use float32, which it is turned into"

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from rejeu.envs import batching, goals as goals_module, validation
-from rejeu.envs.base import SUCCESS_KEYS, Description, Step, VectorEnv, describe_spec, replaced
+from rejeu.envs import goals as goals_module, validation
+from rejeu.envs.base import SUCCESS_KEYS, Step, VectorEnv, describe_spec, step_whole
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.errors import BadEnvironmentError, WorkerError
@@ -22,13 +22,7 @@ from rejeu.spaces import leaves, plain
 class GymnasiumVector(VectorEnv):
     """A Gymnasium vector environment without its automatic resets."""
 
-    def __init__(
-        self,
-        env: gym.vector.VectorEnv,
-        seed: Seed = None,
-        make_one: Callable[[], gym.Env] | None = None,
-        description: Description | None = None,
-    ) -> None:
+    def __init__(self, env: gym.vector.VectorEnv, seed: Seed = None) -> None:
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         unwrapped = env.unwrapped
         if mode == AutoresetMode.NEXT_STEP and not isinstance(unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
@@ -43,14 +37,12 @@ class GymnasiumVector(VectorEnv):
             )
         self.env = env
         self._same_step = mode == AutoresetMode.SAME_STEP
-        self._make_one = make_one
         self.n_envs = env.num_envs
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
         self.backend = "gymnasium-async" if isinstance(unwrapped, AsyncVectorEnv) else "gymnasium"
-        if description is None and env.spec is None and isinstance(unwrapped, gym.vector.SyncVectorEnv):
-            description = describe_spec(unwrapped.envs[0])
-        self.env_id, self.max_episode_steps, self.reward_threshold = description or describe_spec(env)
+        one = unwrapped.envs[0] if env.spec is None and isinstance(unwrapped, gym.vector.SyncVectorEnv) else env
+        self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(one)
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
@@ -76,10 +68,10 @@ class GymnasiumVector(VectorEnv):
         answer = self._called(self.env.step, action)
         try:
             obs, reward, terminated, truncated, info = answer
-            obs = batching.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
-            reward = batching.to_vector("rewards", reward, self.n_envs, np.float32)
-            terminated = batching.to_vector("terminated", terminated, self.n_envs, bool)
-            truncated = batching.to_vector("truncated", truncated, self.n_envs, bool)
+            obs = validation.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
+            reward = validation.to_vector("rewards", reward, self.n_envs, np.float32)
+            terminated = validation.to_vector("terminated", terminated, self.n_envs, bool)
+            truncated = validation.to_vector("truncated", truncated, self.n_envs, bool)
         except ValueError:
             raise self._bad(
                 None, f"step returned {validation.describe_value(answer)}, expected {validation.STEP_VALUES}"
@@ -99,18 +91,17 @@ class GymnasiumVector(VectorEnv):
         return Step(obs, reward, terminated, truncated, info)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
-        rest = ~active
-        before = jax.tree.map(lambda leaf: leaf[rest], self._obs)
-        over = (self._flags[0] | self._flags[1]) & rest
-        if over.any():
-            self._reset(options={"reset_mask": over})
-        action = np.array(action)
-        action[rest] = action[np.argmax(active)]  # inactive environments are stepped too, with a valid action
-        step = self._step_all(action)
-        self._desynced |= rest
-        self._obs = replaced(step.obs, rest, before)
-        reward = np.where(active, step.reward, np.float32(0.0))
-        return Step(self._obs, reward, step.terminated & active, step.truncated & active, step.info)
+        over = (self._flags[0] | self._flags[1]) & ~active
+
+        def step_all(action: np.ndarray) -> Step:
+            if over.any():
+                self._reset(options={"reset_mask": over})
+            return self._step_all(action)
+
+        step = step_whole(step_all, self._obs, action, active)
+        self._desynced |= ~active
+        self._obs = step.obs
+        return step
 
     def reset_done(self, done: np.ndarray) -> Any:
         done = np.asarray(done, bool)
@@ -136,7 +127,7 @@ class GymnasiumVector(VectorEnv):
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise self._bad(None, f"reset returned {validation.describe_value(answer)}, expected (obs, info)")
         try:
-            return batching.to_batch(self.observation_space, self._leaves, self.n_envs, answer[0])
+            return validation.to_batch(self.observation_space, self._leaves, self.n_envs, answer[0])
         except BadEnvironmentError as error:
             raise self._bad(None, f"reset returned {error}") from error.__cause__
 
@@ -155,9 +146,9 @@ class GymnasiumVector(VectorEnv):
         except Exception as error:  # any exception of the vector for an invalid value
             if not is_raised_by_vector(error):
                 raise
-            env, fault = find_invalid_env(error, self.env.unwrapped)
+            ended = (i for i, pipe in enumerate(getattr(self.env.unwrapped, "parent_pipes", ())) if pipe is None)
             advice = "see rejeu.check_env(env) for what it returns against its spaces"
-            raise self._bad(env, fault or f"{type(error).__name__}: {error}; {advice}") from error
+            raise self._bad(next(ended, None), f"{type(error).__name__}: {error}; {advice}") from error
 
     def _bad(self, env: int | None, fault: str) -> BadEnvironmentError:
         return BadEnvironmentError(validation.with_location(self.env_id, env, self.n_steps, fault))
@@ -173,9 +164,7 @@ class GymnasiumVector(VectorEnv):
         unwrapped = self.env.unwrapped
         if isinstance(unwrapped, gym.vector.SyncVectorEnv):
             return goals_module.goal_functions(unwrapped.envs[0])
-        if self._make_one is None and isinstance(unwrapped, AsyncVectorEnv):
-            self._make_one = unwrapped.env_fns[0]
-        return None if self._make_one is None else goals_module.goal_functions(self._make_one())
+        return goals_module.goal_functions(unwrapped.env_fns[0]()) if isinstance(unwrapped, AsyncVectorEnv) else None
 
     def identities(self) -> set[int]:
         return {id(self), id(self.env.unwrapped)}
@@ -189,23 +178,6 @@ def is_raised_by_vector(error: Exception) -> bool:
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][1:]
     machinery = ("gymnasium.vector.", "gymnasium.wrappers.vector.", "numpy", "functools")
     return bool(frames) and all(frame.f_globals.get("__name__", "").startswith(machinery) for frame in frames)
-
-
-def find_invalid_env(error: Exception, vector: Any) -> tuple[int | None, str | None]:
-    """Returns the index of the environment whose value made a vector raise, and a description, each None if unknown."""
-    if isinstance(vector, AsyncVectorEnv):
-        return next((i for i, pipe in enumerate(vector.parent_pipes) if pipe is None), None), None
-    for i, obs in enumerate(getattr(vector, "_env_obs", ())):
-        fault = None if obs is None else validation.observation_fault(vector.single_observation_space, obs)
-        if fault is not None:
-            return i, f"it returned {fault}"
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    number = frame.f_locals.get("i") if frame.f_locals.get("self") is vector else None
-    if not isinstance(number, int):
-        return None, None
-    if "unpack" in str(error) and frame.f_code.co_name == "step":
-        return number, f"{error}; step must return {validation.STEP_VALUES}; {validation.TERMINATED_AND_TRUNCATED}"
-    return number, None
 
 
 def worker_ended(env: AsyncVectorEnv) -> WorkerError:

@@ -9,7 +9,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.envs import batching, goals as goals_module, snapshot, validation
+from rejeu.envs import goals as goals_module, snapshot, validation
 from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
@@ -43,12 +43,14 @@ class InProcess(VectorEnv):
         self.observation_space = envs[0].observation_space
         self.action_space = envs[0].action_space
         self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(envs[0])
+        self.owner: Any = None
+        """The vector environment of Gymnasium that they were given in, which may close them when it is deleted."""
         self.n_steps = 0
         """Number of steps of the vector."""
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._stores = [np.zeros((self.n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
-        self._put = batching.make_writer(self.observation_space, self._stores)
+        self._put = validation.make_writer(self.observation_space, self._stores)
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
 
     def with_wrapper(self, wrap: Callable[[gym.Env], gym.Env], seed: Seed = None) -> InProcess:
@@ -58,18 +60,33 @@ class InProcess(VectorEnv):
         """
         seed, self._seed = seed if self._seed is None else self._seed, None
         wrapped = InProcess([wrap(env) for env in self.envs], seed)
-        wrapped.seeds = self.seeds
+        wrapped.seeds, wrapped.owner = self.seeds, self.owner
         return wrapped
 
     def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        for i, (env, own_seed) in enumerate(zip(self.envs, for_each(seed, self.n_envs), strict=True)):
-            try:
-                self._put(i, batching.reset_env(env, own_seed)[0])
-            except BadEnvironmentError as error:
-                raise self._bad(i, str(error), error) from error.__cause__
+        for i, own_seed in enumerate(for_each(seed, self.n_envs)):
+            self._reset(i, own_seed)
         return self._obs
+
+    def reset_done(self, done: np.ndarray) -> Any:
+        for i in np.flatnonzero(done).tolist():
+            self._reset(i)
+        return self._obs
+
+    def _reset(self, i: int, seed: int | None = None) -> None:
+        try:
+            answer = validation.called_reset(self.envs[i], seed)
+        except BadEnvironmentError as error:
+            raise self._bad(i, str(error), error) from error.__cause__
+        try:
+            obs, info = answer
+            if type(answer) is not tuple or not isinstance(info, dict):
+                raise TypeError("not a tuple of an observation and a dict")
+            self._put(i, obs)
+        except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
+            raise self._bad(i, validation.reset_fault(answer, self.observation_space), error) from error
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         return self._step_all(action, np.flatnonzero(active).tolist())
@@ -91,18 +108,6 @@ class InProcess(VectorEnv):
             except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
                 raise self._bad(i, validation.step_fault(answer, self.observation_space), error) from error
         return Step(self._obs, reward, terminated, truncated, info)
-
-    def reset_done(self, done: np.ndarray) -> Any:
-        for i in np.flatnonzero(done).tolist():
-            answer = self.envs[i].reset()
-            try:
-                obs, info = answer
-                if type(answer) is not tuple or not isinstance(info, dict):
-                    raise TypeError("not a tuple of an observation and a dict")
-                self._put(i, obs)
-            except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
-                raise self._bad(i, validation.reset_fault(answer, self.observation_space), error) from error
-        return self._obs
 
     def _bad(self, i: int, fault: str | None, error: Exception) -> BadEnvironmentError:
         """Returns the error for invalid values of environment ``i``; without a description, that of NumPy."""

@@ -6,7 +6,7 @@ Each backend has a module of its own: :mod:`rejeu.envs.in_process`, :mod:`rejeu.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -14,7 +14,6 @@ import gymnasium as gym
 
 from rejeu import validation
 from rejeu.envs import seeds
-from rejeu.envs.adapters import adapter_of
 from rejeu.envs.base import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.functional import registry as functional
@@ -46,6 +45,21 @@ __all__ = [
     "make_vec",
     "make_vector",
 ]
+
+
+Adapter = Callable[[Any, Any], VectorEnv]
+"""Converts an object with an attribute ``num_envs``, given a seed."""
+_adapters: dict[type, Adapter] = {}
+
+
+def register_adapter(kind: type, adapter: Adapter) -> None:
+    """Lets :func:`make_vector`, and so the agents, accept vector environments of another package's class."""
+    _adapters[kind] = adapter
+
+
+def adapter_of(env: Any) -> Adapter | None:
+    """Returns the adapter for an object, or None if none is registered for its class."""
+    return next((adapter for kind, adapter in _adapters.items() if isinstance(env, kind)), None)
 
 
 class WorkerOptions(NamedTuple):
@@ -137,6 +151,10 @@ def _made(
         return env
     if (adapter := adapter_of(env)) is not None:
         return adapter(env, seed)
+    if type(env) is gym.vector.SyncVectorEnv:
+        in_process = InProcess(env.envs, seed)
+        in_process.owner = env
+        return in_process
     if isinstance(env, gym.vector.VectorEnv):
         return GymnasiumVector(env, seed)
     if isinstance(env, FunctionalEnv):

@@ -16,12 +16,12 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.core import Masked
-from rejeu.envs.adapters import adapter_of
+from rejeu.envs import snapshot
 from rejeu.envs.functional import masks as functional_masks, registry as functional
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, check_workers, make_vector
+from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, adapter_of, check_workers, make_vector
 from rejeu.envs.registry import maker
 from rejeu.envs.seeds import Seed
 from rejeu.envs.validation import id_of
@@ -65,19 +65,6 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
         mask = self._mask(info, terminated or truncated)
         return {OBSERVATION: obs, MASK: mask}, reward, terminated, truncated, info
 
-    def get_wrapper_state(self) -> dict[str, Any]:
-        """Returns an empty dict: the wrapper has no state (see :mod:`rejeu.envs.snapshot`)."""
-        return {}
-
-    def set_wrapper_state(self, state: Mapping[str, Any]) -> None:
-        """Does nothing.
-
-        Raises:
-            ValueError: if ``state`` is not empty.
-        """
-        if state:
-            raise ValueError(f"the state of {type(self).__name__} has {sorted(state)}, expected nothing")
-
     def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
         if not isinstance(info, dict):  # reported by the vector, with the number of the environment
             return np.zeros(self._n, np.int8)
@@ -110,6 +97,9 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
         sizes = space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else [self._n]
         if not all(part.any() for part in np.split(mask, np.cumsum(sizes)[:-1])):
             raise BadEnvironmentError(f"{id_of(self.env)} allows no action: its mask is {mask.tolist()}")
+
+
+snapshot.REMEMBERED[MaskInObservation] = {}
 
 
 @dataclass(frozen=True)

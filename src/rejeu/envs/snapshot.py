@@ -1,7 +1,7 @@
 """Snapshots of running environments, so that a run resumes in the middle of an episode.
 
 Supported are Gymnasium's classic control and MuJoCo environments, ``rejeu/Ball-v0``, the wrappers of Gymnasium and
-rejeu that are listed here, and any environment or wrapper with the two methods ::
+rejeu in :data:`REMEMBERED`, and any environment or wrapper with the two methods ::
 
     get_state() -> a dict of numbers, strings, lists, tuples, dicts and arrays
     set_state(state)
@@ -13,7 +13,8 @@ not supported, because their state is not plain data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import gymnasium as gym
@@ -23,22 +24,6 @@ from gymnasium import wrappers
 from gymnasium.envs import classic_control
 from msgspec import Meta
 
-STATELESS = (
-    wrappers.ClipAction,
-    wrappers.ClipReward,
-    wrappers.DtypeObservation,
-    wrappers.FilterObservation,
-    wrappers.FlattenObservation,
-    wrappers.GrayscaleObservation,
-    wrappers.RescaleAction,
-    wrappers.RescaleObservation,
-    wrappers.ReshapeObservation,
-    wrappers.ResizeObservation,
-    wrappers.TransformAction,
-    wrappers.TransformObservation,
-    wrappers.TransformReward,
-)
-"""Wrappers without state."""
 ABSENT = "absent"
 """Value of an attribute that does not exist yet, such as ``last_u`` before the first step."""
 Integer = int | None | Literal["absent"]
@@ -52,9 +37,22 @@ def numbers(n: int) -> Any:
 
 
 REMEMBERED: dict[type, dict[str, Any]] = {
+    wrappers.ClipAction: {},
+    wrappers.ClipReward: {},
+    wrappers.DtypeObservation: {},
+    wrappers.FilterObservation: {},
+    wrappers.FlattenObservation: {},
+    wrappers.GrayscaleObservation: {},
+    wrappers.PassiveEnvChecker: {},
+    wrappers.RescaleAction: {},
+    wrappers.RescaleObservation: {},
+    wrappers.ReshapeObservation: {},
+    wrappers.ResizeObservation: {},
+    wrappers.TransformAction: {},
+    wrappers.TransformObservation: {},
+    wrappers.TransformReward: {},
     wrappers.TimeLimit: {"_elapsed_steps": Integer},
     wrappers.OrderEnforcing: {"_has_reset": bool},
-    wrappers.PassiveEnvChecker: {},
     wrappers.RecordEpisodeStatistics: {
         "episode_count": int,
         "episode_returns": float | Annotated[list[float], Meta(min_length=1, max_length=1)],
@@ -81,24 +79,33 @@ def state_of(env: gym.Env) -> list[Any] | None:
     >>> bool((env.step(2)[0] == after).all())
     True
     """
-    layers: list[Any] = []
-    layer: gym.Env = env
-    while True:
-        if answers_for_itself(layer):
-            return [*layers, layer.get_state()]  # type: ignore[attr-defined]
-        kind = type(layer)
-        if kind in STATELESS:
-            layers.append({})
-        elif saves_itself(layer):
-            layers.append(layer.get_wrapper_state())  # type: ignore[attr-defined]
-        elif kind in REMEMBERED:
-            layers.append({name: getattr(layer, name, ABSENT) for name in REMEMBERED[kind]})
-        elif not is_mujoco(layer):
-            return None
-        if not isinstance(layer, gym.Wrapper):
-            layers.append({**(_mujoco_state(layer) if is_mujoco(layer) else layers.pop()), "rng": _rng(layer)})
-            return _copied(layers)
+    layers = [*layers_of(env)]
+    states = [_state(layer) for layer in layers]
+    if any(state is None for state in states):
+        return None
+    if not answers_for_itself(layers[-1]):
+        states[-1]["rng"] = None if layers[-1]._np_random is None else layers[-1]._np_random.bit_generator.state
+    return copy.deepcopy(states)
+
+
+def layers_of(env: gym.Env) -> Iterator[Any]:
+    """Yields wrappers, outermost first, and the environment, up to the first layer that answers for the rest."""
+    layer: Any = env
+    while isinstance(layer, gym.Wrapper) and not answers_for_itself(layer):
+        yield layer
         layer = layer.env
+    yield layer
+
+
+def _state(layer: Any) -> Any:
+    """Returns the state of a layer without its random numbers, None if it is not supported."""
+    if answers_for_itself(layer):
+        return layer.get_state()
+    if saves_itself(layer):
+        return layer.get_wrapper_state()
+    if type(layer) in REMEMBERED:
+        return {name: getattr(layer, name, ABSENT) for name in REMEMBERED[type(layer)]}
+    return _mujoco_state(layer) if is_mujoco(layer) else None
 
 
 def restore(env: gym.Env, layers: list[Any]) -> None:
@@ -107,34 +114,33 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
     Raises:
         ValueError: if the environment has other layers, or the state is invalid.
     """
-    layer, left = env, list(layers)
-    while True:
-        if not left or not isinstance(left[0], dict):
-            raise ValueError(f"the state is of another environment than {env}")
-        state = left.pop(0)
-        if answers_for_itself(layer):
-            layer.set_state(state)  # type: ignore[attr-defined]
-        elif saves_itself(layer):
-            layer.set_wrapper_state(state)  # type: ignore[attr-defined]
-        elif type(layer) in STATELESS or type(layer) in REMEMBERED:
-            types = REMEMBERED.get(type(layer), {})
-            check_types(layer, state, types if isinstance(layer, gym.Wrapper) else {**types, "rng": Any})
-            for name in types:
-                if not (isinstance(state[name], str) and state[name] == ABSENT):
-                    setattr(layer, name, state[name])
-            if isinstance(layer, wrappers.PassiveEnvChecker):  # the environment was checked at the start of the run
-                vars(layer).update({name: True for name in vars(layer) if name.startswith("checked_")})
-        elif is_mujoco(layer):
-            _put_mujoco(layer, state)
-        else:
-            raise ValueError(f"{type(layer).__name__} does not support snapshots")
-        if answers_for_itself(layer) or not isinstance(layer, gym.Wrapper):
-            break
-        layer = layer.env
-    if left:
+    own = [*layers_of(env)]
+    if len(layers) != len(own) or not all(isinstance(state, dict) for state in layers):
         raise ValueError(f"the state is of another environment than {env}")
-    if not answers_for_itself(layer) and state["rng"] is not None:
-        layer.unwrapped.np_random.bit_generator.state = state["rng"]
+    for layer, state in zip(own, layers, strict=True):
+        _restore(layer, state)
+    if not answers_for_itself(own[-1]) and layers[-1]["rng"] is not None:
+        own[-1].np_random.bit_generator.state = layers[-1]["rng"]
+
+
+def _restore(layer: Any, state: dict[str, Any]) -> None:
+    """Restores the state of a layer without its random numbers."""
+    if answers_for_itself(layer):
+        layer.set_state(state)
+    elif saves_itself(layer):
+        layer.set_wrapper_state(state)
+    elif type(layer) in REMEMBERED:
+        types = REMEMBERED[type(layer)]
+        check_types(layer, state, types if isinstance(layer, gym.Wrapper) else {**types, "rng": Any})
+        for name in types:
+            if not (isinstance(state[name], str) and state[name] == ABSENT):
+                setattr(layer, name, state[name])
+        if isinstance(layer, wrappers.PassiveEnvChecker):  # the environment was checked at the start of the run
+            vars(layer).update({name: True for name in vars(layer) if name.startswith("checked_")})
+    elif is_mujoco(layer):
+        _put_mujoco(layer, state)
+    else:
+        raise ValueError(f"{type(layer).__name__} does not support snapshots")
 
 
 def check_count(states: Any, n_envs: int) -> None:
@@ -145,15 +151,14 @@ def check_count(states: Any, n_envs: int) -> None:
 
 def is_over(env: gym.Env) -> bool:
     """Returns whether an environment must be reset before the next step, as far as its layers report it."""
-    layer = env
-    while isinstance(layer, gym.Wrapper):
-        if saves_itself(layer) and getattr(layer, "needs_reset", False):
+    *outer, layer = layers_of(env)
+    for wrapper in outer:
+        if saves_itself(wrapper) and getattr(wrapper, "needs_reset", False):
             return True
-        if isinstance(layer, wrappers.OrderEnforcing) and not layer._has_reset:
+        if isinstance(wrapper, wrappers.OrderEnforcing) and not wrapper._has_reset:
             return True
-        if isinstance(layer, wrappers.TimeLimit) and layer._elapsed_steps is None:
+        if isinstance(wrapper, wrappers.TimeLimit) and wrapper._elapsed_steps is None:
             return True
-        layer = layer.env
     if answers_for_itself(layer):
         return bool(getattr(layer, "needs_reset", False))
     return "state" in REMEMBERED.get(type(layer), {}) and getattr(layer, "state", None) is None
@@ -218,15 +223,3 @@ def _put_mujoco(env: Any, state: dict[str, Any]) -> None:
     mujoco.mj_setState(env.model, env.data, given, kind)
     mujoco.mj_forward(env.model, env.data)
     mujoco.mj_setState(env.model, env.data, given, kind)  # mj_forward changed the warm start of the solver
-
-
-def _rng(env: gym.Env) -> Any:
-    return None if env._np_random is None else env._np_random.bit_generator.state
-
-
-def _copied(layers: Any) -> Any:
-    if isinstance(layers, dict):
-        return {key: _copied(value) for key, value in layers.items()}
-    if isinstance(layers, list | tuple):
-        return type(layers)(_copied(value) for value in layers)
-    return layers.copy() if isinstance(layers, np.ndarray) else layers

@@ -1,7 +1,8 @@
-"""Validation of what environments return: what is accepted, how it is converted, and what is wrong with the rest.
+"""What environments may return: what is accepted, how it is converted and written into batches, what is wrong with the rest.
 
 Every function named ``*_fault`` returns one sentence that says what was received, what was expected and how to fix it, or
-None where nothing is wrong. Those functions run once something has failed, and in :func:`rejeu.check_env`.
+None where nothing is wrong. Those functions run once something has failed, and in :func:`rejeu.check_env`; while all is well,
+the loops pay for a few comparisons only.
 
 Accepted although the space declares something else: other dtypes whose values are kept, NumPy's scalars, and 0 and 1 as
 booleans.
@@ -9,16 +10,18 @@ booleans.
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.spaces import Leaf, leaves, parts
+from rejeu.errors import BadEnvironmentError
+from rejeu.spaces import Leaf, cast, leaves, parts
 
 FLAGS = frozenset((bool, np.bool_))
 """Types of ``terminated`` and ``truncated``."""
@@ -26,6 +29,12 @@ NUMBERS = frozenset((float, int, np.float64, np.float32, np.int64, np.int32))
 """Types of rewards that need no conversion."""
 LARGEST = float(np.finfo(np.float32).max)
 """The largest reward that float32 can hold."""
+STEP_VALUES = "(obs, reward, terminated, truncated, info)"
+FAR = 10.0
+"""Warn if an observation is outside its bounds by more than this multiple of their distance."""
+TERMINATED_AND_TRUNCATED = (
+    "terminated says that the task itself ended, truncated that a time limit cut the episode off; return both as bools"
+)
 
 
 def keeps_values(array: np.ndarray, dtype: Any) -> bool:
@@ -104,12 +113,125 @@ def to_bool(flag: Any) -> bool:
     return bool(number)
 
 
-STEP_VALUES = "(obs, reward, terminated, truncated, info)"
-FAR = 10.0
-"""Warn if an observation is outside its bounds by more than this multiple of their distance."""
-TERMINATED_AND_TRUNCATED = (
-    "terminated says that the task itself ended, truncated that a time limit cut the episode off; return both as bools"
-)
+def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, Any], None]:
+    """Returns ``put(i, observation)``, which writes one observation into row ``i`` of each of the ``stores``.
+
+    ``stores`` hold the leaves of ``space`` in the order of :func:`rejeu.spaces.leaves`, ``(n_envs, *leaf.shape)``, of the
+    kept dtypes. Values of another dtype are cast if only precision is lost. ``put`` raises any exception for an invalid
+    observation; :func:`observation_fault` then describes what is wrong.
+    """
+    slots = [
+        (store, leaf.shape, math.prod(leaf.shape), part.dtype, np.ndarray)
+        for store, leaf, part in zip(stores, leaves(space), leaf_spaces(space), strict=True)
+    ]
+    store, shape, size, dtype, array = slots[0]
+
+    def put_array(i: int, obs: Any) -> None:
+        # As many numbers as are expected can only be broadcast from shapes with leading ones, which is harmless.
+        if type(obs) is not array or obs.size != size or obs.dtype is not dtype:
+            obs = to_array(obs, shape, store.dtype)
+        store[i] = obs
+
+    def put_parts(i: int, obs: Any) -> None:
+        for (store, shape, size, dtype, array), part in zip(slots, parts(space, obs), strict=True):
+            if type(part) is not array or part.size != size or part.dtype is not dtype:
+                part = to_array(part, shape, store.dtype)
+            store[i] = part
+
+    return put_parts if isinstance(space, spaces.Dict | spaces.Tuple) else put_array
+
+
+def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+    """Returns what ``reset`` returns, given ``seed`` and ``options`` only if they are not None.
+
+    Raises:
+        BadEnvironmentError: if it does not accept a seed.
+    """
+    arguments = {key: value for key, value in (("seed", seed), ("options", options)) if value is not None}
+    try:
+        return env.reset(**arguments)  # type: ignore[arg-type]
+    except TypeError as error:
+        if seed is not None and (fault := seed_fault(env)) is not None:
+            raise BadEnvironmentError(fault) from error
+        raise
+
+
+def reset_env(
+    env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Resets an environment and returns the observation and the info; see :func:`called_reset`.
+
+    Raises:
+        BadEnvironmentError: if it does not accept a seed, or does not return an observation of its space and a dict.
+    """
+    answer = called_reset(env, seed, options)
+    if (fault := reset_fault(answer, env.observation_space)) is not None:
+        raise BadEnvironmentError(fault)
+    return answer
+
+
+def step_env(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """Steps an environment and returns the result, with numbers as Python scalars.
+
+    Raises:
+        BadEnvironmentError: if ``step`` does not return the five values, or the observation does not match its space.
+    """
+    answer = env.step(action)
+    if (fault := step_fault(answer, env.observation_space)) is not None:
+        raise BadEnvironmentError(fault)
+    return convert_step(answer)
+
+
+def copy_observation(space: spaces.Space, obs: Any) -> Any:
+    """Returns a copy of a valid observation, in which every leaf can be cast to the declared dtype."""
+    if isinstance(space, spaces.Dict):
+        return {key: copy_observation(part, obs[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(copy_observation(part, one) for part, one in zip(space.spaces, obs, strict=True))
+    dtype = np.dtype(space.dtype)
+    if isinstance(obs, np.ndarray) and np.can_cast(obs.dtype, dtype, "same_kind"):
+        return obs.copy()
+    return copy.deepcopy(obs) if np.isscalar(obs) else np.asarray(obs).astype(dtype)
+
+
+def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:
+    """Returns the observations of a vector environment, converted by :func:`rejeu.spaces.cast`.
+
+    Raises:
+        BadEnvironmentError: with the description only, if they are not ``(n_envs, *leaf.shape)`` at every leaf.
+    """
+    try:
+        arrays = cast(space, space_leaves, obs)
+    except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
+        raise BadEnvironmentError(
+            f"observations as {describe_value(obs)}, expected a batch of {space}: {error}"
+        ) from error
+    for leaf, array in zip(space_leaves, parts(space, arrays), strict=True):
+        if array.shape != (n_envs, *leaf.shape):
+            raise BadEnvironmentError(
+                f"{leaf_name(leaf.path)} of all environments of shape {array.shape}, expected {(n_envs, *leaf.shape)}; one "
+                "row for each environment"
+            )
+    return arrays
+
+
+def to_vector(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
+    """Returns the rewards or flags that a vector environment returned, ``dtype (n_envs,)``.
+
+    Raises:
+        BadEnvironmentError: with the description only, if they are not numbers of that shape.
+    """
+    array = np.asarray(values)
+    if array.shape != (n_envs,) or array.dtype.kind not in ("fiub" if dtype == np.float32 else "iub"):
+        kind = "numbers" if dtype == np.float32 else "bools"
+        raise BadEnvironmentError(f"{name} as {describe_value(values)}, expected {kind} of shape ({n_envs},)")
+    with np.errstate(over="ignore"):
+        kept = array.astype(dtype, copy=False)
+    if dtype == np.float32 and not math.isfinite(np.vdot(kept, kept)):
+        large = array[np.isinf(kept) & np.isfinite(array)]
+        if large.size:
+            raise BadEnvironmentError(reward_fault(large[0].item()))
+    return kept
 
 
 def seed_fault(env: gym.Env) -> str | None:
@@ -126,30 +248,30 @@ def seed_fault(env: gym.Env) -> str | None:
     return None
 
 
-def reset_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | None:
-    """Describes what is wrong with what ``reset`` returned; for ``strict`` see :func:`observation_fault`."""
+def reset_fault(answer: Any, space: spaces.Space) -> str | None:
+    """Describes what is wrong with what ``reset`` returned."""
     if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
         only = observation_fault(space, answer) is None
         what = "the observation only" if only else f"{describe_value(answer)}"
         return f"reset returned {what}, expected (obs, info); return obs, {{}} if there is nothing to say"
-    fault = observation_fault(space, answer[0], strict=strict)
+    fault = observation_fault(space, answer[0])
     return None if fault is None else f"reset returned {fault}"
 
 
-def step_fault(answer: Any, space: spaces.Space, strict: bool = False) -> str | None:
-    """Describes what is wrong with what ``step`` returned; for ``strict`` see :func:`observation_fault`."""
+def step_fault(answer: Any, space: spaces.Space) -> str | None:
+    """Describes what is wrong with what ``step`` returned."""
     if not isinstance(answer, tuple) or len(answer) != 5:
         what = f"{len(answer)} values" if isinstance(answer, tuple) else describe_value(answer)
         old = " as in the old package gym" if isinstance(answer, tuple) and len(answer) == 4 else ""
         return f"step returned {what}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
     obs, reward, terminated, truncated, info = answer
     fault = (
-        observation_fault(space, obs, strict=strict)
-        or reward_fault(reward, strict)
-        or flag_fault("terminated", terminated, strict)
-        or flag_fault("truncated", truncated, strict)
+        observation_fault(space, obs)
+        or reward_fault(reward)
+        or flag_fault("terminated", terminated)
+        or flag_fault("truncated", truncated)
+        or info_fault(info)
     )
-    fault = fault or info_fault(info)
     return None if fault is None else f"step returned {fault}"
 
 
@@ -257,9 +379,13 @@ def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str 
 
 def nonfinite_fault(space: spaces.Space, obs: Any) -> str | None:
     """Describes which number of one observation of the right structure is not finite."""
-    named = zip(leaves(space), _values(space, obs), strict=True)
-    said = (_array_nonfinite_fault(np.asarray(value), leaf_name(leaf.path)) for leaf, value in named)
-    return next((fault for fault in said if fault is not None), None)
+    for leaf, value in zip(leaves(space), parts(space, obs), strict=True):
+        array = np.asarray(value)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            at = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+            what = f"{leaf_name(leaf.path)} with {array[at]}{_place(at)}"
+            return f"{what}, expected finite numbers; look for divisions by zero and overflows"
+    return None
 
 
 def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warning"], str] | None:
@@ -267,7 +393,7 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
 
     A warning for a Box, whose bounds networks never see; an error for choices and bits, which would have no place in one.
     """
-    for leaf, part, value in zip(leaves(space), leaf_spaces(space), _values(space, obs), strict=True):
+    for leaf, part, value in zip(leaves(space), leaf_spaces(space), parts(space, obs), strict=True):
         array = np.asarray(value)
         if isinstance(part, spaces.Box):
             low, high = part.low, part.high
@@ -308,21 +434,6 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
                 f"the declared bounds [{part.low[where]:.4g}, {part.high[where]:.4g}]"
             )
     return None
-
-
-def _array_nonfinite_fault(array: np.ndarray, what: str) -> str | None:
-    if array.dtype.kind != "f" or np.isfinite(array).all():
-        return None
-    at = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
-    return f"{what} with {array[at]}{_place(at)}, expected finite numbers; look for divisions by zero and overflows"
-
-
-def _values(space: spaces.Space, obs: Any) -> list[Any]:
-    if isinstance(space, spaces.Dict):
-        return [value for key in sorted(space.spaces) for value in _values(space.spaces[key], obs[key])]
-    if isinstance(space, spaces.Tuple):
-        return [value for part, one in zip(space.spaces, obs, strict=True) for value in _values(part, one)]
-    return [obs]
 
 
 def _size(leaf: Leaf) -> int:

@@ -45,15 +45,9 @@ class SavedResult(msgspec.Struct, forbid_unknown_fields=True):
 def to_saved(env: int, result: Result) -> dict[str, Any]:
     """Returns a result of environment ``env`` as plain data."""
     success = success_of(result.info)
-    return {
-        "env": env,
-        "obs": result.obs,
-        "reward": float(result.reward),
-        "terminated": bool(result.terminated),
-        "truncated": bool(result.truncated),
-        "success": None if np.isnan(success) else success,
-        "begun": result.begun,
-    }
+    saved = {"env": env, **result._asdict(), "success": None if np.isnan(success) else success}
+    del saved["info"]
+    return saved
 
 
 def from_saved(saved: Any, leaves: Sequence[Leaf]) -> tuple[int, Result]:

@@ -19,7 +19,7 @@ import gymnasium as gym
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.envs.workers import process
-from rejeu.envs.workers.process import Encoder
+from rejeu.envs.workers.process import Copied, Encoder
 from rejeu.envs.workers.worker import CLOSE_SECONDS, Starter, Worker
 from rejeu.errors import WorkerError
 
@@ -29,7 +29,7 @@ START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 class ProcessWorker(Worker):
     """A handle of a worker process on this machine."""
 
-    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, encoder: Encoder | None) -> None:
+    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, encoder: Encoder) -> None:
         """Starts the process. ``encoder`` is passed to :func:`rejeu.envs.workers.process.serve`."""
         pipe, theirs = context.Pipe()
         super().__init__(number, pipe)
@@ -89,7 +89,7 @@ class Processes(Starter):
         Args:
             start_method: start method of ``multiprocessing``. None uses :data:`START_METHOD`.
             encoders: takes the ``multiprocessing`` context and returns a function that returns the encoder of each worker by
-                its number. None: observations are sent as they are.
+                its number. None: observations are sent with the dtypes of the space.
             preload: name of an additional module that the workers need.
 
         Raises:
@@ -105,11 +105,10 @@ class Processes(Starter):
         if start_method == "forkserver":
             # Imported once, in the server, so that a worker starts in milliseconds. The import starts no threads.
             self._context.set_forkserver_preload([process.__name__, *([] if preload is None else [preload])])
-        self._encoder_of = None if encoders is None else encoders(self._context)
+        self._encoder_of = (lambda number: Copied()) if encoders is None else encoders(self._context)
 
     def start(self, number: int, make: Callable[[], gym.Env]) -> ProcessWorker:
-        encoder = None if self._encoder_of is None else self._encoder_of(number)
-        return ProcessWorker(number, make, self._context, encoder)
+        return ProcessWorker(number, make, self._context, self._encoder_of(number))
 
     def close(self) -> None:
         """Does nothing: the workers own all that was started."""

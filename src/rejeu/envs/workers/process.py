@@ -9,6 +9,7 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Literal, NamedTuple
@@ -18,7 +19,7 @@ import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu import cluster
-from rejeu.envs import batching, snapshot, validation
+from rejeu.envs import snapshot, validation
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves
 
@@ -89,7 +90,7 @@ class ToSharedMemory(Encoder):
         self.buffers, self.n_envs, self.number = buffers, n_envs, number
 
     def __call__(self, space: gym.Space) -> Callable[[Any], None]:
-        put, number = batching.make_writer(space, rows(space, self.buffers, self.n_envs)), self.number
+        put, number = validation.make_writer(space, rows(space, self.buffers, self.n_envs)), self.number
         return lambda obs: put(number, obs)
 
 
@@ -98,7 +99,7 @@ class ToLeaves(Encoder):
 
     def __call__(self, space: gym.Space) -> Callable[[Any], list[np.ndarray]]:
         stores = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves(space)]
-        put = batching.make_writer(space, stores)
+        put = validation.make_writer(space, stores)
 
         def encode(obs: Any) -> list[np.ndarray]:
             put(0, obs)
@@ -107,23 +108,31 @@ class ToLeaves(Encoder):
         return encode
 
 
-def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder | None) -> None:
+class Copied(Encoder):
+    """Sends observations with their structure and the dtypes of the space."""
+
+    def __call__(self, space: gym.Space) -> Callable[[Any], Any]:
+        return partial(validation.copy_observation, space)
+
+
+def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder) -> None:
     """Answers requests for one environment, until it is closed or the main process exits.
 
     Args:
         pipe: connection to the main process.
         make: makes the environment.
-        encoder: encodes the observations. None sends them as they are.
+        encoder: encodes the observations.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
     env: gym.Env | None = None
     try:
         env = make.fn()
-        encode = unchanged if encoder is None else encoder(env.observation_space)
+        encode = encoder(env.observation_space)
+        keep = ToLeaves()(env.observation_space) if isinstance(encoder, ToSharedMemory) else encode
         send(pipe, Description(env.observation_space, env.action_space, env.metadata, env.render_mode))
         while (request := receive(pipe))[0] != "close":
-            send(pipe, _answered(env, request, encode))
+            send(pipe, _answered(env, request, encode, keep))
     except (EOFError, ConnectionError):
         pass
     except Exception as error:  # any exception of the constructor: the main process raises it
@@ -183,15 +192,10 @@ def receive_exactly(connected: socket.socket, n: int) -> bytes:
     return data
 
 
-def unchanged(obs: Any) -> Any:
-    """Returns an observation as it is."""
-    return obs
-
-
-def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any]) -> Any:
+def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any], keep: Callable[[Any], Any]) -> Any:
     """Returns the answer of the environment, or a :class:`Failure`."""
     try:
-        return _answer(env, encode, *request)
+        return _answer(env, encode, keep, *request)
     except BadEnvironmentError as error:
         return Failure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # the environment can raise anything
@@ -199,21 +203,20 @@ def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any]) -> Any:
         return Failure(kind, str(error), traceback.format_exc())
 
 
-def _answer(env: gym.Env, encode: Callable[[Any], Any], name: str, *arguments: Any) -> Any:
+def _answer(env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], Any], name: str, *arguments: Any) -> Any:
     """Returns the answer of an environment to one request."""
     if name == "step":
-        action, resets = arguments
-        if resets:
-            return step_and_reset(env, action, encode)
-        obs, *rest = checked_step(env, action)
+        obs, *rest = validation.step_env(env, *arguments)
         return encode(obs), *rest
+    if name == "step_and_reset":
+        return step_and_reset(env, encode, keep, *arguments)
     if name == "reset":
-        obs, info = batching.reset_env(env, *arguments)
+        obs, info = validation.reset_env(env, *arguments)
         return encode(obs), info
     if name == "snapshot":
         return snapshot.state_of(env)
     if name == "restore":
-        snapshot.restore(env, arguments[0])
+        snapshot.restore(env, *arguments)
         return snapshot.is_over(env)
     assert name == "call", name
     function, *rest = arguments
@@ -221,30 +224,23 @@ def _answer(env: gym.Env, encode: Callable[[Any], Any], name: str, *arguments: A
 
 
 def step_and_reset(
-    env: gym.Env, action: Any, encode: Callable[[Any], Any]
-) -> tuple[Any, float, bool, bool, dict[str, Any], list[np.ndarray] | None]:
+    env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], Any], action: Any
+) -> tuple[Any, float, bool, bool, dict[str, Any], Any, dict[str, Any]]:
     """Steps an environment, and resets it if the episode has ended.
 
+    Args:
+        env: the environment.
+        encode: encodes the observation to act on.
+        keep: encodes the final observation of an episode, which must outlast the next.
+        action: the action.
+
     Returns:
-        The observation to act on, encoded, the reward, both flags, the info, and the leaves of the final observation, None
-        if the episode goes on.
+        The encoded observation to act on, the reward, both flags, the info, and the final observation and the info of the
+        reset, which are None and empty if the episode goes on.
     """
-    obs, reward, terminated, truncated, info = checked_step(env, action)
-    final = None
-    if terminated or truncated:
-        final = ToLeaves()(env.observation_space)(obs)
-        obs, _ = batching.reset_env(env)
-    return encode(obs), reward, terminated, truncated, info, final
-
-
-def checked_step(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """Steps an environment and returns the result, with numbers as Python scalars.
-
-    Raises:
-        BadEnvironmentError: if ``step`` does not return the five values, or the observation does not match its space.
-    """
-    answer = env.step(action)
-    fault = validation.step_fault(answer, env.observation_space)
-    if fault is not None:
-        raise BadEnvironmentError(fault)
-    return validation.convert_step(answer)
+    obs, reward, terminated, truncated, info = validation.step_env(env, action)
+    if not (terminated or truncated):
+        return encode(obs), reward, terminated, truncated, info, None, {}
+    final = keep(obs)
+    obs, reset_info = validation.reset_env(env)
+    return encode(obs), reward, terminated, truncated, info, final, reset_info

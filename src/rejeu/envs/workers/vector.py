@@ -161,7 +161,7 @@ class InWorkers(VectorEnv):
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
         lost = {i: self._lost.pop(i) for i in which if i in self._lost}
-        asked = {i: ("step", action[i], False) for i in which if i not in lost}
+        asked = {i: ("step", action[i]) for i in which if i not in lost}
         said = {**self._heard(self.workers.ask(asked), "step"), **lost}
         stepped = {}
         for i, answer in said.items():
@@ -207,7 +207,7 @@ class InWorkers(VectorEnv):
         """
         idle = [i for i in range(self.n_envs) if i not in self._pending and i not in self._results]
         lost = [i for i in idle if i in self._lost]
-        self.workers.send({i: ("step", action[i], True) for i in idle if i not in self._lost})
+        self.workers.send({i: ("step_and_reset", action[i]) for i in idle if i not in self._lost})
         self._pending.update(idle)
         for i in lost:
             self._arrived(i, self._lost.pop(i))
@@ -279,7 +279,7 @@ class InWorkers(VectorEnv):
             why = {RESTARTED: self._lost.pop(i).why}
             self._results[i] = Result(before, 0.0, False, True, why, begun)
             return
-        _, reward, terminated, truncated, info, final = answer
+        _, reward, terminated, truncated, info, final, _ = answer
         self._results[i] = Result(
             begun if final is None else final, reward, terminated, truncated, info, None if final is None else begun
         )

@@ -69,7 +69,8 @@ class Worker(ABC):
 
     def ask(self, request: str, *arguments: Any) -> None:
         """Sends a request. The answer must be fetched with :meth:`answer`."""
-        self.asked = arguments[0].__name__.strip("_") if request == "call" else request
+        name = getattr(arguments[0], "__name__", request) if request == "call" else request
+        self.asked = name.removesuffix("_and_reset")
         self.asked_at = time.monotonic()
         process.send(self.pipe, (request, *arguments))
 

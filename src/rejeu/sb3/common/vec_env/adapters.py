@@ -1,32 +1,35 @@
 """Conversion between Stable-Baselines3's vector environments and rejeu's.
 
 Agents step a :class:`rejeu.envs.base.VectorEnv`, which never resets by itself. Importing this module registers the
-conversion in both directions (:mod:`rejeu.envs.adapters`).
+conversion in both directions.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.envs import adapters, batching, goals as goals_module, validation
-from rejeu.envs.base import Step, VectorEnv, success_of
+from rejeu.envs import goals as goals_module, validation
+from rejeu.envs.base import Step, VectorEnv, step_whole, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.in_process import InProcess
+from rejeu.envs.make import register_adapter
 from rejeu.envs.seeds import Seed
 from rejeu.errors import BadEnvironmentError
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
     TIME_LIMIT_TRUNCATED,
     Indices,
+    SingleEnvs,
     StepResult,
     VecEnv,
     VecEnvWrapper,
+    is_wrapped,
 )
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
 from rejeu.sb3.common.vec_env.vec_normalize import unwrap_vec_normalize
@@ -124,8 +127,8 @@ class VecEnvAdapter(VectorEnv):
             raise self._bad(f"step returned {validation.describe_value(answer)}, expected (obs, rewards, dones, infos)")
         returned, reward, dones, infos = answer
         try:
-            done = batching.to_vector("dones", dones, self.n_envs, bool)
-            reward = batching.to_vector("rewards", reward, self.n_envs, np.float32)
+            done = validation.to_vector("dones", dones, self.n_envs, bool)
+            reward = validation.to_vector("rewards", reward, self.n_envs, np.float32)
         except BadEnvironmentError as error:
             raise self._bad(f"step returned {error}") from error.__cause__
         for i, info in enumerate(infos):
@@ -161,20 +164,10 @@ class VecEnvAdapter(VectorEnv):
             store[i] = part
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
-        rest = ~active
-        before = jax.tree.map(lambda leaf: leaf[rest], self._obs)
-        action = np.array(action)
-        action[rest] = action[np.argmax(active)]  # inactive environments are stepped too, with a valid action
-        step = self._step_all(action)
-        self._desynced |= rest
-        self._obs = jax.tree.map(np.copy, step.obs)
-        jax.tree.map(lambda whole, old: whole.__setitem__(rest, old), self._obs, before)
-        return step._replace(
-            obs=self._obs,
-            reward=np.where(active, step.reward, np.float32(0.0)),
-            terminated=step.terminated & active,
-            truncated=step.truncated & active,
-        )
+        step = step_whole(self._step_all, self._obs, action, active)
+        self._desynced |= ~active
+        self._obs = step.obs
+        return step
 
     def reset_done(self, done: np.ndarray) -> Any:
         done = np.asarray(done, bool)
@@ -220,7 +213,7 @@ class VecEnvAdapter(VectorEnv):
 
     def _cast(self, obs: Any) -> Any:
         try:
-            return batching.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
+            return validation.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
         except BadEnvironmentError as error:
             raise self._bad(f"it returned {error}") from error.__cause__
 
@@ -237,7 +230,7 @@ def _first_attr(venv: VecEnv, name: str) -> Any:
     return found[0] if found else None
 
 
-class AutoResetView(VecEnv):
+class AutoResetView(SingleEnvs):
     """A vector environment of rejeu as a ``VecEnv``, to be stepped by hand.
 
     It is used where single environments are not Python objects in this process, as with EnvPool.
@@ -275,28 +268,13 @@ class AutoResetView(VecEnv):
     def close(self) -> None:
         self.vector.close()
 
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Raises ``AttributeError``: single environments cannot be accessed."""
-        raise AttributeError(self._no_access(attr_name))
-
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Raises ``AttributeError``, as :meth:`get_attr` does."""
-        raise AttributeError(self._no_access(attr_name))
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Raises ``AttributeError``, as :meth:`get_attr` does."""
-        raise AttributeError(self._no_access(method_name))
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        return [False for _ in self._get_indices(indices)]
-
-    def _no_access(self, name: str) -> str:
-        return (
-            f"{name!r}: single environments of {self.vector.env_id} on the backend {self.vector.backend} cannot be "
-            "accessed; give the agent gymnasium.make(id) or make_vec_env(id) instead of an id"
+    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        if function is is_wrapped:
+            return [False for _ in self._get_indices(indices)]
+        raise AttributeError(
+            f"single environments of {self.vector.env_id} on the backend {self.vector.backend} cannot be accessed; give the "
+            "agent gymnasium.make(id) or make_vec_env(id) instead of an id"
         )
 
 
-adapters.register_adapter(VecEnv, to_vector)
+register_adapter(VecEnv, to_vector)

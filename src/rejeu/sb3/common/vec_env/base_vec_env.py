@@ -11,14 +11,15 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from operator import methodcaller
 from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from rejeu.envs.workers.calls import TERMINAL_OBSERVATION, TIME_LIMIT_TRUNCATED
+from rejeu.envs.rendering import check_renders, rgb_frame
 from rejeu.errors import MissingExtra
 from rejeu.reporting.formatting import counted
 
@@ -32,6 +33,10 @@ __all__ = [
     "unwrap_wrapper",
 ]
 
+TERMINAL_OBSERVATION = "terminal_observation"
+"""Key of the info that holds the last observation of an episode."""
+TIME_LIMIT_TRUNCATED = "TimeLimit.truncated"
+"""Key of the info that says whether only a time limit ended the episode."""
 Indices = int | Iterable[int] | None
 """Which environments: one, several, or None for all."""
 StepResult = tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]
@@ -186,6 +191,48 @@ class VecEnv(ABC):
         return list(chosen)
 
 
+class SingleEnvs(VecEnv):
+    """A vector of Gymnasium environments, in this process or in others. Abstract."""
+
+    @abstractmethod
+    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Returns ``function(env, *arguments)`` of some environments."""
+
+    def get_images(self) -> list[np.ndarray]:
+        check_renders(self)
+        return self._call(None, rgb_frame)
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        return self._call(indices, methodcaller("get_wrapper_attr", attr_name))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Sets an attribute of each environment.
+
+        It is set where it exists, also inside wrappers. (Stable-Baselines3 sets it on the outermost wrapper, where the
+        environment itself does not see it.)
+        """
+        self._call(indices, methodcaller("set_wrapper_attr", attr_name, value))
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        return self._call(indices, call_method, method_name, method_args, method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        return self._call(indices, is_wrapped, wrapper_class)
+
+    def _stepped(self, answers: Iterable[Any]) -> StepResult:
+        """Returns what :func:`rejeu.envs.workers.process.step_and_reset` returned for each environment as one result."""
+        obs, rewards, terminated, truncated, infos, finals, reset_infos = map(list, zip(*answers, strict=True))
+        dones = np.logical_or(terminated, truncated)
+        for i in range(self.num_envs):
+            infos[i] = {**infos[i], TIME_LIMIT_TRUNCATED: truncated[i] and not terminated[i]}
+            if dones[i]:
+                infos[i][TERMINAL_OBSERVATION] = finals[i]
+                self.reset_infos[i] = reset_infos[i]
+        return stacked(self.observation_space, obs), np.array(rewards, np.float32), dones, infos
+
+
 class VecEnvWrapper(VecEnv):
     """A wrapper of a vector environment. Abstract: subclasses implement :meth:`reset` and :meth:`step_wait`.
 
@@ -307,6 +354,11 @@ def unwrap_wrapper(env: gym.Env, wrapper_class: type[G]) -> G | None:
 def is_wrapped(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> bool:
     """Returns whether an environment is wrapped in that class."""
     return unwrap_wrapper(env, wrapper_class) is not None
+
+
+def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
+    """Calls a method, looked up through the wrappers, and returns its result."""
+    return env.get_wrapper_attr(name)(*arguments, **keywords)
 
 
 def tile_images(images: Sequence[np.ndarray]) -> np.ndarray:

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
-from rejeu.envs import batching, validation
-from rejeu.envs.rendering import check_renders, rgb_frame
+from rejeu.envs.validation import copy_observation, id_of, reset_env, with_location
+from rejeu.envs.workers.process import step_and_reset
 from rejeu.errors import BadEnvironmentError
-from rejeu.sb3.common.vec_env.base_vec_env import (
-    TERMINAL_OBSERVATION,
-    TIME_LIMIT_TRUNCATED,
-    Indices,
-    StepResult,
-    VecEnv,
-    is_wrapped,
-    stacked,
-)
+from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
 
 __all__ = ["DummyVecEnv"]
 
 
-class DummyVecEnv(VecEnv):
+class DummyVecEnv(SingleEnvs):
     """Environments stepped one after the other in this process, each reset within the step that ends its episode.
 
     Observations are arrays with a leading axis ``num_envs``, with the structure of the observation space. They, rewards
@@ -61,11 +53,13 @@ class DummyVecEnv(VecEnv):
         self.n_steps = 0
         """Number of steps of the vector."""
         self._actions: Any = None
+        self._copies = [partial(copy_observation, env.observation_space) for env in self.envs]
 
     def reset(self) -> Any:
         parts = []
         for i, env in enumerate(self.envs):
-            parts.append(self._reset_env(i, env, self._seeds[i], self._options[i]))
+            obs, self.reset_infos[i] = self._located(i, reset_env, env, self._seeds[i], self._options[i])
+            parts.append(self._copies[i](obs))
         self._reset_seeds()
         self._reset_options()
         return stacked(self.observation_space, parts)
@@ -76,64 +70,23 @@ class DummyVecEnv(VecEnv):
 
     def step_wait(self) -> StepResult:
         self.n_steps += 1
-        parts, infos = [], []
-        rewards, dones = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
-        for i, env in enumerate(self.envs):
-            answer = env.step(self._actions[i])
-            if (fault := validation.step_fault(answer, env.observation_space)) is not None:
-                raise BadEnvironmentError(validation.with_location(validation.id_of(env), i, self.n_steps, fault))
-            obs, rewards[i], terminated, truncated, info = validation.convert_step(answer)
-            # A copy: an environment may write its next observation into the same array.
-            obs = batching.copy_observation(env.observation_space, obs)
-            info = {**info, TIME_LIMIT_TRUNCATED: truncated and not terminated}
-            dones[i] = terminated or truncated
-            if dones[i]:
-                info[TERMINAL_OBSERVATION] = obs
-                obs = self._reset_env(i, env)
-            parts.append(obs)
-            infos.append(info)
-        return stacked(self.observation_space, parts), rewards, dones, infos
+        return self._stepped(
+            # Copies: an environment may write its next observation into the same array.
+            self._located(i, step_and_reset, env, copy, copy, action)
+            for i, (env, copy, action) in enumerate(zip(self.envs, self._copies, self._actions, strict=True))
+        )
 
-    def _reset_env(self, i: int, env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Resets one environment; returns a copy of its observation."""
+    def _located(self, i: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Calls a function; says of an invalid value that it is of environment ``i``."""
         try:
-            obs, self.reset_infos[i] = batching.reset_env(env, seed, options)
+            return function(*arguments)
         except BadEnvironmentError as error:
-            raise BadEnvironmentError(
-                validation.with_location(validation.id_of(env), i, self.n_steps, str(error))
-            ) from error
-        return batching.copy_observation(env.observation_space, obs)
+            where = id_of(self.envs[i]), i, self.n_steps
+            raise BadEnvironmentError(with_location(*where, str(error))) from error
 
     def close(self) -> None:
         for env in self.envs:
             env.close()
 
-    def get_images(self) -> list[np.ndarray]:
-        check_renders(self)
-        return [rgb_frame(env) for env in self.envs]
-
-    def has_attr(self, attr_name: str) -> bool:
-        return all(env.has_wrapper_attr(attr_name) for env in self.envs)
-
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        return [env.get_wrapper_attr(attr_name) for env in self._chosen(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Sets an attribute of each environment.
-
-        It is set where it exists, also inside wrappers. (Stable-Baselines3 sets it on the outermost wrapper, where the
-        environment itself does not see it.)
-        """
-        for env in self._chosen(indices):
-            env.set_wrapper_attr(attr_name, value)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in self._chosen(indices)]
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        return [is_wrapped(env, wrapper_class) for env in self._chosen(indices)]
-
-    def _chosen(self, indices: Indices) -> list[gym.Env]:
-        return [self.envs[i] for i in self._get_indices(indices)]
+    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        return [function(self.envs[i], *arguments) for i in self._get_indices(indices)]

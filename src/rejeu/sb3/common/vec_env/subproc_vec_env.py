@@ -6,29 +6,18 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
-from rejeu.envs.rendering import rgb_frame
 from rejeu.envs.validation import with_location
-from rejeu.envs.workers import calls
 from rejeu.envs.workers.local import Processes, ProcessWorker
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
 from rejeu.envs.workers.process import Failure
 from rejeu.errors import BadEnvironmentError, WorkerError
-from rejeu.sb3.common.vec_env.base_vec_env import (
-    TERMINAL_OBSERVATION,
-    TIME_LIMIT_TRUNCATED,
-    Indices,
-    StepResult,
-    VecEnv,
-    is_wrapped,
-    stacked,
-)
+from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
 
 __all__ = ["SubprocVecEnv"]
 
 
-class SubprocVecEnv(VecEnv):
+class SubprocVecEnv(SingleEnvs):
     """Environments stepped in parallel, one process each, and reset within the step that ends an episode.
 
     Worth it where a step takes longer than a few tenths of a millisecond. The processes import the main script, so it must
@@ -88,7 +77,7 @@ class SubprocVecEnv(VecEnv):
         """Resets some environments, again where the process had to be replaced; returns observations and infos."""
         done: dict[int, tuple[Any, dict[str, Any]]] = {}
         while len(done) < len(numbers):
-            waiting = {i: ("call", calls.reset, self._seeds[i], self._options[i]) for i in numbers if i not in done}
+            waiting = {i: ("reset", self._seeds[i], self._options[i]) for i in numbers if i not in done}
             self.workers.send(waiting)
             replies = self._receive(waiting)
             done |= {i: reply for i, reply in replies.items() if not isinstance(reply, Restarted)}
@@ -97,7 +86,7 @@ class SubprocVecEnv(VecEnv):
     def step_async(self, actions: Any) -> None:
         self._check_count(actions)
         self._n_steps += 1
-        self.workers.send({i: ("call", calls.step_and_reset, action) for i, action in enumerate(actions)})
+        self.workers.send({i: ("step_and_reset", action) for i, action in enumerate(actions)})
         self.waiting = True
 
     def step_wait(self) -> StepResult:
@@ -105,53 +94,28 @@ class SubprocVecEnv(VecEnv):
         replies = self._receive(range(self.num_envs))
         lost = {i: reply.why for i, reply in replies.items() if isinstance(reply, Restarted)}
         for i, (obs, reset_info) in self._reset([*lost]).items():
-            info = {TIME_LIMIT_TRUNCATED: True, TERMINAL_OBSERVATION: self._last[i], RESTARTED: lost[i]}
-            replies[i] = obs, 0.0, True, info, reset_info
-        obs, rewards, dones, infos, reset_infos = zip(*(replies[i] for i in range(self.num_envs)), strict=True)
-        for i in np.flatnonzero(dones).tolist():
-            self.reset_infos[i] = reset_infos[i]
-        self._last = list(obs)
-        return (
-            stacked(self.observation_space, self._last),
-            np.array(rewards, np.float32),
-            np.array(dones, bool),
-            list(infos),
-        )
+            replies[i] = obs, 0.0, False, True, {RESTARTED: lost[i]}, self._last[i], reset_info
+        self._last = [replies[i][0] for i in range(self.num_envs)]
+        return self._stepped(replies[i] for i in range(self.num_envs))
 
     def close(self) -> None:
         """Ends the processes; a second call does nothing."""
         self.workers.close()
 
-    def get_images(self) -> list[np.ndarray]:
-        return self._call(range(self.num_envs), _render)
-
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        return self._call(self._get_indices(indices), calls.get_attr, attr_name)
-
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        self._call(self._get_indices(indices), calls.set_attr, attr_name, value)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        return self._call(self._get_indices(indices), calls.call_method, method_name, method_args, method_kwargs)
-
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        return self._call(self._get_indices(indices), is_wrapped, wrapper_class)
-
-    def _call(self, indices: Sequence[int] | range, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Calls ``function(env, *arguments)`` in some processes and returns the results.
 
         Raises:
             AttributeError: if the function does; the processes then keep running.
         """
-        self.workers.send(dict.fromkeys(indices, ("call", function, *arguments)))
-        replies = self._receive(indices, attribute_errors=True)
+        chosen = self._get_indices(indices)
+        self.workers.send(dict.fromkeys(chosen, ("call", function, *arguments)))
+        replies = self._receive(chosen, attribute_errors=True)
         for i, reply in replies.items():
             if isinstance(reply, Restarted):
                 self.close()
                 raise WorkerError(f"the process of environment {i} was lost outside of a step: {reply.why}")
-        return [replies[i] for i in indices]
+        return [replies[i] for i in chosen]
 
     def _receive(self, indices: Any, attribute_errors: bool = False) -> dict[int, Any]:
         """Returns the replies of some processes; ends all processes if one of the replies is a failure."""
@@ -165,7 +129,3 @@ class SubprocVecEnv(VecEnv):
                     raise BadEnvironmentError(with_location(type(self).__name__, i, self._n_steps, answer.message))
                 raise WorkerError(f"environment {i} raised an error:\n{answer.trace}")
         return replies
-
-
-def _render(env: gym.Env) -> Any:
-    return env.render() if env.render_mode == "human" else rgb_frame(env)
