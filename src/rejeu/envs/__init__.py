@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from rejeu.envs.functional import registry
+from rejeu.envs import functional
 
 if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv, make_vector
@@ -20,7 +20,7 @@ if "rejeu/CartPoleNoVelocity-v0" not in gym.registry:
         reward_threshold=475.0,
     )
 
-registry.register_with_gymnasium()
+functional.register_with_gymnasium()
 
 __all__ = ["VectorEnv", "make_vector"]
 

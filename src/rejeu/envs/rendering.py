@@ -74,44 +74,46 @@ def rgb_frame(env: gym.Env) -> np.ndarray:
 
 
 @contextmanager
+def environment_variable(name: str, value: str | None) -> Iterator[None]:
+    """Sets an environment variable, unless the value is None, and restores it at the end."""
+    before = os.environ.get(name)
+    if value is not None:
+        os.environ[name] = value
+    try:
+        yield
+    finally:
+        os.environ.pop(name, None)
+        if before is not None:
+            os.environ[name] = before
+
+
+@contextmanager
 def display_for_pygame() -> Iterator[None]:
     """Lets pygame render without a display, by SDL's ``dummy`` driver; restores the environment variable at the end.
 
     While ``SDL_VIDEODRIVER=dummy`` is set, highway-env renders black frames. Therefore the variable is set only while pygame's
     display is opened.
     """
-    before = os.environ.get("SDL_VIDEODRIVER")
-    driver = "dummy" if before is None and is_headless() else before
-    try:
-        if driver == "dummy":
-            os.environ["SDL_VIDEODRIVER"] = driver
-            if "pygame" in sys.modules:
-                display = sys.modules["pygame"].display
-                if not display.get_init():
-                    display.init()
-                del os.environ["SDL_VIDEODRIVER"]
+    name = "SDL_VIDEODRIVER"
+    driver = os.environ.get(name, "dummy" if is_headless() else None)
+    with environment_variable(name, driver):
+        if driver == "dummy" and "pygame" in sys.modules:
+            display = sys.modules["pygame"].display
+            if not display.get_init():
+                display.init()
+            del os.environ[name]
         yield
-    finally:
-        if before is None:
-            os.environ.pop("SDL_VIDEODRIVER", None)
-        else:
-            os.environ["SDL_VIDEODRIVER"] = before
 
 
 @contextmanager
 def headless_mujoco() -> Iterator[None]:
     """Lets MuJoCo render without a display, by EGL or OSMesa, unless ``MUJOCO_GL`` is set; restores it at the end."""
-    if "mujoco" not in sys.modules or "MUJOCO_GL" in os.environ or not is_headless():
+    driver = None
+    if "mujoco" in sys.modules and "MUJOCO_GL" not in os.environ and is_headless():
+        libraries = {"egl": "EGL", "osmesa": "OSMesa"}
+        driver = next((name for name, library in libraries.items() if ctypes.util.find_library(library)), None)
+    with environment_variable("MUJOCO_GL", driver):
         yield
-        return
-    libraries = {"egl": "EGL", "osmesa": "OSMesa"}
-    driver = next((name for name, library in libraries.items() if ctypes.util.find_library(library)), None)
-    try:
-        if driver is not None:
-            os.environ["MUJOCO_GL"] = driver
-        yield
-    finally:
-        os.environ.pop("MUJOCO_GL", None)
 
 
 def is_headless() -> bool:

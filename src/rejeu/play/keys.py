@@ -50,68 +50,45 @@ class Binding(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DiscreteKeys:
-    """Keys for Discrete actions.
+class KeyMap:
+    """Keys for Discrete or Box actions.
 
-    Opposite keys cancel. If keys of several actions are held, the actions alternate step by step.
+    Discrete: opposite keys cancel. If keys of several actions are held, the actions alternate step by step. Box: the
+    contributions of the held keys are added and clipped to the bounds.
     """
 
+    space: gym.spaces.Discrete | gym.spaces.Box
     bindings: tuple[Binding, ...]
-    idle: tuple[int, ...]
-    """Actions without a key, which alternate; empty to wait for a key."""
+    idle: tuple[Any, ...]
+    """Discrete: actions without a key, which alternate; empty to wait for a key. Box: the action without a key."""
 
     @property
     def names(self) -> frozenset[str]:
         """All keys with an action, arrow keys included."""
         return frozenset().union(*(equivalent_keys(binding, self.bindings) for binding in self.bindings))
 
-    def action(self, held: Iterable[str], step: int) -> np.int64 | None:
-        """Returns the action at a step of the episode (from 0), None to wait.
+    def action(self, held: Iterable[str], step: int) -> Any:
+        """Returns the action at a step of the episode (from 0) in the space's shape and dtype, None to wait.
 
         >>> keys = bind(gym.spaces.Discrete(4), {"a": 1, "w": 2, "d": 3, "none": 0})
         >>> [int(keys.action(held, step=0)) for held in (["left"], ["a", "d"], [])]
         [1, 0, 0]
         >>> [int(keys.action(["a", "w"], step)) for step in range(4)]
         [1, 2, 1, 2]
+        >>> keys = bind(gym.spaces.Box(-1, 1, (2,)), {"w": [1, 0], "a": [0, -1], "d": [0, 1]})
+        >>> keys.action(["up", "left"], step=0).tolist(), keys.action(["w", "a", "d"], step=0).tolist()
+        ([1.0, -1.0], [1.0, 0.0])
         """
         pressed = _canonical(held, self.bindings)
+        if isinstance(self.space, gym.spaces.Box):
+            added = (np.subtract(binding.action, self.idle) for binding in _active(pressed, self.bindings))
+            total = sum(added, np.array(self.idle)).reshape(self.space.shape)
+            return np.clip(total, self.space.low, self.space.high).astype(self.space.dtype)
         for pair in OPPOSITES:
             if pressed.issuperset(pair) and not any(binding.keys.issuperset(pair) for binding in self.bindings):
                 pressed -= set(pair)
         chosen = [binding.action for binding in _active(pressed, self.bindings)] or self.idle
         return np.int64(chosen[step % len(chosen)]) if chosen else None
-
-
-@dataclass(frozen=True)
-class BoxKeys:
-    """Keys for Box actions. The contributions of the held keys are added and clipped to the bounds."""
-
-    bindings: tuple[Binding, ...]
-    rest: tuple[float, ...]
-    """The action without a key."""
-    space: gym.spaces.Box
-
-    @property
-    def names(self) -> frozenset[str]:
-        """All keys with an action, arrow keys included."""
-        return frozenset().union(*(equivalent_keys(binding, self.bindings) for binding in self.bindings))
-
-    def action(self, held: Iterable[str], step: int) -> np.ndarray:
-        """Returns the action in the space's shape and dtype; ``step`` has no effect.
-
-        >>> keys = bind(gym.spaces.Box(-1, 1, (2,)), {"w": [1, 0], "a": [0, -1], "d": [0, 1]})
-        >>> keys.action(["up", "left"], step=0).tolist(), keys.action(["w", "a", "d"], step=0).tolist()
-        ([1.0, -1.0], [1.0, 0.0])
-        """
-        rest = np.array(self.rest)
-        total = rest.copy()
-        for binding in _active(_canonical(held, self.bindings), self.bindings):
-            total += np.array(binding.action) - rest
-        shaped = total.reshape(self.space.shape)
-        return np.clip(shaped, self.space.low, self.space.high).astype(self.space.dtype)
-
-
-KeyMap = DiscreteKeys | BoxKeys
 
 
 def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[Any, str]] = ()) -> KeyMap:
@@ -142,10 +119,10 @@ def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[An
     bindings = tuple(by_keys.values())
     if isinstance(space, gym.spaces.Box):
         rest = _resting(space) if NONE not in actions else _box(space, NONE, actions[NONE])
-        return BoxKeys(bindings, rest, space)
+        return KeyMap(space, bindings, rest)
     idle = actions.get(NONE, WAIT)
     turns = [] if idle == WAIT else idle if isinstance(idle, list | tuple) else [idle]
-    return DiscreteKeys(bindings, tuple(_discrete(space, NONE, action) for action in turns))
+    return KeyMap(space, bindings, tuple(_discrete(space, NONE, action) for action in turns))
 
 
 def default_actions(space: gym.Space) -> dict[str, Any]:

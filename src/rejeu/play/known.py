@@ -18,7 +18,7 @@ SHORT_NAMES = {"car": "CarRacing-v3", "mountain": "MountainCar-v0", "lunar": "Lu
 
 KNOWN: dict[str, dict[str, tuple[Any, str]]] = {
     env_id: {key: tuple(entry) for key, entry in entries.items()}
-    for env_id, entries in tomllib.loads((resources.files("rejeu.play") / "keys.toml").read_text("utf-8")).items()
+    for env_id, entries in tomllib.loads((resources.files(__package__) / "keys.toml").read_text("utf-8")).items()
 }
 """Actions and descriptions of the keys, by id."""
 KNOWN |= {f"jax/{env_id}": KNOWN[env_id] for env_id in [*KNOWN] if env_id.startswith(("Cart", "Mountain", "Pendulum"))}

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from rejeu.envs.rendering import environment_variable
 from rejeu.envs.validation import id_of
 from rejeu.errors import MissingExtra
 from rejeu.reporting.formatting import counted
@@ -123,7 +121,7 @@ class Recording:
 
     def _create(self, buffer: Any) -> Any:
         described = None if self._description.spec is None else self._description
-        with minari_path(self.folder), warnings.catch_warnings():
+        with environment_variable("MINARI_DATASETS_PATH", str(self.folder)), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # for example about the missing author
             return self._minari.create_dataset_from_buffers(
                 self.dataset_id,
@@ -154,17 +152,3 @@ def spec_of(env: gym.Env) -> EnvSpec | None:
     except (ValueError, TypeError):
         return None
     return spec
-
-
-@contextmanager
-def minari_path(folder: Path) -> Iterator[None]:
-    """Sets Minari's dataset path to a folder, and restores it at the end."""
-    before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["MINARI_DATASETS_PATH"]
-        else:
-            os.environ["MINARI_DATASETS_PATH"] = before

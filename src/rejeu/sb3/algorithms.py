@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rejeu import agents
 from rejeu.sb3.common.utils import of_progress
+
+if TYPE_CHECKING:
+    from rejeu.agents import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
+
+__all__ = ["A2C", "DDPG", "DQN", "PPO", "QRDQN", "SAC", "TD3", "TQC", "CrossQ", "MaskablePPO", "RecurrentPPO"]
 
 SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "critic_learning_rate", "beta")
 """The hyperparameters that can be schedules."""
@@ -20,70 +25,13 @@ def converted(settings: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-class A2C(agents.A2C):
-    """:class:`rejeu.A2C`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class DDPG(agents.DDPG):
-    """:class:`rejeu.DDPG`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
+def with_remaining_progress(kind: Any) -> Any:
+    """Returns the subclass of an agent whose schedules that are functions take the remaining progress."""
+    doc = f":class:`rejeu.{kind.__name__}`; functions given as schedules take the remaining progress."
+    attributes = {"__module__": __name__, "__doc__": doc, "converted": staticmethod(converted)}
+    return type(kind)(kind.__name__, (kind,), attributes)
 
 
-class DQN(agents.DQN):
-    """:class:`rejeu.DQN`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class PPO(agents.PPO):
-    """:class:`rejeu.PPO`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class QRDQN(agents.QRDQN):
-    """:class:`rejeu.QRDQN`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class SAC(agents.SAC):
-    """:class:`rejeu.SAC`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class TD3(agents.TD3):
-    """:class:`rejeu.TD3`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class TQC(agents.TQC):
-    """:class:`rejeu.TQC`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class CrossQ(agents.CrossQ):
-    """:class:`rejeu.CrossQ`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class MaskablePPO(agents.MaskablePPO):
-    """:class:`rejeu.MaskablePPO`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-class RecurrentPPO(agents.RecurrentPPO):
-    """:class:`rejeu.RecurrentPPO`; functions given as schedules take the remaining progress."""
-
-    converted = staticmethod(converted)
-
-
-__all__ = ["A2C", "DDPG", "DQN", "PPO", "QRDQN", "SAC", "TD3", "TQC", "CrossQ", "MaskablePPO", "RecurrentPPO"]
+if not TYPE_CHECKING:
+    for name in __all__:
+        globals()[name] = with_remaining_progress(getattr(agents, name))

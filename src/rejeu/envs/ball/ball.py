@@ -14,6 +14,7 @@ from gymnasium import spaces
 
 from rejeu.envs.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL, BallDrawing
 from rejeu.envs.canvas import Scene
+from rejeu.validation import number
 
 if TYPE_CHECKING:
     from rejeu.reporting.plots.picture import Picture
@@ -79,12 +80,10 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
     def __init__(self, dimension: int = 2, sigma: float = 1.0, render_mode: str | None = None) -> None:
         if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
             raise ValueError(f"dimension={dimension!r} must be a whole number of at least 1")
-        if isinstance(sigma, bool) or not isinstance(sigma, int | float) or not 0 <= sigma < math.inf:
-            raise ValueError(f"sigma={sigma!r} must be a finite number of at least 0")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} must be None, 'human' or 'rgb_array'")
         self.dimension = dimension
-        self.sigma = float(sigma)
+        self.sigma = number("sigma", sigma, least=0)
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-WALL, WALL, (dimension,), np.float32)
         self.action_space = spaces.Box(-MAX_PUSH, MAX_PUSH, (dimension,), np.float32)

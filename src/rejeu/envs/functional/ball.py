@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,7 +13,7 @@ from jax import Array
 
 from rejeu.envs.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.validation import whole
+from rejeu.validation import number, whole
 
 
 class State(NamedTuple):
@@ -44,8 +43,7 @@ class Ball(FunctionalEnv):
 
     def __check_init__(self) -> None:
         whole("dimension", self.dimension, least=1)
-        if not 0 <= self.sigma < math.inf:
-            raise ValueError(f"sigma={self.sigma!r} must be a finite number of at least 0")
+        number("sigma", self.sigma, least=0)
 
     @property
     def observation_space(self) -> spaces.Box:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
+import jax
 import numpy as np
 
 from rejeu.envs.canvas import Drawing, Scene
@@ -66,9 +67,10 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         self._scene = Scene([], None, True)
         goals = self._vector.goals()
         if goals is not None:
-            self.compute_reward = _of_goals(goals.reward)
-            if goals.terminated is not None:
-                self.compute_terminated = _of_goals(goals.terminated)
+            reward, judge = goals
+            self.compute_reward = lambda achieved_goal, desired_goal, info: reward(achieved_goal, desired_goal)
+            if judge is not None:
+                self.compute_terminated = lambda achieved_goal, desired_goal, info: judge(achieved_goal, desired_goal)
 
     @property
     def max_episode_steps(self) -> int | None:
@@ -160,13 +162,4 @@ class GymnasiumEnv(gym.Env[Any, Any]):
 
 def _first(obs: Any) -> Any:
     """Returns the observation of the only environment of a vector."""
-    return {key: _first(part) for key, part in obs.items()} if isinstance(obs, dict) else np.array(obs[0])
-
-
-def _of_goals(function: Any) -> Any:
-    """Returns a goal function with the signature of Gymnasium's goal environments."""
-
-    def call(achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        return function(achieved_goal, desired_goal)
-
-    return call
+    return jax.tree.map(lambda part: np.array(part[0]), obs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,39 +28,50 @@ class State(NamedTuple):
     """``int32 ()``."""
 
 
-class MountainCar(FunctionalEnv):
-    """A car whose engine is too weak must reach the top of a hill (Moore 1990), as Gymnasium's ``MountainCar-v0``.
+class Hill(FunctionalEnv):
+    """A car whose engine is too weak must reach the top of a hill (Moore 1990). Abstract."""
 
-    The reward is -1 per step.
+    goal_position: eqx.AbstractClassVar[float]
+    """Position from which on the car is at the goal."""
+    goal_velocity: eqx.AbstractVar[float]
+    """Velocity that the car must have at the goal."""
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        low, high = [MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]
+        return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
+
+    def reset(self, key: Array) -> tuple[State, Array]:
+        position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)
+        state = State(position, jnp.zeros(()), jnp.zeros((), jnp.int32))
+        return state, observe(state)
+
+    def success(self, state: State) -> Array:
+        return (state.position >= self.goal_position) & (state.velocity >= self.goal_velocity)
+
+
+class MountainCar(Hill):
+    """A car must reach the top of a hill, as Gymnasium's ``MountainCar-v0``. The reward is -1 per step.
 
     Args:
         goal_velocity: velocity that the car must have at the goal.
     """
 
+    goal_position: ClassVar[float] = 0.5
     goal_velocity: float = eqx.field(static=True, default=0.0)
     max_episode_steps: int | None = eqx.field(static=True, default=200)
-
-    @property
-    def observation_space(self) -> spaces.Box:
-        return observation_space()
 
     @property
     def action_space(self) -> spaces.Discrete:
         return spaces.Discrete(3)
 
-    def reset(self, key: Array) -> tuple[State, Array]:
-        return start(key)
-
     def step(self, key: Array, state: State, action: Array) -> tuple[State, Array, Array, Array, Array]:
         after = drive(state, 0.001 * (action - 1))
-        terminated = (after.position >= 0.5) & (after.velocity >= self.goal_velocity)
-        return after, observe(after), -jnp.ones(()), terminated, time_is_up(after.time, self.max_episode_steps)
-
-    def success(self, state: State) -> Array:
-        return (state.position >= 0.5) & (state.velocity >= self.goal_velocity)
+        truncated = time_is_up(after.time, self.max_episode_steps)
+        return after, observe(after), -jnp.ones(()), self.success(after), truncated
 
 
-class MountainCarContinuous(FunctionalEnv):
+class MountainCarContinuous(Hill):
     """MountainCar with continuous actions, as Gymnasium's ``MountainCarContinuous-v0``.
 
     The reward is 100 at the goal, minus a tenth of the squared action in every step.
@@ -69,41 +80,19 @@ class MountainCarContinuous(FunctionalEnv):
         goal_velocity: velocity that the car must have at the goal.
     """
 
+    goal_position: ClassVar[float] = 0.45
     goal_velocity: float = eqx.field(static=True, default=0.0)
     max_episode_steps: int | None = eqx.field(static=True, default=999)
-
-    @property
-    def observation_space(self) -> spaces.Box:
-        return observation_space()
 
     @property
     def action_space(self) -> spaces.Box:
         return spaces.Box(-1.0, 1.0, (1,), np.float32)
 
-    def reset(self, key: Array) -> tuple[State, Array]:
-        return start(key)
-
     def step(self, key: Array, state: State, action: Array) -> tuple[State, Array, Array, Array, Array]:
         after = drive(state, 0.0015 * jnp.clip(action[0], -1.0, 1.0))
-        terminated = (after.position >= 0.45) & (after.velocity >= self.goal_velocity)
+        terminated = self.success(after)
         reward = jnp.where(terminated, 100.0, 0.0) - 0.1 * action[0] ** 2
         return after, observe(after), reward, terminated, time_is_up(after.time, self.max_episode_steps)
-
-    def success(self, state: State) -> Array:
-        return (state.position >= 0.45) & (state.velocity >= self.goal_velocity)
-
-
-def observation_space() -> spaces.Box:
-    """Returns the space of position and velocity."""
-    low, high = [MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]
-    return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
-
-
-def start(key: Array) -> tuple[State, Array]:
-    """Returns the state and the observation at the start of an episode."""
-    position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)
-    state = State(position, jnp.zeros(()), jnp.zeros((), jnp.int32))
-    return state, observe(state)
 
 
 def observe(state: State) -> Array:

@@ -11,13 +11,11 @@ import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import gymnasium as gym
-
 if TYPE_CHECKING:
     from rejeu.envs.canvas import Drawing
     from rejeu.envs.functional.protocol import FunctionalEnv
 
-OWN = "rejeu.envs.functional"
+OWN = __name__.rpartition(".")[0]
 MakeDrawing = Callable[["FunctionalEnv", str], "Drawing"]
 """Returns the drawing of an environment for a render mode, ``"rgb_array"`` or ``"human"``."""
 
@@ -50,48 +48,6 @@ REGISTRY: dict[str, Entry] = {
     "jax/Parking-v0": Entry(f"{OWN}.parking:Parking", 500, None, f"{OWN}.drawing:ParkingLot"),
 }
 """The environments by id."""
-
-
-def register(
-    env_id: str,
-    kind: Callable[..., FunctionalEnv],
-    *,
-    max_episode_steps: int | None = None,
-    reward_threshold: float | None = None,
-    drawing: MakeDrawing | None = None,
-) -> None:
-    """Registers an environment under an id, also with Gymnasium.
-
-    Args:
-        env_id: begins with ``jax/`` and ends with a version, such as ``jax/Walk-v0``.
-        kind: the class, or a function that returns an environment; called with the arguments of :func:`make`.
-        max_episode_steps: the time limit with default arguments. ``kind`` must then have this argument.
-        reward_threshold: the return at which it counts as solved, None if there is none.
-        drawing: a function that returns its drawing, given the environment and the render mode; None if it has none.
-
-    Raises:
-        ValueError: if the id does not begin with ``jax/``, or belongs to another environment.
-    """
-    if not env_id.startswith("jax/"):
-        raise ValueError(f"env_id={env_id!r} must begin with 'jax/', such as jax/Walk-v0")
-    entry = Entry(kind, max_episode_steps, reward_threshold, drawing)
-    if REGISTRY.get(env_id, entry) != entry:
-        raise ValueError(f"{env_id} is registered already; choose another name or version")
-    REGISTRY[env_id] = entry
-    register_with_gymnasium()
-
-
-def register_with_gymnasium() -> None:
-    """Registers with Gymnasium what is not registered yet."""
-    for env_id, entry in REGISTRY.items():
-        if env_id not in gym.registry:
-            gym.register(
-                env_id,
-                f"{OWN}.gym_env:GymnasiumEnv",
-                max_episode_steps=entry.max_episode_steps,
-                reward_threshold=entry.reward_threshold,
-                kwargs={"env": env_id},
-            )
 
 
 def is_functional(env_id: object) -> bool:

@@ -45,7 +45,7 @@ def check(env: FunctionalEnv) -> None:
     values = _traced(said, env.step, key, state, action)
     after, obs, reward, *flags = _unpack(values, said, ("state", "obs", "reward", "terminated", "truncated"))
     _check_obs(said, env.observation_space, obs)
-    _check_state(said, state, after)
+    _check_tree(said, "state", after, state, "as from reset")
     _check_array(said, "reward", reward, (), "f")
     for what, flag in zip(("terminated", "truncated"), flags, strict=True):
         _check_array(said, what, flag, (), "b")
@@ -94,39 +94,27 @@ def _unpack(answer: Any, said: str, names: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 def _check_obs(said: str, space: spaces.Space, obs: Any) -> None:
-    """Compares an observation with its space, but accepts 64-bit floats, which occur with ``jax_enable_x64``."""
-    _check_structure(said, "observation", obs, structure(space), "as in observation_space")
-    for leaf, array in zip(leaves(space), jax.tree.leaves(obs), strict=True):
-        where = f" under {leaf.path!r}" if leaf.path else ""
-        if array.shape != leaf.shape:
-            raise BadEnvironmentError(
-                f"{said} returned an observation{where} of shape {array.shape}, expected {leaf.shape} as in observation_space"
-            )
-        if narrow(array.dtype) != leaf.dtype or array.dtype == bool:
-            raise BadEnvironmentError(
-                f"{said} returned an observation{where} of dtype {array.dtype}, expected {leaf.dtype}: "
-                f"use .astype({leaf.dtype!r}), or declare the other dtype in observation_space"
-            )
+    """Compares an observation with its space, but accepts 64-bit numbers, which occur with ``jax_enable_x64``."""
+    declared = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves(space)]
+    narrowed = jax.tree.map(lambda a: a if a.dtype == bool else jax.ShapeDtypeStruct(a.shape, narrow(a.dtype)), obs)
+    expected = jax.tree.unflatten(structure(space), declared)
+    _check_tree(said, "observation", narrowed, expected, "as in observation_space")
 
 
-def _check_state(said: str, before: Any, after: Any) -> None:
-    _check_structure(said, "state", after, jax.tree.structure(before), "as from reset")
-    pairs = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
-    for (path, old), new in pairs:
-        if (old.shape, old.dtype) != (new.shape, new.dtype):
-            raise BadEnvironmentError(
-                f"{said} changed state{jax.tree_util.keystr(path)} from {_shown(old)} in reset to {_shown(new)}; shapes and "
-                "dtypes must stay the same"
-            )
-
-
-def _check_structure(said: str, what: str, tree: Any, expected: Any, source: str) -> None:
-    """Compares the structures of trees, in which every array is an asterisk."""
-    seen = jax.tree.structure(tree)
-    if seen != expected:
-        texts = [str(one).removeprefix("PyTreeDef(").removesuffix(")") for one in (seen, expected)]
+def _check_tree(said: str, what: str, found: Any, expected: Any, source: str) -> None:
+    """Compares the structures of trees, in which every array is an asterisk, and the shapes and dtypes of their arrays."""
+    structures: list[Any] = [jax.tree.structure(tree) for tree in (found, expected)]
+    if structures[0] != structures[1]:
+        texts = [str(one).removeprefix("PyTreeDef(").removesuffix(")") for one in structures]
         got, wanted = ("one array" if text == "*" else text[:200] for text in texts)
         raise BadEnvironmentError(f"{said} returned the {what} {got}, expected {wanted} {source}")
+    pairs = zip(jax.tree_util.tree_leaves_with_path(expected), jax.tree.leaves(found), strict=True)
+    for (path, one), other in pairs:
+        if (one.shape, one.dtype) != (other.shape, other.dtype):
+            raise BadEnvironmentError(
+                f"{said} returned the {what}{jax.tree_util.keystr(path)} as {_shown(other)}, expected {_shown(one)} "
+                f"{source}: index it, or convert it with .astype"
+            )
 
 
 def _check_array(said: str, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:

@@ -14,6 +14,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from rejeu.agents import Agent
@@ -312,18 +313,10 @@ def env_infos(agent: Agent, progress: Progress) -> list[dict[str, Any]]:
     ]
     for i in np.flatnonzero(result.terminated | result.truncated).tolist():
         if progress.last_obs is not None:
-            infos[i].setdefault(TERMINAL_OBSERVATION, _row(progress.last_obs, i))
+            infos[i].setdefault(TERMINAL_OBSERVATION, jax.tree.map(lambda part, i=i: part[i], progress.last_obs))
         if not np.isnan(success := env.success(result, i)):
             infos[i].setdefault("is_success", bool(success))
     for episode in progress.episodes:
         entry = {"r": episode.episode_return, "l": episode.length, "t": episode.seconds}
         infos[episode.env].setdefault("episode", entry)
     return infos
-
-
-def _row(batch: Any, i: int) -> Any:
-    if isinstance(batch, dict):
-        return {key: _row(part, i) for key, part in batch.items()}
-    if isinstance(batch, tuple):
-        return tuple(_row(part, i) for part in batch)
-    return batch[i]

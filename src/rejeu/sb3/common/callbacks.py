@@ -88,15 +88,9 @@ class CheckpointCallback(BaseCallback):
 
     def _write(self, save: Callable[[Path], Any], kind: str) -> None:
         """Saves one file, or warns. It is not written later: the next one has another name."""
-        path = self._path(kind)
-        if self.model.failed_writes.attempt(str(path), lambda: save(path), retry=False):
-            self._report(path)
-
-    def _path(self, kind: str) -> Path:
-        return self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{SUFFIX}"
-
-    def _report(self, path: Path) -> None:
-        if self.verbose >= 2:
+        path = self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{SUFFIX}"
+        is_saved = self.model.failed_writes.attempt(str(path), lambda: save(path), retry=False)
+        if is_saved and self.verbose >= 2:
             print(f"Saved {path}")
 
 

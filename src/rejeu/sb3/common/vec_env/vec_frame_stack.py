@@ -52,13 +52,7 @@ class VecFrameStack(VecEnvWrapper):
         self._stack: dict[str, np.ndarray] = {}
 
     def reset(self) -> Any:
-        obs = by_key(self.venv.reset())
-        for key, newest in obs.items():
-            width = newest.shape[self._axes[key] + 1]
-            shape = list(newest.shape)
-            shape[self._axes[key] + 1] = width * self.n_stack
-            self._stack[key] = np.zeros(shape, newest.dtype)
-            self._put(key, slice(None), newest)
+        self._stack = {key: self._begun(key, newest) for key, newest in by_key(self.venv.reset()).items()}
         return self._stacked()
 
     def step_wait(self) -> StepResult:
@@ -68,30 +62,23 @@ class VecFrameStack(VecEnvWrapper):
         final: dict[int, dict[str, np.ndarray]] = {i: {} for i in last}
         for key, newest in by_key(obs).items():
             axis = self._axes[key] + 1
-            width = newest.shape[axis]
-            older = _cut(self._stack[key], axis, width, None)
+            _, older = np.split(self._stack[key], [newest.shape[axis]], axis)
             for i in last:
                 final[i][key] = np.concatenate([older[i], last[i][key]], axis=axis - 1)
             self._stack[key] = np.concatenate([older, newest], axis=axis)
-            for i in ended:
-                self._stack[key][i] = 0
-                self._put(key, slice(i, i + 1), newest[i : i + 1])
+            self._stack[key][ended] = self._begun(key, newest[ended])
         for i, parts in final.items():
             infos[i][TERMINAL_OBSERVATION] = parts.get("", parts)
         return self._stacked(), rewards, dones, infos
 
-    def _put(self, key: str, rows: slice, newest: np.ndarray) -> None:
-        axis = self._axes[key] + 1
-        _cut(self._stack[key][rows], axis, -newest.shape[axis], None)[...] = newest
+    def _begun(self, key: str, newest: np.ndarray) -> np.ndarray:
+        """Returns the stacks of first observations ``(n, ...)``."""
+        missing = [np.zeros_like(newest)] * (self.n_stack - 1)
+        return np.concatenate([*missing, newest], axis=self._axes[key] + 1)
 
     def _stacked(self) -> Any:
         copies = {key: stack.copy() for key, stack in self._stack.items()}
         return copies.get("", copies)
-
-
-def _cut(array: np.ndarray, axis: int, start: int, stop: int | None) -> np.ndarray:
-    """Returns a view of ``array[..., start:stop, ...]`` along one axis."""
-    return array[(slice(None),) * axis + (slice(start, stop),)]
 
 
 def _stack_axis(space: spaces.Box, order: str | None) -> int:

@@ -6,6 +6,7 @@ agents' option ``normalize=True`` (:mod:`rejeu.normalization`), which keeps the 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     StepResult,
     VecEnv,
     VecEnvWrapper,
+    by_key,
     unwrap_vec_wrapper,
 )
 
@@ -114,24 +116,22 @@ class VecNormalize(VecEnvWrapper):
 
     def _init_observations(self, space: spaces.Space) -> None:
         """Creates the moments of the observations and the space of the normalized observations."""
-        if isinstance(space, spaces.Dict):
-            keys = list(space.spaces) if self.norm_obs_keys is None else self.norm_obs_keys
-            self.norm_obs_keys = keys
-            for key in keys:
-                if key not in space.spaces:
-                    raise ValueError(
-                        f"norm_obs_keys contains {key!r}, but the observations have the keys {', '.join(space.spaces)}"
-                    )
-                _check_box(space[key], key)
-            self.obs_rms = {key: RunningMeanStd(shape=space[key].shape or ()) for key in keys}
-            parts = {key: self._box(part) if key in keys else part for key, part in space.spaces.items()}
-            self.observation_space = spaces.Dict(parts)
-            return
-        if self.norm_obs_keys is not None:
+        is_dict = isinstance(space, spaces.Dict)
+        if self.norm_obs_keys is not None and not is_dict:
             raise ValueError(f"norm_obs_keys={self.norm_obs_keys!r} needs Dict observations, got {space}")
-        _check_box(space, None)
-        self.obs_rms = RunningMeanStd(shape=space.shape or ())
-        self.observation_space = self._box(space)
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        keys = list(parts) if self.norm_obs_keys is None else self.norm_obs_keys
+        for key in keys:
+            if key not in parts:
+                raise ValueError(
+                    f"norm_obs_keys contains {key!r}, but the observations have the keys {', '.join(parts)}"
+                )
+            _check_box(parts[key], key)
+        moments = {key: RunningMeanStd(shape=parts[key].shape or ()) for key in keys}
+        normalized = {key: self._box(part) if key in keys else part for key, part in parts.items()}
+        self.norm_obs_keys = keys if is_dict else None
+        self.obs_rms = moments if is_dict else moments[""]
+        self.observation_space = spaces.Dict(normalized) if is_dict else normalized[""]
 
     def _box(self, space: spaces.Space) -> spaces.Box:
         return spaces.Box(-self.clip_obs, self.clip_obs, space.shape, np.float32)
@@ -174,13 +174,9 @@ class VecNormalize(VecEnvWrapper):
         return self.normalize_obs(obs), self.normalize_reward(rewards), dones, infos
 
     def _update(self, obs: Any) -> None:
-        if not (self.training and self.norm_obs):
-            return
-        if isinstance(self.obs_rms, dict):
-            for key, moments in self.obs_rms.items():
-                moments.update(obs[key])
-        else:
-            self.obs_rms.update(obs)
+        if self.training and self.norm_obs:
+            for key, moments in by_key(self.obs_rms).items():
+                moments.update(by_key(obs)[key])
 
     def normalize_obs(self, obs: Any) -> Any:
         """Returns normalized observations; does not update the statistics."""
@@ -203,7 +199,7 @@ class VecNormalize(VecEnvWrapper):
 
     def get_original_obs(self) -> Any:
         """Returns the original observations of the last step or reset."""
-        return _copy(self.old_obs)
+        return copy.deepcopy(self.old_obs)
 
     def get_original_reward(self) -> np.ndarray:
         """Returns the original rewards of the last step."""
@@ -212,9 +208,9 @@ class VecNormalize(VecEnvWrapper):
     def _map(self, obs: Any, function: Any) -> Any:
         if not self.norm_obs:
             return obs
-        if isinstance(self.obs_rms, dict):
-            return {**obs, **{key: function(np.asarray(obs[key]), m) for key, m in self.obs_rms.items()}}
-        return function(np.asarray(obs), self.obs_rms)
+        parts = by_key(obs)
+        mapped = {**parts, **{key: function(np.asarray(parts[key]), m) for key, m in by_key(self.obs_rms).items()}}
+        return mapped.get("", mapped)
 
     def _scale(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
         z = (obs - moments.mean) / np.sqrt(moments.var + self.epsilon)
@@ -301,7 +297,7 @@ def sync_envs_normalization(env: VecEnv, eval_env: VecEnv) -> None:
                 f"{type(eval_env).__name__}; wrap both in the same way, the other with training=False"
             )
         if isinstance(env, VecNormalize) and isinstance(eval_env, VecNormalize):
-            eval_env.obs_rms, eval_env.ret_rms = _copy(env.obs_rms), env.ret_rms.copy()
+            eval_env.obs_rms, eval_env.ret_rms = copy.deepcopy(env.obs_rms), env.ret_rms.copy()
         env, eval_env = env.venv, eval_env.venv
 
 
@@ -326,16 +322,10 @@ def _written(key: str, value: float) -> float | bool | None:
     return None if value == math.inf else float(value)
 
 
-def _check_box(space: spaces.Space, key: str | None) -> None:
+def _check_box(space: spaces.Space, key: str) -> None:
     if not isinstance(space, spaces.Box):
-        where = "" if key is None else f" under {key!r}"
+        where = f" under {key!r}" if key else ""
         raise ValueError(
             f"VecNormalize normalizes Box observations, got {space}{where}; select others with norm_obs_keys, or set "
             "norm_obs=False"
         )
-
-
-def _copy(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {key: _copy(part) for key, part in tree.items()}
-    return None if tree is None else tree.copy()
