@@ -50,52 +50,10 @@ SEEDS = {
 AFRESH = {"run": 0.7, "rows": 0.7}
 """Probability that a seed file is mutated instead of an input that increased coverage. Most such inputs are
 rejected, and so are their mutations. For these targets the code that runs after reading is equally important."""
-VALUES = (
-    None,
-    True,
-    False,
-    0,
-    -1,
-    1,
-    2,
-    3,
-    0.5,
-    1e-9,
-    1e300,
-    -1e300,
-    2**31,
-    2**63,
-    2**127,
-    10**15,
-    "",
-    "a",
-    "inf",
-    "-inf",
-)
-VALUES += (
-    [],
-    {},
-    [[]],
-    [1],
-    [0.0],
-    [3, 3],
-    "auto",
-    "normal",
-    "linear",
-    "relu",
-    "simba",
-    "gru",
-    "os.system",
-    "envpool",
-    "CartPole-v1",
-    "rejeu/Ball-v0",
-    {"float": "nan"},
-    {"float": "inf"},
-    {"tuple": []},
-    {"dict": {}},
-    "float64",
-    "HerReplayBuffer",
-)
+VALUES: tuple[Any, ...] = (None, True, False, 0, -1, 1, 2, 3, 0.5, 1e-9, 1e300, -1e300, 2**31, 2**63, 2**127, 10**15)
+VALUES += ([], {}, [[]], [1], [0.0], [3, 3], {"float": "nan"}, {"float": "inf"}, {"tuple": []}, {"dict": {}})
+VALUES += ("", "a", "inf", "-inf", "auto", "normal", "linear", "relu", "simba", "gru", "os.system", "float64")
+VALUES += ("envpool", "CartPole-v1", "rejeu/Ball-v0", "HerReplayBuffer")
 VALUES += ("SAC", "DDPG", "TD3", "TQC", "CrossQ", "DQN", "QRDQN", "PPO", "A2C", "PQN", "RecurrentPPO", "MaskablePPO")
 """Replacements for values of a header, in addition to each other."""
 

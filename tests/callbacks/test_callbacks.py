@@ -89,13 +89,6 @@ def test_evaluate_counts_environment_steps_whatever_the_number_of_environments(n
     assert [step for step, _ in evaluate.results] == {1: [10, 20, 30], 3: [12, 21, 30]}[n_envs]
 
 
-def test_evaluation_leaves_training_as_it_would_have_been():
-    evaluate = Evaluate(lambda: gym.make("Pendulum-v1"), every=50, episodes=1, seed=7)
-    watched, alone = pendulum().learn(450, evaluate), pendulum().learn(450)
-    evaluate.close()
-    np.testing.assert_array_equal(watched.history["return"], alone.history["return"])
-
-
 def test_evaluate_refuses_the_environments_of_training():
     env = gym.make("Pendulum-v1")
     agent = rejeu.SAC("MlpPolicy", env, seed=0, **SMALL)

@@ -26,35 +26,13 @@ def test_environments_are_checked_and_advised_on():
     with pytest.raises(TypeError, match="got str"):
         check_env("CartPole-v1")
 
-    class NoInfo(Tidy):
-        def reset(self, *, seed=None, options=None):
-            return super().reset(seed=seed)[0]
-
-    with pytest.raises(BadEnvironmentError, match=r"reset returned the observation only, expected \(obs, info\)"):
-        check_env(NoInfo(), warn=False)
-
-    class Wild(Tidy):
-        def step(self, action):
-            obs, _, *rest = super().step(action)
-            return obs, float("inf"), *rest
-
-    with pytest.raises(BadEnvironmentError, match="step returned the reward inf, expected one finite number"):
-        check_env(Wild(), warn=False)
-
 
 def test_goal_environments_are_checked_for_what_hindsight_needs():
     class Line(Reach):
         def _observe(self):
             return {key: np.array(value) for key, value in super()._observe().items()}
 
-    class Odd(Line):
-        def step(self, action):
-            obs, reward, *rest = super().step(action)
-            return obs, reward - 1.0, *rest
-
     check_env(Line(), warn=False)
-    with pytest.raises(BadEnvironmentError, match="they must agree"):
-        check_env(Odd(), warn=False)
     half = gym.spaces.Dict({"observation": Walk.observation_space, "desired_goal": Walk.observation_space})
     with pytest.raises(BadEnvironmentError, match="achieved_goal is missing from a Dict with the keys"):
         check_env(Sampled(half), warn=False)

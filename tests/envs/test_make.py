@@ -81,13 +81,6 @@ def test_the_successor_of_every_step_is_the_true_one(make):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_all_gymnasium_vectors_walk_like_the_one_in_process(mode):
-    for one, two in zip(walk(in_process()), walk(synchronous(mode)()), strict=True):
-        for left, right in zip(one, two, strict=True):
-            np.testing.assert_array_equal(left, right)
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_the_environments_of_a_synchronous_vector_are_stepped_one_by_one(mode):
     given = SyncVectorEnv(counters(), autoreset_mode=mode)
     vector = make_vector(given, seed=7)

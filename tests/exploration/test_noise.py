@@ -138,22 +138,6 @@ def test_without_repulsion_the_action_saturates_and_with_it_it_does_not():
     assert saturated[1] < 0.001
 
 
-def test_saturation_lasts_without_repulsion_only():
-    """The longest time that an action stays at its bound, over 100 processes of 5,000 steps."""
-
-    def longest(noise) -> int:
-        at_bound = np.abs(course(noise, 5_000, n_envs=100, policy=0.6)[:, :, 0]) == 1.0
-        runs = np.zeros(100, int)
-        best = 0
-        for row in at_bound:
-            runs = np.where(row, runs + 1, 0)
-            best = max(best, int(runs.max()))
-        return best
-
-    assert longest(OrnsteinUhlenbeckActionNoise([0.0], 0.4)) > 500
-    assert longest(OrnsteinUhlenbeckActionNoise([0.0], 0.4, repulsive=4e-4)) < 50
-
-
 def test_strong_repulsion_pushes_no_further_than_to_the_middle():
     noise = OrnsteinUhlenbeckActionNoise([0.0], 0.0, initial_noise=3.0, repulsive=1.0)
     state, action = noise.perturb(noise.init(1), jnp.ones((1, 1)), jax.random.PRNGKey(0))
@@ -179,14 +163,6 @@ def test_each_environment_has_a_process_of_its_own():
     kicks = np.diff(x, axis=0)
     correlation = np.corrcoef(kicks.T) - np.eye(8)
     assert np.abs(correlation).max() < 5 / np.sqrt(2_000)
-
-
-def test_actions_with_noise_stay_within_their_bounds():
-    exploring = explorer.make(constant(0.9, 2), NormalActionNoise([0.0, 0.0], 1.0))
-    action, _ = exploring.act(
-        exploring.init(None, 500), None, jnp.zeros((500, 1)), jnp.zeros(500, bool), jax.random.PRNGKey(0), CLOCK
-    )
-    assert float(jnp.abs(action).max()) == 1.0
 
 
 def test_arguments_are_those_of_stable_baselines3_in_its_order():

@@ -527,21 +527,6 @@ def test_no_action_is_taken_that_a_bad_update_led_to(overlap, tmp_path):
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
 
 
-@exhaustive
-def test_an_action_that_a_bad_weight_between_wide_layers_led_to_is_explained_by_the_update(monkeypatch, tmp_path):
-    """That weight is found with the loss of the next update, whose report is read after the action was taken."""
-    monkeypatch.setattr(sac, "make", broken_at(lambda s: s.actor.torso.layers[1].weight))
-    env = InProcess([Echo(gym.spaces.Box(-1.0, 1.0, (3,)))], seed=0)
-    agent = rejeu.SAC("MlpPolicy", env, **{**OFF, "policy_kwargs": {"net_arch": [100, 100]}})
-    agent.report_folder = tmp_path
-    poison(agent, 4, 100.0)
-    with pytest.raises(NonFiniteError) as caught:
-        agent.learn(TOTAL)
-    assert caught.value.names == ("actor.torso.layers.1.weight",)
-    assert caught.value.step == 13
-    assert agent.state.n_updates == 4
-
-
 def test_large_finite_observations_are_fine():
     class Large(Sampled):
         def reset(self, **keywords):
