@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rejeu.errors import CheckpointError
@@ -36,6 +36,7 @@ def same(one, two):
     return one == two or (isinstance(one, float) and math.isnan(one) and math.isnan(two))
 
 
+@settings(max_examples=30)
 @given(DATA)
 def test_everything_comes_back_as_what_it_was(value):
     arrays = {}
