@@ -24,6 +24,7 @@ from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.registry import is_functional
+from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt
 from rejeu.loops import nonfinite
@@ -105,7 +106,7 @@ def train_seeds(
         start_device(len(numbers) * len(values))
     agents: list[A] = []
     for one in values:
-        vector = lambda seed: first_envs(env, n_envs, seed)  # noqa: E731
+        vector = lambda seed: make_vector(env, n_envs, seed=seed)  # noqa: E731
         first = kind(policy, vector(numbers[0]), seed=numbers[0], device=device, **fixed, **one)
         if not agents:
             require_memory(first, len(numbers) * len(values))
@@ -144,13 +145,6 @@ def start_device(n_runs: int) -> None:
     n_devices = min(hardware.cores(), n_runs)
     if n_devices > 1:
         xla.start_device(hardware.cores() // n_devices, n_devices)
-
-
-def first_envs(env: Any, n_envs: int, seed: int) -> Any:
-    """Returns the environments of a run."""
-    from rejeu.envs.make import make_vector
-
-    return make_vector(env, n_envs, seed=seed)
 
 
 def is_list_of_numbers(value: Any) -> bool:
@@ -224,7 +218,7 @@ def learn_together(
         ]
         try:
             with Interrupt() as interrupt:
-                turns = chunks.train(
+                turns: Any = chunks.train(
                     [agent.run for agent in agents],
                     first.learner,
                     first.config,
@@ -235,6 +229,7 @@ def learn_together(
                     hyper,
                     devices.local(first.device),
                 )
+                stack.callback(turns.close)  # which copies what is still on the device
                 for chunk in named(turns, differing, first):
                     over = [i for i in active if sessions[i](chunk[i])]
                     active[:] = [i for i in active if i not in over]
@@ -246,10 +241,6 @@ def learn_together(
             which = agents[broken.which]
             values = [f"{name}={getattr(which.config, name):g}" for name in differing]
             raise nonfinite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
-        finally:
-            for agent in agents:
-                agent.run.state = [jax.numpy.array(part) for part in agent.run.state]  # views until now
-                agent.run.carry = jax.tree.map(jax.numpy.array, agent.run.carry)
 
 
 def common_stops(

@@ -24,9 +24,10 @@ from jax import Array
 from rejeu import schedules
 from rejeu.buffers import device_priorities
 from rejeu.buffers.device_priorities import DevicePriorities
+from rejeu.buffers.n_step import look_ahead, replaced, with_new_goals
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
-from rejeu.buffers.strategies import BUILT_IN, STRATEGIES, GoalStrategy, HindsightSteps
+from rejeu.buffers.strategies import BUILT_IN, GoalStrategy, HindsightSteps
 from rejeu.buffers.uniform import bootstrap_discount
 from rejeu.core import PyTree, Transition, copy
 
@@ -257,58 +258,48 @@ class DeviceReplay:
         n = self.n_relabeled
         goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
         goal = ring.obs[self.achieved][goal_rows]
-        return self.relabeled(ring, rows, goal, reward, terminated)._replace(weight=weight), rows
+        return self.batch(ring, rows, goal, reward, terminated)._replace(weight=weight), rows
 
     @property
     def n_relabeled(self) -> int:
         """The number of transitions of a batch that get a new goal: the first of it."""
         return int(self.batch_size * self.n_sampled_goal / (self.n_sampled_goal + 1))
 
-    def batch(self, ring: DeviceRing, rows: DeviceRows) -> Transition:
-        """Returns the transitions of ``rows``; see :class:`rejeu.buffers.uniform.ReplayBuffer`."""
-        obs, action = [store[rows.position] for store in ring.obs], ring.action[rows.position]
-        rewards = None
-        if self.n_steps == 1:
-            steps: Any = 1
-            reward, discount = ring.reward[rows.position], self._discounts(ring.kind[rows.position] == TERMINATED, 1)
-        else:
-            position, valid, terminal = self._window(ring, rows)
-            rewards = jnp.where(valid, ring.reward[position], jnp.float32(0))
-            steps = valid.sum(axis=1)
-            reward, rewards = self._sums(rewards)
-            discount = self._discounts(terminal.any(axis=1), steps)
-        next_obs = [store[self.positions(rows.env, rows.time + steps)] for store in ring.obs]
-        tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
-        return Transition(tree(obs), action, reward, tree(next_obs), discount, None, rewards)
-
-    def relabeled(
-        self, ring: DeviceRing, rows: DeviceRows, goal: Array, reward: GoalFunction, terminated: GoalFunction | None
+    def batch(
+        self,
+        ring: DeviceRing,
+        rows: DeviceRows,
+        goal: Array | None = None,
+        reward: GoalFunction | None = None,
+        terminated: GoalFunction | None = None,
     ) -> Transition:
-        """Returns the transitions of ``rows``, the first of them with new goals ``(n_relabeled, ...)``.
+        """Returns the transitions of ``rows``, the first of them with new goals ``(n_relabeled, ...)``, if there are any.
 
-        See :class:`rejeu.buffers.hindsight.HerReplayBuffer`.
+        See :class:`rejeu.buffers.uniform.ReplayBuffer` and :class:`rejeu.buffers.hindsight.HerReplayBuffer`.
         """
-        n = len(goal)
+        which = slice(0 if goal is None else len(goal))
         obs, action = [store[rows.position] for store in ring.obs], ring.action[rows.position]
-        rewards = None
+        rewards, steps = None, 1
         if self.n_steps == 1:
-            steps: Any = 1
             rewarded, ends = ring.reward[rows.position], ring.kind[rows.position] == TERMINATED
-            if n:
-                reached = ring.obs[self.achieved][self.positions(rows.env[:n], rows.time[:n] + 1)]
-                rewarded = rewarded.at[:n].set(reward(reached, goal).astype(jnp.float32))
-                if terminated is not None:
-                    ends = ends.at[:n].set(terminated(reached, goal).astype(bool))
-            discount = self._discounts(ends, 1)
+            if goal is not None and reward is not None and which.stop:
+                reached = ring.obs[self.achieved][self.positions(rows.env[which], rows.time[which] + 1)]
+                rewarded = replaced(rewarded, which, reward(reached, goal))
+                ends = ends if terminated is None else replaced(ends, which, terminated(reached, goal))
         else:
-            each, valid, terminal = self._relabeled_window(ring, rows, goal, reward, terminated)
-            steps = valid.sum(axis=1)
-            rewarded, rewards = self._sums(each)
-            discount = self._discounts(terminal.any(axis=1), steps)
+            window = look_ahead(jnp, ring, self.positions, rows, self.n_steps)
+            each = ring.reward[window.position]
+            if goal is not None and reward is not None and which.stop:
+                later = rows.time[which, None] + 1 + jnp.arange(self.n_steps)[None]
+                reached = ring.obs[self.achieved][self.positions(rows.env[which, None], later)]
+                each, window = with_new_goals(jnp, each, window, which, reached, goal, reward, terminated)
+            rewarded, rewards = self._sums(jnp.where(window.valid, each, jnp.float32(0)))
+            ends, steps = window.terminal.any(axis=1), window.valid.sum(axis=1)
         next_obs = [store[self.positions(rows.env, rows.time + steps)] for store in ring.obs]
-        for leaves in (obs, next_obs):
-            leaves[self.desired] = leaves[self.desired].at[:n].set(goal)
+        for leaves in (obs, next_obs) if goal is not None else ():
+            leaves[self.desired] = replaced(leaves[self.desired], which, goal)
         tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
+        discount = self._discounts(ends, steps)
         return Transition(tree(obs), action, rewarded, tree(next_obs), discount, None, rewards)
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
@@ -322,49 +313,16 @@ class DeviceReplay:
         last = jnp.minimum(ring.ends[place], ring.head[rows.env])
         numbers = count()
 
-        def achieved(times: Array) -> Array:
-            env = rows.env.reshape(-1, *[1] * (times.ndim - 1))
-            return ring.obs[self.achieved][self.positions(env, times)]
-
         def integers(low: Array, high: Array) -> Array:
             shape = jnp.broadcast_shapes(jnp.shape(low), jnp.shape(high))
             return low + below(jax.random.bits(jax.random.fold_in(key, next(numbers)), shape, jnp.uint32), high - low)
 
-        desired = lambda: ring.obs[self.desired][rows.position]  # noqa: E731
-        choose = STRATEGIES[self.strategy] if isinstance(self.strategy, str) else self.strategy
-        times = choose(HindsightSteps(jnp, rows.time, first, last, achieved, desired, integers))  # type: ignore[misc]
+        goals_at = ring.obs[self.achieved].__getitem__, ring.obs[self.desired].__getitem__
+        steps = HindsightSteps.of(jnp, self.positions, rows.env, (rows.time, first, last), goals_at, integers)
+        times = steps.chosen_by(self.strategy)  # type: ignore[arg-type]
         if self.strategy not in BUILT_IN:
             times = jnp.clip(times.astype(jnp.int32), first, last)
         return self.positions(rows.env, times)
-
-    def _window(self, ring: DeviceRing, rows: DeviceRows) -> tuple[Array, Array, Array]:
-        """Returns the steps that n-step returns sum: positions, which of them count and which are terminal, ``(batch, n)``."""
-        times = rows.time[:, None] + jnp.arange(self.n_steps)[None]
-        position = self.positions(rows.env[:, None], times)
-        kind = ring.kind[position]
-        is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
-        continues = jnp.cumprod(is_step & (kind != TERMINATED), axis=1).astype(bool)
-        valid = is_step.at[:, 1:].set(is_step[:, 1:] & continues[:, :-1])
-        return position, valid, (kind == TERMINATED) & valid
-
-    def _relabeled_window(
-        self, ring: DeviceRing, rows: DeviceRows, goal: Array, reward: GoalFunction, terminated: GoalFunction | None
-    ) -> tuple[Array, Array, Array]:
-        """Returns rewards, which steps count and which are terminal ``(batch, n)``, with the new goals."""
-        n, k = len(goal), self.n_steps
-        position, valid, terminal = self._window(ring, rows)
-        rewards = ring.reward[position]
-        if n:
-            following = self.positions(rows.env[:n, None], rows.time[:n, None] + 1 + jnp.arange(k)[None])
-            reached = ring.obs[self.achieved][following].reshape(n * k, *goal.shape[1:])
-            goals = jnp.repeat(goal, k, axis=0)
-            rewards = rewards.at[:n].set(reward(reached, goals).astype(jnp.float32).reshape(n, k))
-            if terminated is not None:
-                ends = terminated(reached, goals).astype(bool).reshape(n, k) & valid[:n]
-                before = jnp.cumsum(ends, axis=1)[:, :-1] > 0
-                valid = valid.at[:n, 1:].set(valid[:n, 1:] & ~before)
-                terminal = terminal.at[:n].set(ends) & valid
-        return jnp.where(valid, rewards, jnp.float32(0)), valid, terminal
 
     def _sums(self, rewards: Array) -> tuple[Array, Array | None]:
         """Returns the discounted sums of rewards ``(batch, n)``, and the discounted rewards where they are asked for."""

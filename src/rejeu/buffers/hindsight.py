@@ -18,13 +18,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
+from rejeu.buffers.n_step import look_ahead, with_new_goals
 from rejeu.buffers.prioritized import Draw, Priorities
-from rejeu.buffers.ring import TERMINATED, Ring, Rows
+from rejeu.buffers.ring import Ring, Rows
 from rejeu.buffers.strategies import BUILT_IN, STRATEGIES, GoalStrategy, HindsightSteps, name_of, takes_generator
 from rejeu.buffers.uniform import (
     BaseReplayBuffer,
@@ -32,7 +33,6 @@ from rejeu.buffers.uniform import (
     bootstrap_discount,
     discounted,
     discounted_sum,
-    look_ahead,
 )
 from rejeu.core import Transition
 from rejeu.envs.goals import GoalFunctions
@@ -176,17 +176,13 @@ class HerReplayBuffer(BaseReplayBuffer):
             with_generator: Any = strategy
             return ring.index(env, checked(with_generator(rng, time, first, last), first, last))
 
-        def achieved(times: np.ndarray) -> np.ndarray:
-            of = env.reshape(-1, *[1] * (times.ndim - 1))
-            return ring.read_leaf(self.achieved, ring.index(of, times))
-
         def integers(low: np.ndarray, high: np.ndarray) -> np.ndarray:
             u = rng.random(np.broadcast_shapes(np.shape(low), np.shape(high)))
             return low + (u * (high - low)).astype(np.int64)
 
-        desired = lambda: ring.read_leaf(self.desired, ring.index(env, time))  # noqa: E731
-        choose = STRATEGIES[strategy] if isinstance(strategy, str) else strategy
-        times = choose(HindsightSteps(np, time, first, last, achieved, desired, integers))
+        goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
+        steps = HindsightSteps.of(np, ring.index, env, (time, first, last), goals_at, integers)
+        times = steps.chosen_by(strategy)
         return ring.index(env, times if strategy in BUILT_IN else checked(times, first, last))
 
     def _n_step(
@@ -194,19 +190,13 @@ class HerReplayBuffer(BaseReplayBuffer):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns rewards ``(batch, n)``, number of steps and ``terminated``, for the new goals where there are any."""
         ring = self.ring
-        window = look_ahead(ring, rows, self.n_steps)
-        rewards, valid = ring.reward[window.position], window.valid.copy()
-        terminal = (ring.kind[window.position] == TERMINATED) & valid
+        window = look_ahead(np, ring, ring.index, rows, self.n_steps)
         following = ring.index(rows.env[relabeled, None], rows.time[relabeled, None] + 1 + np.arange(self.n_steps))
-        reached = ring.obs[self.achieved][following].reshape(-1, *goal.shape[1:])
-        goals = np.repeat(goal, self.n_steps, axis=0)
-        rewards[relabeled] = self.goals.reward(reached, goals).reshape(-1, self.n_steps)
-        if self.goals.terminated is not None:
-            ends = self.goals.terminated(reached, goals).reshape(-1, self.n_steps) & valid[relabeled]
-            terminal[relabeled] = ends
-            valid[relabeled, 1:] &= ~np.logical_or.accumulate(ends, axis=1)[:, :-1]
-            terminal &= valid
-        return np.where(valid, rewards, np.float32(0.0)), valid.sum(axis=1), terminal.any(axis=1)
+        reached, judges = ring.obs[self.achieved][following], (self.goals.reward, self.goals.terminated)
+        rewards = ring.reward[window.position]
+        rewards, window = with_new_goals(np, rewards, window, relabeled, reached, goal, *judges)
+        rewards = np.where(window.valid, rewards, np.float32(0.0))
+        return rewards, window.valid.sum(axis=1), window.terminal.any(axis=1)
 
 
 @cache

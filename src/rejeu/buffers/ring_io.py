@@ -67,10 +67,15 @@ def check(ring: Ring, found: Mapping[str, Any]) -> None:
     n_envs, used = ring.n_envs, min((*found["kind"].shape, 0, 0)[1], ring.rows)
     expected = {name: ((n_envs, used, *array.shape[1:]), array.dtype) for name, array in own.items()}
     expected |= dict.fromkeys(counters, ((n_envs, used), np.dtype(np.int32)))
+    check_specs(found, expected, "the replay file")
+
+
+def check_specs(found: Mapping[str, Any], expected: Mapping[str, tuple[Any, Any]], where: str) -> None:
+    """Raises ``ValueError`` unless arrays, or their specs, have the shapes and dtypes that a ring has for them."""
     for name, (shape, dtype) in expected.items():
         if found[name].shape != shape or found[name].dtype != dtype:
             raise ValueError(
-                f"{name} in the replay file is {found[name].dtype}{list(found[name].shape)} and this buffer expects "
+                f"{name} in {where} is {found[name].dtype}{list(found[name].shape)} and this buffer expects "
                 f"{dtype}{list(shape)}; it was saved with another environment or buffer_size"
             )
 
@@ -138,12 +143,7 @@ def check_rows(ring: Ring, found: Mapping[str, Any]) -> None:
     expected |= dict.fromkeys(("first", "head"), ((ring.n_envs,), np.dtype(np.int64)))
     if "since_start" in found:
         expected["since_start"] = ((n,), np.dtype(np.int32))
-    for name, (shape, dtype) in expected.items():
-        if found[name].shape != shape or found[name].dtype != dtype:
-            raise ValueError(
-                f"{name} in rows of the replay buffer is {found[name].dtype}{list(found[name].shape)}, expected "
-                f"{dtype}{list(shape)}; it was saved with another environment or buffer_size"
-            )
+    check_specs(found, expected, "rows of the replay buffer")
     if n > ring.rows * ring.n_envs:
         raise ValueError(f"there are {n:,} rows, and the replay buffer has {ring.rows * ring.n_envs:,}")
 

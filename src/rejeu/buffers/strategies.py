@@ -32,6 +32,34 @@ class HindsightSteps:
     integers: Callable[[Any, Any], Any]
     """``integers(low, high)`` returns random whole numbers from ``low`` to ``high - 1``, arrays ``(n,)`` or ``(n, k)``."""
 
+    @classmethod
+    def of(
+        cls,
+        np: Any,
+        index: Callable[[Any, Any], Any],
+        env: Any,
+        times: tuple[Any, Any, Any],
+        goals_at: tuple[Callable[[Any], Any], Callable[[Any], Any]],
+        integers: Callable[[Any, Any], Any],
+    ) -> HindsightSteps:
+        """Returns transitions of the environments ``env`` ``(n,)``.
+
+        Args:
+            np: the module of the arrays.
+            index: returns positions in a ring, given environments and times.
+            env: the environments.
+            times: ``time``, ``first`` and ``last``.
+            goals_at: return the achieved and the desired goals at positions.
+            integers: as above.
+        """
+        achieved_at, desired_at = goals_at
+        achieved = lambda at: achieved_at(index(env.reshape(-1, *[1] * (at.ndim - 1)), at))  # noqa: E731
+        return cls(np, *times, achieved, lambda: desired_at(index(env, times[0])), integers)
+
+    def chosen_by(self, strategy: str | GoalStrategy) -> Any:
+        """Returns the times of the new goals that a strategy, or the one of this name, chooses."""
+        return (STRATEGIES[strategy] if isinstance(strategy, str) else strategy)(self)
+
 
 GoalStrategy = Callable[[HindsightSteps], Any]
 """A goal strategy of your own: ``strategy(steps) -> times``, for the loop of the host and for the program on the device.

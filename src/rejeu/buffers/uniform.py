@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 from rejeu.buffers import ring_io
+from rejeu.buffers.n_step import look_ahead
 from rejeu.buffers.prioritized import Draw, Priorities
-from rejeu.buffers.ring import LAST, TERMINATED, Ring, Rows
+from rejeu.buffers.ring import TERMINATED, Ring, Rows
 from rejeu.core import Transition
 
 
@@ -111,10 +112,10 @@ class ReplayBuffer(BaseReplayBuffer):
         if self.n_steps == 1:
             reward, discount = step["reward"], self.discounts.take(rows.kind)
         else:
-            window = look_ahead(self.ring, rows, self.n_steps)
+            window = look_ahead(np, self.ring, self.ring.index, rows, self.n_steps)
             rewards = np.where(window.valid, self.ring.reward[window.position], np.float32(0.0))
-            reward = discounted_sum(rewards, self.gamma)
-            steps, discount = window.steps, bootstrap_discount(self.gamma, window.steps, window.terminated)
+            reward, steps = discounted_sum(rewards, self.gamma), window.valid.sum(axis=1)
+            discount = bootstrap_discount(self.gamma, steps, window.terminal.any(axis=1))
         _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
         rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
         return batch(self.ring, shape, step, obs, reward, next_obs, discount, weight, rewards), drawn
@@ -137,31 +138,6 @@ def batch(
     if weight is not None:
         return shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
     return shaped
-
-
-class Window(NamedTuple):
-    """The steps that an n-step return sums, by sampled row."""
-
-    position: np.ndarray
-    """Positions in the ring of the n rows from the sampled one on, ``(batch, n)``."""
-    valid: np.ndarray
-    """Which of them belong to the return, ``bool (batch, n)``; the first always does."""
-    steps: np.ndarray
-    """How many do, ``(batch,)``."""
-    terminated: np.ndarray
-    """Whether the last of them entered a terminal state, ``bool (batch,)``."""
-
-
-def look_ahead(ring: Ring, rows: Rows, n: int) -> Window:
-    """Returns the up to ``n`` steps from each row to its episode's end or to the newest step."""
-    times = rows.time[:, None] + np.arange(n)
-    index = ring.index(rows.env[:, None], times)
-    kind = ring.kind[index]
-    is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
-    continues = is_step & (kind != TERMINATED)
-    valid = is_step.copy()
-    valid[:, 1:] &= np.logical_and.accumulate(continues, axis=1)[:, :-1]
-    return Window(index, valid, valid.sum(axis=1), ((kind == TERMINATED) & valid).any(axis=1))
 
 
 def discounted_sum(rewards: np.ndarray, gamma: float) -> np.ndarray:

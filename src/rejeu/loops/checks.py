@@ -21,33 +21,22 @@ VDOT_SIZE = 2**13
 
 
 def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None) -> Step:
-    """Steps the environments, or those that are ``active``, and checks what they return.
+    """Steps the environments, or those that are ``active``, and checks what they return, bounds from time to time.
 
     Where environments do not wait for each other, the result is that of the first ``wait_for``.
 
     Raises:
-        BadEnvironmentError, NonFiniteError, NonFiniteUpdate: as :func:`check_step`.
+        BadEnvironmentError, NonFiniteError, NonFiniteUpdate: as :func:`check_finite`.
     """
     if run.env.wait_for is None:
         step = run.env.step(action, active)
     else:
         run.env.send(action)
         step = run.env.receive()
-    check_step(run, step)
-    return step
-
-
-def check_step(run: Run, step: Step) -> None:
-    """Checks the rewards and observations of a step, and from time to time the bounds of the observations.
-
-    Raises:
-        BadEnvironmentError: if a reward or an observation is NaN or infinite: nothing can be learned from it.
-        NonFiniteError: if the agent's own action was not finite, so that the environment is not to blame.
-        NonFiniteUpdate: if that action came from weights that an update left not finite.
-    """
     check_finite(run, step, run.step)
     if run.step >= run.next_look:
         check_bounds(run, step.obs)
+    return step
 
 
 def is_finite(array: np.ndarray) -> bool:
@@ -60,7 +49,13 @@ def is_finite(array: np.ndarray) -> bool:
 
 
 def check_finite(run: Run, step: Step, taken: int) -> None:
-    """Raises an error if a reward or an observation is NaN or infinite; see :func:`check_step`."""
+    """Checks the rewards and observations of a step after ``taken`` steps.
+
+    Raises:
+        BadEnvironmentError: if a reward or an observation is NaN or infinite: nothing can be learned from it.
+        NonFiniteError: if the agent's own action was not finite, so that the environment is not to blame.
+        NonFiniteUpdate: if that action came from weights that an update left not finite.
+    """
     if not is_finite(step.reward):
         which = int(np.flatnonzero(~np.isfinite(step.reward))[0])
         _check_action(run, taken)

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -59,16 +61,14 @@ class Packing:
         return jax.tree.unflatten(self.structure, leaves)
 
 
-@jax.tree_util.register_pytree_node_class
+@partial(jax.tree_util.register_dataclass, data_fields=("vector",), meta_fields=("names",))
+@dataclass(frozen=True, eq=False)
 class Readings(Mapping[str, Array]):
-    """The metrics of an update: named scalars in one vector on the device. Reading one waits for it.
+    """The metrics of an update: named scalars in one vector on the device. Reading one waits for it."""
 
-    The last element of the vector has no name: the number of gradient steps that left NaN or infinity.
-    """
-
-    def __init__(self, names: tuple[str, ...], vector: Array) -> None:
-        self.names = names
-        self.vector = vector
+    names: tuple[str, ...]
+    vector: Array
+    """Its last element has no name: the number of gradient steps that left NaN or infinity."""
 
     @classmethod
     def of(cls, scalars: Mapping[str, Array], n_bad: Array | int = 0) -> Readings:
@@ -90,10 +90,3 @@ class Readings(Mapping[str, Array]):
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def tree_flatten(self) -> tuple[tuple[Array], tuple[str, ...]]:
-        return (self.vector,), self.names
-
-    @classmethod
-    def tree_unflatten(cls, names: tuple[str, ...], children: tuple[Array]) -> Readings:
-        return cls(names, *children)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rejeu.algorithms.config import OffPolicyConfig
@@ -94,6 +95,7 @@ def train(
     finally:
         for run in runs:
             run.copy_replay()
+            run.state, run.carry = jax.tree.map(jnp.array, (run.state, run.carry))  # views of arrays of all runs
 
 
 def take_chunks(

@@ -15,16 +15,13 @@ import numpy as np
 from jax import Array
 
 from rejeu.algorithms.rollout_config import RolloutConfig
-from rejeu.core import Clock, PyTree, Rollout
+from rejeu.core import Clock, Rollout
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.loops.device.program import Carry, Limits, Loop, Program, step_envs
 from rejeu.loops.device.trainer import DeviceTrainer, capacity_of
 from rejeu.loops.on_policy import begin_episodes
 from rejeu.loops.run import Run
 from rejeu.prng import nth
-
-FIELDS = ("action", "reward", "discount", "ended", "valid", "running_return")
-"""Arrays of a rollout buffer that have the same names on the device."""
 
 
 class Counts(NamedTuple):
@@ -36,28 +33,11 @@ class Counts(NamedTuple):
     """Turns of the current rollout, ``int32[]``."""
 
 
-class Steps(NamedTuple):
-    """The rollout: its steps ``(n_steps, n_envs, ...)``, and how it began. The fields are those of ``RolloutBuffer``."""
-
-    obs: PyTree
-    next_obs: PyTree
-    action: Array
-    reward: Array
-    discount: Array
-    ended: Array
-    valid: Array
-    running_return: Array
-    started: Array
-    """``bool (n_envs,)``."""
-    carry: PyTree
-    """The state of a recurrent policy before the first step."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyProgram(Program):
     """Turns that fill a rollout, and updates on all of it."""
 
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: Steps) -> Rollout:
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout) -> Rollout:
         return rollout_of(experience, jnp.int32(0))
 
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
@@ -94,17 +74,15 @@ def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: 
     loop = step_envs(program, env, loop, action, limits, i)
     result, episodes = loop.result, loop.carry.episodes
     put = lambda stores, values: jax.tree.map(lambda s, v: s.at[t].set(v.astype(s.dtype)), stores, values)  # noqa: E731
-    steps = Steps(
-        put(steps.obs, before.obs),
-        put(steps.next_obs, result.obs),
-        put(steps.action, action),
-        put(steps.reward, result.reward),
-        put(steps.discount, jnp.where(result.terminated, 0.0, config.gamma)),
-        put(steps.ended, episodes.ended),
-        put(steps.valid, result.kept),
-        put(steps.running_return, episodes.running_return),
-        steps.started,
-        steps.carry,
+    steps = steps._replace(
+        obs=put(steps.obs, before.obs),
+        next_obs=put(steps.next_obs, result.obs),
+        action=put(steps.action, action),
+        reward=put(steps.reward, result.reward),
+        discount=put(steps.discount, jnp.where(result.terminated, 0.0, config.gamma)),
+        ended=put(steps.ended, episodes.ended),
+        valid=put(steps.valid, result.kept),
+        running_return=put(steps.running_return, episodes.running_return),
     )
     counts = Counts(counts.step + jnp.sum(result.kept, dtype=jnp.uint32), t + 1)
     return loop._replace(carry=loop.carry._replace(explorer=explorer, counts=counts), experience=steps)
@@ -119,21 +97,9 @@ def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
     return loop._replace(carry=carry._replace(counts=counts), experience=steps, learned=learned)
 
 
-def rollout_of(steps: Steps, length: Any) -> Rollout:
+def rollout_of(steps: Rollout, length: Any) -> Rollout:
     """Returns the first ``length`` steps as the update takes them."""
-    valid = steps.valid & (jnp.arange(len(steps.valid)) < length)[:, None]
-    return Rollout(
-        steps.obs,
-        steps.action,
-        steps.reward,
-        steps.next_obs,
-        steps.discount,
-        steps.ended,
-        valid,
-        steps.running_return,
-        steps.started,
-        steps.carry,
-    )
+    return steps._replace(valid=steps.valid & (jnp.arange(len(steps.valid)) < length)[:, None])
 
 
 class OnPolicyTrainer(DeviceTrainer):
@@ -162,36 +128,29 @@ class OnPolicyTrainer(DeviceTrainer):
     def carry_of(self, run: Run, progress: float) -> Carry:
         return self.common_carry(run, Counts(jnp.uint32(run.step), jnp.int32(run.replay.length)), None)
 
-    def uploaded(self, run: Run) -> Steps:
-        buffer = run.replay
-        tree = lambda stores: jax.tree.unflatten(buffer.obs_structure, [jnp.array(x) for x in stores])  # noqa: E731
-        return Steps(
-            tree(buffer.obs),
-            tree(buffer.next_obs),
-            **{name: jnp.array(getattr(buffer, name)) for name in FIELDS},
-            started=jnp.array(buffer.started),
-            carry=jax.tree.map(jnp.array, run.carry if buffer.carry == () else buffer.carry),
-        )
+    def uploaded(self, run: Run) -> Rollout:
+        steps: Any = jax.tree.map(jnp.array, run.replay.rollout())
+        return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
 
-    def saved(self, experience: Steps, n_turns: int) -> Steps:
+    def saved(self, experience: Rollout, n_turns: int) -> Rollout:
         return experience  # which is not donated
 
-    def put_back(self, experience: Steps, saved: Steps) -> Steps:
+    def put_back(self, experience: Rollout, saved: Rollout) -> Rollout:
         return saved
 
-    def download(self, run: Run, experience: Steps, counts: Counts) -> None:
+    def download(self, run: Run, experience: Rollout, counts: Counts) -> None:
         buffer, n = run.buffer, int(counts.length)
         buffer.length = n
-        if n:
-            pairs = [(getattr(buffer, name), getattr(experience, name)) for name in FIELDS]
-            for stores, values in ((buffer.obs, experience.obs), (buffer.next_obs, experience.next_obs)):
-                pairs += zip(stores, jax.tree.leaves(values), strict=True)
-            for host, device in pairs:
-                host[:n] = np.asarray(device)[:n]
         buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
+        if n:
+            own, found = (
+                jax.tree.leaves(one._replace(started=None, carry=None)) for one in (buffer.rollout(), experience)
+            )
+            for host, device in zip(own, found, strict=True):
+                host[:n] = np.asarray(device)[:n]
 
     def pull_counts(self, run: Run, carry: Carry) -> None:
         """Does nothing: the length of the rollout is copied with it."""
 
-    def bad_batch(self, carry: Carry, experience: Steps, clock: Clock, number: int) -> Rollout:
+    def bad_batch(self, carry: Carry, experience: Rollout, clock: Clock, number: int) -> Rollout:
         return rollout_of(experience, carry.counts.length)
