@@ -57,12 +57,7 @@ def check_finite(run: Run, step: Step, taken: int) -> None:
         NonFiniteUpdate: if that action came from weights that an update left not finite.
     """
     if not is_finite(step.reward):
-        which = int(np.flatnonzero(~np.isfinite(step.reward))[0])
-        _check_action(run, taken)
-        raise BadEnvironmentError(
-            f"{run.env.env_id} returned the reward {step.reward[which]} in environment {which} after {taken} steps; rewards "
-            "must be finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformReward"
-        )
+        raise _reward_error(run, step.reward, taken)
     check_obs(run, step.obs, taken, "returned")
 
 
@@ -81,16 +76,7 @@ def check_obs(run: Run, obs: PyTree, taken: int, what: str) -> None:
     """Raises ``BadEnvironmentError`` if an observation ``(n_envs, ...)`` is NaN or infinite; see :func:`check_finite`."""
     for i, array in enumerate(jax.tree.leaves(obs)):
         if not is_finite(array):
-            _check_action(run, taken)
-            where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
-            path = leaves(run.env.observation_space)[i].path
-            at = ", ".join(map(str, where[1:]))
-            raise BadEnvironmentError(
-                f"{run.env.env_id}: {what} an observation with {array[where]}{f' at [{at}]' if at else ''}"
-                f"{f' of {path!r}' if path else ''} in environment {where[0]} after {taken} steps; observations must be "
-                "finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformObservation and "
-                "np.nan_to_num"
-            )
+            raise _observation_error(run, i, array, taken, what)
 
 
 def check_bounds(run: Run, obs: PyTree) -> None:
@@ -110,6 +96,26 @@ def check_bounds(run: Run, obs: PyTree) -> None:
         )
 
 
+def _reward_error(run: Run, reward: np.ndarray, taken: int) -> Exception:
+    _check_action(run, taken)
+    which = int(np.flatnonzero(~np.isfinite(reward))[0])
+    return BadEnvironmentError(
+        f"{run.env.env_id} returned the reward {reward[which]} in environment {which} after {taken} steps; rewards must be "
+        "finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformReward"
+    )
+
+
+def _observation_error(run: Run, leaf: int, array: np.ndarray, taken: int, what: str) -> Exception:
+    _check_action(run, taken)
+    where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+    path, at = leaves(run.env.observation_space)[leaf].path, ", ".join(map(str, where[1:]))
+    return BadEnvironmentError(
+        f"{run.env.env_id}: {what} an observation with {array[where]}{f' at [{at}]' if at else ''}"
+        f"{f' of {path!r}' if path else ''} in environment {where[0]} after {taken} steps; observations must be finite "
+        "numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformObservation and np.nan_to_num"
+    )
+
+
 def _check_action(run: Run, taken: int) -> None:
     if run.action is not None and not is_finite(run.action):
         run.monitor.read()
@@ -127,11 +133,15 @@ def _check_action(run: Run, taken: int) -> None:
 def check_state(run: Run, learner: Learner) -> None:
     """Raises ``NonFiniteError`` if the state is not finite when training begins; waits for the device."""
     if bad := learner.bad_leaves(run.state):
-        more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
-        raise NonFiniteError(
-            f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
-            f"{run.n_updates}); set_parameters or a file put them there: give it finite numbers, or load another model",
-            names=[text.split(" ")[0] for text in bad],
-            step=run.step,
-            n_updates=run.n_updates,
-        )
+        raise _state_error(run, bad)
+
+
+def _state_error(run: Run, bad: list[str]) -> Exception:
+    more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
+    return NonFiniteError(
+        f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
+        f"{run.n_updates}); set_parameters or a file put them there: give it finite numbers, or load another model",
+        names=[text.split(" ")[0] for text in bad],
+        step=run.step,
+        n_updates=run.n_updates,
+    )
