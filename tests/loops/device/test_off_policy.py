@@ -11,6 +11,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
+from rejeu.loops.device.trainer import DeviceTrainer
 from tests.jax_environments import Reach
 from tests.loops.device.same_draws import use_same_draws
 from tests.sharing import shared_learners
@@ -203,3 +204,40 @@ def test_priorities_continue_from_the_loop_of_the_host_and_back() -> None:
         assert np.count_nonzero(priorities.state()["values"]) == agent.replay_buffer.size()
         assert sum(len(draw.position) for draw, _ in agent.run.td_errors) == 4 * 8
     assert len({*priorities.state()["values"]}) > 60
+
+
+def test_a_chunk_that_is_interrupted_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The replay buffer, which is full, is as the last chunk left it, and training continues from there."""
+    interrupted, other = (make(rejeu.SAC, "jax/Pendulum-v1", 2) for _ in range(2))
+    finish = DeviceTrainer.finish
+
+    def fails_once(trainer: DeviceTrainer, group: int) -> None:
+        if trainer.runs[0].step >= 300:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        finish(trainer, group)
+
+    monkeypatch.setattr(DeviceTrainer, "finish", fails_once)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted.learn(600)
+    taken = interrupted.num_timesteps
+    assert 300 <= taken < 600
+    interrupted.learn(600 - taken, reset_num_timesteps=False)
+    assert_same_runs(interrupted, other.learn(600), 0)
+
+
+def test_steps_are_copied_to_the_host_when_they_are_read() -> None:
+    sizes: list[int] = []
+
+    def look(agent: Any, progress: Any) -> None:
+        copied = agent.run.fetch is None
+        if progress.step >= 100:
+            sizes.append(agent.replay_buffer.size())
+            assert sizes[-1] == progress.step
+            assert agent.run.fetch is None
+        assert not copied
+
+    agent = make(rejeu.SAC, "jax/Pendulum-v1").learn(150, look)
+    assert agent.stops is not None
+    assert sizes
+    assert sizes[-1] == 150

@@ -185,7 +185,7 @@ class DeviceTrainer(ABC):
             for group in (self.groups[g] for g in busy):
                 self.start(group, limits)
             for g in busy:
-                self._finish(g)
+                self.finish(g)
         except BaseException:  # such as KeyboardInterrupt: the runs are still before the chunk
             self.undo()
             raise
@@ -199,7 +199,7 @@ class DeviceTrainer(ABC):
         group.carry, group.experience, group.report = chunk(group.carry, limits, group.experience)
         group.before = before
 
-    def _finish(self, g: int) -> None:
+    def finish(self, g: int) -> None:
         """Waits for the chunk of a group, and copies what it did to the host, apart from experience."""
         group = self.groups[g]
         carry, counts = group.carry, copies(group.carry.counts)
