@@ -19,6 +19,11 @@ from rejeu.loops import nonfinite
 from rejeu.loops.packing import PackedState, Packing, Readings
 from rejeu.prng import nth
 
+NO_TD_ERROR = (
+    "prioritized replay needs the absolute TD error of each transition: return it from update among the metrics, as TD_ERROR "
+    "of shape (batch,); it returned {}"
+)
+
 
 class Learner:
     """The pure functions of an algorithm, compiled. Holds no state: every function takes it, packed into a few vectors.
@@ -142,10 +147,7 @@ def td_error_of(metrics: Metrics, batches: Transition | Rollout) -> Array | None
         return None
     td_error = metrics.get(TD_ERROR)
     if td_error is None or td_error.shape != batches.reward.shape:
-        raise ValueError(
-            "prioritized replay needs the absolute TD error of each transition: return it from update among the metrics, "
-            f"as TD_ERROR of shape (batch,); it returned {'none' if td_error is None else td_error.shape}"
-        )
+        raise ValueError(NO_TD_ERROR.format("none" if td_error is None else td_error.shape))
     return td_error
 
 

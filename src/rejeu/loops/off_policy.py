@@ -63,32 +63,33 @@ def off_policy(
             begin_episodes(run)
         if run.action is None:
             run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)), None))
-        with timer("env"):
-            action = scale(run.action)
-            step = checked_step(run, action)
-        with timer("replay"):
-            n_kept, episodes = store(run, learner, config, step, last)
-        with timer("env"):
-            last_obs = begin_where_ended(run, step)
-        with timer("replay"):
-            if last_obs is not None:
-                run.replay.begin(run.obs, np.flatnonzero(run.ended))
-            observe(run, learner, step.which)
-            done = progress(run.step - first)
-            clock = clock_of(run, done)
-            n_updates = due(run, config, n_kept, len(episodes))
-        with timer("update"):
-            chosen = choose(run, learner, config, clock, step.which) if config.overlap else None
-        with timer("replay"):
-            shapes = batch_shapes(n_updates, config, env.wait_for or env.n_envs)
-            samples = [run.replay.draw(run.rng, shape, done) for shape in shapes]
-        with timer("update"):
-            n_unread = len(run.monitor)
-            update(run, learner, samples, clock)
-            if chosen is None:
-                chosen, n_unread = choose(run, learner, config, clock, step.which), len(run.monitor)
-            run.action = merged(run.action, np.asarray(chosen), step.which)
-            run.monitor.read(n_unread)  # those are done, since the actions came after them
+        timer.lap()
+        action = scale(run.action)
+        step = checked_step(run, action)
+        timer.lap("env")
+        n_kept, episodes = store(run, learner, config, step, last)
+        timer.lap("replay")
+        last_obs = begin_where_ended(run, step)
+        timer.lap("env")
+        if last_obs is not None:
+            run.replay.begin(run.obs, np.flatnonzero(run.ended))
+        observe(run, learner, step.which)
+        done = progress(run.step - first)
+        clock = clock_of(run, done)
+        n_updates = due(run, config, n_kept, len(episodes))
+        timer.lap("replay")
+        chosen = choose(run, learner, config, clock, step.which) if config.overlap else None
+        timer.lap("update")
+        shapes = batch_shapes(n_updates, config, env.wait_for or env.n_envs)
+        samples = [run.replay.draw(run.rng, shape, done) for shape in shapes]
+        timer.lap("replay")
+        n_unread = len(run.monitor)
+        update(run, learner, samples, clock)
+        if chosen is None:
+            chosen, n_unread = choose(run, learner, config, clock, step.which), len(run.monitor)
+        run.action = merged(run.action, np.asarray(chosen), step.which)
+        run.monitor.read(n_unread)  # those are done, since the actions came after them
+        timer.lap("update")
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, n_kept, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 

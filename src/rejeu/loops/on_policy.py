@@ -52,27 +52,28 @@ def on_policy(
     while last is None or run.step < last:
         if run.obs is None or (env.must_reset and not rollout.length):
             begin_episodes(run, config)
-        with timer("update"):
-            clock = clock_of(run, progress(run.step - first))
-            chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
-            run.action = np.asarray(chosen)
-            run.monitor.read()  # before the rollout of the last update is overwritten
-            rollout.observe(run.obs)
-        with timer("env"):
-            stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
-            action = scale(run.action)
-            step = checked_step(run, action, stepped)
-        with timer("replay"):
-            episodes = store(run, config, step, stepped, last)
-            is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
-            is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
-        with timer("env"):
-            last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
-            run.obs = next_obs(run, step, config, is_done)
-        with timer("update"):
-            if is_done:
-                update(run, learner, config, clock_of(run, progress(run.step - first)))
-                begin(run, config)
+        timer.lap()
+        clock = clock_of(run, progress(run.step - first))
+        chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+        run.action = np.asarray(chosen)
+        run.monitor.read()  # before the rollout of the last update is overwritten
+        rollout.observe(run.obs)
+        timer.lap("update")
+        stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
+        action = scale(run.action)
+        step = checked_step(run, action, stepped)
+        timer.lap("env")
+        episodes = store(run, config, step, stepped, last)
+        is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
+        is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
+        timer.lap("replay")
+        last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
+        run.obs = next_obs(run, step, config, is_done)
+        timer.lap("env")
+        if is_done:
+            update(run, learner, config, clock_of(run, progress(run.step - first)))
+            begin(run, config)
+        timer.lap("update")
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
 
 

@@ -211,25 +211,13 @@ def initial_run(
 
 
 class Timer:
-    """Adds the wall time of the parts to ``seconds``: ``with timer("env"): ...``, or between calls of :meth:`lap`."""
+    """Adds the wall time of the parts to ``seconds``, each time :meth:`lap` is called."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
         """Continues to count in ``seconds``, which is mutated."""
         self.seconds = seconds
         self._last = time.perf_counter()
         self._began = self._last - seconds["total"]
-        self._part: str | None = None
-
-    def __call__(self, part: str) -> Timer:
-        """Returns a context whose time counts as ``part``."""
-        self._part = part
-        return self
-
-    def __enter__(self) -> None:
-        self.lap()
-
-    def __exit__(self, *error: object) -> None:
-        self.lap(self._part)
 
     def lap(self, part: str | None = None) -> None:
         """Adds the time since the last call to ``part``, if one is given, and updates the total."""
