@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import msgspec
 import numpy as np
 from gymnasium import spaces
 
@@ -18,9 +17,9 @@ MAX_NUMBERS = 2**20
 """Upper limit on the numbers and choices of a space in a file, unless the file is large enough to hold networks for more: a
 damaged file must not exhaust the memory."""
 MAX_LEAVES = 1024
-"""Upper limit on the arrays of an observation in a file."""
-MAX_DEPTH = 32
-"""Upper limit on the levels of nesting of a space in a file."""
+"""Upper limit on the parts of a Dict or Tuple in a file."""
+INVALID = (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""Exceptions that an invalid description of a space can cause."""
 
 
 @dataclass(frozen=True)
@@ -331,25 +330,8 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.n
     raise TypeError(f"cannot draw random actions of {space}")
 
 
-def check_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
-    """Checks actions of a file in the range of algorithms, ``(..., action_dim)`` or for Discrete ``(...)``.
-
-    ``owner`` names their source in the message.
-
-    Raises:
-        ValueError: if they are not finite or not in the space; no later code would detect this.
-    """
-    if not np.isfinite(action).all():
-        raise ValueError(f"{owner} has actions that are not finite")
-    if isinstance(space, spaces.Box) or not action.size:
-        return
-    n = space.n if isinstance(space, spaces.Discrete) else getattr(space, "nvec", np.array(2)).ravel()
-    if (action < 0).any() or (action >= n).any():
-        raise ValueError(f"{owner} has actions from {action.min()} to {action.max()}, expected {space}")
-
-
 def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:
-    """Checks actions ``(n, ...)`` of a file in the range of the environment, before an environment gets them.
+    """Checks actions ``(n, ...)`` in the range of the environment.
 
     ``owner`` names their source in the message.
 
@@ -408,103 +390,44 @@ def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
 
     Args:
         description: JSON values.
-        largest: upper limit on the numbers and choices of all its parts together.
+        largest: upper limit on the numbers and choices of each of its parts.
 
     Raises:
         ValueError: if the description is not one that :func:`describe` writes, or is of a larger space.
     """
-    sizes: list[int] = []
-
-    def check(size: int) -> None:
-        sizes.append(size)
-        if sum(sizes) > largest or len(sizes) > MAX_LEAVES:
-            raise ValueError(f"{sum(sizes)} numbers in {len(sizes)} arrays, expected {largest} in {MAX_LEAVES} at most")
-
     try:
-        return _rebuild(description, check)
-    except (
-        AttributeError, LookupError, TypeError, ValueError, AssertionError, ArithmeticError, msgspec.ValidationError
-    ) as error:  # fmt: skip
+        ((kind, body),) = description.items()
+        if kind in ("Dict", "Tuple") and len(body) > MAX_LEAVES:
+            raise ValueError(f"{len(body)} parts, expected {MAX_LEAVES} at most")
+        if kind == "Dict":
+            return spaces.Dict({key: rebuild(part, largest) for key, part in body.items()})
+        if kind == "Tuple":
+            return spaces.Tuple([rebuild(part, largest) for part in body])
+        size = {"Discrete": "n", "MultiDiscrete": "nvec"}.get(kind)
+        numbers = int(np.sum(body[size])) if size else math.prod(body["shape"])
+        if numbers > largest:
+            raise ValueError(f"{numbers} numbers, expected {largest} at most")
+        if kind == "Box" and np.dtype(str(body["dtype"])).kind in "fiu":
+            dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
+            low, high = (np.broadcast_to(_bound(body[end], dtype), shape) for end in ("low", "high"))
+            return spaces.Box(low, high, shape, dtype.type)
+        if kind == "Discrete":
+            return spaces.Discrete(body["n"], start=body["start"])
+        if kind == "MultiDiscrete":
+            return spaces.MultiDiscrete(body["nvec"], start=body["start"])
+        if kind == "MultiBinary":
+            return spaces.MultiBinary(body["shape"])
+        raise ValueError(f"{str(kind)[:40]!r}")
+    except INVALID as error:
         raise ValueError(f"not the description of a space: {error}") from None
-
-
-Size = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
-
-
-class BoxRecord(msgspec.Struct):
-    """The description of a Box."""
-
-    low: Any
-    high: Any
-    shape: list[Size]
-    dtype: Literal["float16", "float32", "float64", "int8", "int16", "int32", "uint8", "uint16", "uint32"]
-
-
-class DiscreteRecord(msgspec.Struct):
-    """The description of a Discrete."""
-
-    n: Size
-    start: int
-
-
-class MultiDiscreteRecord(msgspec.Struct):
-    """The description of a MultiDiscrete; both lists may be nested."""
-
-    nvec: list[Any]
-    start: list[Any]
-
-
-class MultiBinaryRecord(msgspec.Struct):
-    """The description of a MultiBinary."""
-
-    shape: list[Size]
-
-
-def _rebuild(description: Any, check: Callable[[int], None], depth: int = 0) -> spaces.Space:
-    """Returns the space; ``check`` is called with the size of each array before it is made."""
-    ((kind, body),) = description.items()
-    if depth > MAX_DEPTH or len(body) > MAX_LEAVES:
-        raise ValueError(f"nested more than {MAX_DEPTH} deep, or more than {MAX_LEAVES} parts")
-    if kind == "Dict":
-        return spaces.Dict({key: _rebuild(part, check, depth + 1) for key, part in body.items()})
-    if kind == "Tuple":
-        return spaces.Tuple([_rebuild(part, check, depth + 1) for part in body])
-    if kind == "Box":
-        box = msgspec.convert(body, BoxRecord)
-        check(math.prod(box.shape))
-        dtype, shape = np.dtype(box.dtype), tuple(box.shape)
-        low, high = (np.broadcast_to(_bound(bound, dtype), shape) for bound in (box.low, box.high))
-        return spaces.Box(low, high, shape, dtype.type)
-    if kind == "Discrete":
-        discrete = msgspec.convert(body, DiscreteRecord)
-        check(discrete.n)
-        return spaces.Discrete(discrete.n, start=discrete.start)
-    if kind == "MultiDiscrete":
-        several = msgspec.convert(body, MultiDiscreteRecord)
-        check(sum(msgspec.convert(_flat(several.nvec), list[Size])))
-        msgspec.convert(_flat(several.start), list[int])
-        return spaces.MultiDiscrete(several.nvec, start=several.start)
-    if kind == "MultiBinary":
-        binary = msgspec.convert(body, MultiBinaryRecord)
-        check(math.prod(binary.shape))
-        return spaces.MultiBinary(binary.shape)
-    raise ValueError(f"{str(kind)[:40]!r}")
-
-
-def _flat(value: Any) -> list[Any]:
-    return [leaf for part in value for leaf in _flat(part)] if isinstance(value, list) else [value]
 
 
 def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
     """Returns a bound of a Box; 64-bit integers that became 32-bit ones are clipped."""
-    for number in _flat(value):
-        if type(number) not in (int, float) and number not in ("inf", "-inf"):
-            raise ValueError(f"the bound {str(number)[:40]!r}")
     bound = np.asarray(value, np.float64)
     if dtype.kind != "f":
         bound = bound.clip(np.iinfo(dtype).min, np.iinfo(dtype).max)
-    with np.errstate(over="raise", invalid="raise"):
-        return bound.astype(dtype)
+    return bound.astype(dtype)
 
 
 def _bounds(bounds: np.ndarray) -> Any:

@@ -221,8 +221,8 @@ def test_a_file_that_does_not_fit_says_what_differs(trained, tmp_path, change, w
     ("change", "words"),
     [
         (lambda h, a: h["counters"].update(step=10**30), "step"),
-        (lambda h, a: h["rng"].update(state=2**128), r"from 0 to 2\*\*128"),
-        (lambda h, a: h["rng"].update(inc=-1), r"from 0 to 2\*\*128"),
+        (lambda h, a: h["rng"].update(state=2**128), "other.safetensors"),
+        (lambda h, a: h["rng"].update(inc=-1), "other.safetensors"),
         (lambda h, a: h["config"].update(buffer_size=10**18), "buffer_size"),
         (lambda h, a: h["config"]["policy_kwargs"].update(net_arch=[10**9, 10**9]), "other networks|memory"),
     ],

@@ -73,7 +73,6 @@ class OffPolicyAgent(Agent):
                     model_files.check_space(file.header.get(f"{kind}_space"), own, kind)
                 ring_io.check(self.run.replay.ring, file.specs)
                 arrays = file.read()
-            spaces.check_actions(self.action_space, arrays["action"], "the replay file")
             self.run.replay.restore(arrays)
         except CheckpointError:
             raise

@@ -47,14 +47,6 @@ from rejeu.validation import number, whole_seed
 
 A = TypeVar("A", bound=BaseAgent)
 
-MAX_OTHER_BYTES = 2**26
-"""Upper limit on the bytes of history, environments and callbacks in a checkpoint; beyond it they must not be a hole in the
-file."""
-MAX_ZEROS = 64
-"""Upper limit on their size relative to that of the file without its holes."""
-PER_BUFFER = ("heads", "started")
-"""Arrays of a replay buffer and of a rollout with one entry per environment; a run has one of them."""
-
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
     """Returns the agent of the newest complete checkpoint; see :meth:`Agent.resume`."""
@@ -92,10 +84,6 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     path = file.path
     try:
         header = convert(file.header, RunHeader)
-        buffer = checkpoint.within(file.specs, "run.buffer.")
-        counted = " or ".join(str(buffer[name].size) for name in PER_BUFFER if name in buffer)
-        if counted != str(header.n_envs):
-            raise ValueError(f"it is of {header.n_envs} environments, and its replay buffer of {counted or 'none'}")
     except WRONG as error:
         raise refusal(path, error) from error
 
@@ -127,8 +115,6 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         with devices.chosen(agent.device):
             reason = restore(agent, saved, parts, best, path)
         agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
-        if "train_freq" not in changes:
-            check_owed(agent)
         agent.run_id, agent.made_from_id = header.run_id, env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
@@ -148,21 +134,12 @@ def check_specs(agent: BaseAgent, file: checkpoint.Contents) -> None:
 
     Raises:
         CheckpointError: if the best weights are of other networks, or there are arrays that no run has.
-        ValueError: if the other arrays are larger than a run needs, and nearly all of them are a hole in the file.
     """
     if best := checkpoint.within(file.specs, "best."):
         checkpoint.match(agent.learner.shapes, best, file.path)
     for name in file.specs:
         if not name.startswith(("state.", "best.", "run.")):
             raise CheckpointError(f"{file.path} has {checkpoint.shown(name)}, which no checkpoint of a run has")
-    buffer = agent.run.replay
-    if isinstance(buffer, RolloutBuffer):
-        experience = buffer.nbytes
-    else:
-        experience = 0 if buffer.priorities is None else 8 * buffer.ring.rows * buffer.ring.n_envs
-    found = sum(spec.nbytes for spec in checkpoint.within(file.specs, "run.").values())
-    if found > experience + MAX_OTHER_BYTES and found > MAX_ZEROS * file.room:
-        raise ValueError(f"it says that it holds {found:,} bytes of the run, nearly all of them a hole in the file")
 
 
 def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
@@ -178,29 +155,20 @@ def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
 
 def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
     """Returns how a run resumes whose environments were restored."""
-    if header.versions != versions():
-        names = "rejeu, JAX or Optax"
-        return Resumed(
-            agent.run.step,
-            False,
-            f"as it was saved, but by another version of {names}, so results may differ in their last bits",
-        )
-    if header.n_together > 1:
-        return Resumed(
-            agent.run.step,
-            False,
-            f"as it was saved, but alone: it was one of {header.n_together} runs in one program, whose sums are rounded "
-            "otherwise, so results may differ in their last bits",
-        )
     here = xla.threads()
     before = here if header.threads is None else header.threads
-    if before == here:
+    if header.versions != versions():
+        why = "by another version of rejeu, JAX or Optax, so"
+    elif header.n_together > 1:
+        why = f"alone: it was one of {header.n_together} runs in one program, whose sums are rounded otherwise, so"
+    elif before != here:
+        why = (
+            f"JAX computes with {here} threads here and had {before}; resume in a new process, with the environment variable "
+            f"{xla.THREADS}={before} if JAX is used before, or"
+        )
+    else:
         return Resumed(agent.run.step, True, "")
-    return Resumed(
-        agent.run.step, False,
-        f"as it was saved, but JAX computes with {here} threads here and had {before}, so results may differ in their last "
-        f"bits; resume in a new process, with the environment variable {xla.THREADS}={before} if JAX is used before",
-    )  # fmt: skip
+    return Resumed(agent.run.step, False, f"as it was saved, but {why} results may differ in their last bits")
 
 
 def refusal(path: Path, error: BaseException) -> CheckpointError:
@@ -208,17 +176,6 @@ def refusal(path: Path, error: BaseException) -> CheckpointError:
     if isinstance(error, CheckpointError) and str(path.parent) in str(error):
         return error
     return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {brief(error)}")
-
-
-def check_owed(agent: BaseAgent) -> None:
-    """Checks that no more gradient steps are due than are possible with this configuration.
-
-    Raises:
-        ValueError: if more are due, as only a damaged file can say.
-    """
-    frequency = getattr(agent.config, "train_freq", 1)
-    if agent.run.owed >= (frequency if isinstance(frequency, int) else frequency[0]):
-        raise ValueError(f"owed={agent.run.owed} is not below train_freq={frequency!r}")
 
 
 def environment(path: Path, header: RunHeader) -> tuple[str, Backend]:
@@ -256,13 +213,9 @@ def restore(
         metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved.metrics.items()}
         run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
     td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved.td_errors]
-    for part in rows:
-        spaces.check_actions(agent.action_space, part["action"], "a file of rows")
     restore_buffer(run, saved.buffer, rows, carry, begun=saved.envs is not None)
     if saved.buffer.get("priorities") is not None:
         run.td_errors = with_draws(run.replay.priorities, saved.buffer["priorities"]["drawn"], td_errors)
-    if isinstance(run.replay, RolloutBuffer):
-        spaces.check_actions(agent.action_space, saved.buffer["rollout"]["action"], "the rollout")
     reason = saved.reason
     if saved.envs is not None:
         reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
@@ -303,13 +256,10 @@ def restore_best(agent: BaseAgent, saved: SavedBest, arrays: dict[str, np.ndarra
     """Restores the best weights.
 
     Raises:
-        CheckpointError, TypeError: if they are of other networks, or not finite, or the score is not numbers.
+        CheckpointError: if they are of other networks, or not finite.
     """
     packed = agent.learner.pack(checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path))
     checkpoint.require_finite(arrays, path)
-    scores = saved.score if isinstance(saved.score, tuple) else (saved.score,)
-    if not all(isinstance(part, int | float) for part in scores):
-        raise TypeError(f"the best score is {saved.score!r}, expected numbers")
     agent.best = Best(saved.score, saved.by, saved.step, packed)
 
 
@@ -323,20 +273,12 @@ def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
     for key in PER_ENV:
         if len(getattr(run, key)) != n_envs and (key != "playing" or n_episodes is not None):
             raise ValueError(f"{key} is not of {n_envs} environments")
-    if not isinstance(run.replay, RolloutBuffer) and (run.replay.ring.head < 0).any():
-        raise ValueError("the replay buffer does not hold the episodes under way")
-    waiting = None
-    if n_episodes is not None:
-        waiting = run.playing == 0
-        if waiting.all() or not ((run.playing >= 0) & (run.playing <= n_episodes)).all():
-            raise ValueError(f"playing={run.playing} is not between 0 and n_episodes={n_episodes}, or all 0")
+    waiting = None if n_episodes is None else run.playing == 0
     held = run.replay if isinstance(run.replay, RolloutBuffer) else run.replay.ring
     parts = zip(saved.obs or (), held.obs_leaves, strict=True)
     obs = jax.tree.unflatten(
         held.obs_structure, [exactly(part, (n_envs, *leaf.shape), leaf.dtype, "obs") for part, leaf in parts]
     )
-    if not all(is_finite(leaf) for leaf in jax.tree.leaves(obs)):
-        raise ValueError("the observations are not finite")
     try:
         must_reset = run.env.restore(saved.envs, obs)
     except DivergedError as error:
@@ -347,7 +289,6 @@ def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
     if saved.action is not None:
         expected = np.asarray(spaces.random_action(run.env.action_space, n_envs, np.random.default_rng(0)))
         run.action = exactly(saved.action, expected.shape, expected.dtype, "action")
-        spaces.check_actions(run.env.action_space, run.action, "the checkpoint")
     return ""
 
 

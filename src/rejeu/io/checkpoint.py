@@ -10,9 +10,7 @@ checksums on purpose; such a file still executes nothing.
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -38,8 +36,6 @@ HEADER_KEY, CHECKSUM_KEY = "rejeu", "crc32"
 """Names of the header and of its checksum in the file's metadata."""
 CHECKSUMS = "checksums"
 """Name of the arrays' checksums in the header."""
-MAX_EXTENTS = 1000
-"""Upper limit on the parts between holes that are counted; a file with more counts as one without holes."""
 RESERVED = ("schema", "kind", CHECKSUMS)
 
 Header = dict[str, Any]
@@ -108,8 +104,8 @@ class Contents:
 
     @property
     def room(self) -> int:
-        """Bytes that the file holds, without holes where the system reports them."""
-        return _without_holes(self.path)
+        """Bytes of the file."""
+        return self.path.stat().st_size
 
     def read(self, prefix: str = "") -> dict[str, np.ndarray]:
         """Returns the arrays whose names begin with ``prefix``, by their full names.
@@ -207,24 +203,6 @@ def _existing(path: str | Path) -> Path:
     if not path.is_file():
         raise CheckpointError(f"{path} is not a file but a folder or a device; give the path of a file")
     return path
-
-
-def _without_holes(path: Path) -> int:
-    """Returns the size of a file, without holes where the system reports them."""
-    with path.open("rb") as file:
-        handle = file.fileno()
-        size = os.fstat(handle).st_size
-        if not hasattr(os, "SEEK_DATA"):
-            return size
-        total = end = 0
-        try:
-            for _ in range(MAX_EXTENTS):
-                begin = os.lseek(handle, end, os.SEEK_DATA)
-                end = os.lseek(handle, begin, os.SEEK_HOLE)
-                total += end - begin
-            return size
-        except OSError as error:
-            return total if error.errno == errno.ENXIO else size  # no data are left, or holes are not reported
 
 
 @contextlib.contextmanager
