@@ -40,41 +40,52 @@ class Evaluation:
     """How many of the episodes did not end and were cut off after :data:`MOST_STEPS` steps."""
 
     @property
+    def n(self) -> int:
+        """Number of episodes."""
+        return len(self.returns)
+
+    @property
     def mean_return(self) -> float:
-        """Mean return."""
-        return float(np.mean(self.returns))
+        """Mean return, NaN without episodes."""
+        return float(np.mean(self.returns)) if self.n else math.nan
 
     @property
     def std_return(self) -> float:
         """Standard deviation of the returns over episodes (divided by n)."""
-        return float(np.std(self.returns))
+        return float(np.std(self.returns)) if self.n else math.nan
 
     @property
     def mean_length(self) -> float:
         """Mean episode length in steps."""
-        return float(np.mean(self.lengths))
+        return float(np.mean(self.lengths)) if self.n else math.nan
+
+    @property
+    def std_length(self) -> float:
+        """Standard deviation of the episode lengths (divided by n)."""
+        return float(np.std(self.lengths)) if self.n else math.nan
 
     @property
     def return_interval(self) -> tuple[float, float]:
         """95 % confidence interval of the mean return (Student's t), NaN for a single episode."""
-        low, high = statistics.student(self.mean_return, self.std_return, len(self.returns))
+        low, high = statistics.student(self.mean_return, self.std_return, self.n)
         return float(low), float(high)
 
     @property
     def success_rate(self) -> float:
-        """Share of successful episodes, NaN if unknown."""
-        return float(np.mean(self.successes))
+        """Share of successes among the episodes where success is known, NaN if it never is."""
+        known = self.successes[np.isfinite(self.successes)]
+        return float(np.mean(known)) if len(known) else math.nan
 
     @property
     def success_interval(self) -> tuple[float, float]:
         """95 % confidence interval of the success rate (Wilson score), NaN if unknown."""
-        low, high = statistics.wilson(self.success_rate, len(self.successes))
+        low, high = statistics.wilson(self.success_rate, np.sum(np.isfinite(self.successes)) or self.n)
         return float(low), float(high)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the statistics by name, as ``rejeu evaluate --json`` prints them."""
         return {
-            "episodes": len(self.returns),
+            "episodes": self.n,
             "cut": self.cut,
             "mean_return": self.mean_return,
             "std_return": self.std_return,
@@ -102,7 +113,7 @@ class Evaluation:
         interval = "" if math.isnan(low) else f" (95 % CI of the mean {low:.2f} to {high:.2f})"
         text = (
             f"return {self.mean_return:.2f} ± {self.std_return:.2f}{interval}, "
-            f"length {self.mean_length:.1f}, {counted(len(self.returns), 'episode')}"
+            f"length {self.mean_length:.1f}, {counted(self.n, 'episode')}"
         )
         if not math.isnan(self.success_rate):
             low, high = self.success_interval
@@ -121,11 +132,9 @@ class Evaluation:
             rows.append(("success", f"{self.success_rate:.1%}", f"{least:.1%} to {most:.1%}", ""))
         rows += [
             ("return", f"{self.mean_return:,.2f}", interval, f"{self.std_return:,.2f}"),
-            ("length", f"{self.mean_length:,.1f}", "", f"{np.std(self.lengths):,.1f}"),
+            ("length", f"{self.mean_length:,.1f}", "", f"{self.std_length:,.1f}"),
         ]
-        return html_table(
-            [(counted(len(self.returns), "episode"), "mean", "95 % CI of the mean", "standard deviation"), *rows]
-        )
+        return html_table([(counted(self.n, "episode"), "mean", "95 % CI of the mean", "standard deviation"), *rows])
 
 
 def evaluate(

@@ -15,6 +15,7 @@ import numpy as np
 
 from rejeu.io import atomic
 from rejeu.loops.run import Episode
+from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.formatting import counted, html_table
 from rejeu.validation import whole
 
@@ -209,38 +210,6 @@ class EpisodeTable:
         self._n_written = len(history)
 
 
-@dataclass(frozen=True)
-class Averages:
-    """Averages over episodes; NaN if there are none, or if nothing is known."""
-
-    n: int
-    """Number of episodes."""
-    mean_return: float
-    std_return: float
-    """Standard deviation over episodes (divided by n)."""
-    mean_length: float
-    """Mean length in steps."""
-    std_length: float
-    success_rate: float
-    """Share of successes among the episodes where success is known."""
-
-    @classmethod
-    def of(cls, returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray) -> Averages:
-        """Returns the averages of episodes, ``(n,)`` each."""
-        if not len(returns):
-            return cls(0, math.nan, math.nan, math.nan, math.nan, math.nan)
-        known = successes[np.isfinite(successes)]
-        rate = float(known.mean()) if len(known) else math.nan
-        return cls(
-            n=len(returns),
-            mean_return=float(np.mean(returns)),
-            std_return=float(np.std(returns)),
-            mean_length=float(np.mean(lengths)),
-            std_length=float(np.std(lengths)),
-            success_rate=rate,
-        )
-
-
 @dataclass(frozen=True, repr=False)
 class Summary:
     """Summary of a run; ``print`` and notebooks show it as a table."""
@@ -249,10 +218,10 @@ class Summary:
     """Environment steps at the end of the last episode."""
     seconds: float
     """Training time in seconds at the end of the last episode."""
-    all: Averages
-    """Means over all episodes."""
-    last: Averages
-    """Over the last ``window`` episodes, or all if there are fewer."""
+    all: Evaluation
+    """All episodes; see :class:`rejeu.Evaluation`."""
+    last: Evaluation
+    """The last ``window`` episodes, or all if there are fewer."""
     records: int
     """Number of episodes with a higher return than all before them."""
     best: Episode | None
@@ -266,8 +235,8 @@ class Summary:
         return cls(
             steps=int(history["step"][-1]) if len(history) else 0,
             seconds=float(history["seconds"][-1]) if len(history) else 0.0,
-            all=Averages.of(*columns),
-            last=Averages.of(*(column[-window:] for column in columns)),
+            all=Evaluation(*columns),
+            last=Evaluation(*(column[-window:] for column in columns)),
             records=len(records),
             best=records[-1] if records else None,
         )
