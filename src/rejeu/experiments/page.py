@@ -16,8 +16,8 @@ from rejeu.experiments.final import Final
 from rejeu.experiments.study import Outcome, Study, best_of
 from rejeu.io import atomic
 from rejeu.io.records import shown
-from rejeu.reporting import comparison_page
 from rejeu.reporting.charts import GROUP_COLORS, group_chart
+from rejeu.reporting.comparison import table_html
 from rejeu.reporting.formatting import counted, number
 from rejeu.reporting.report import page
 from rejeu.reporting.report.sections import duration
@@ -77,7 +77,7 @@ def render(study: Study, outcomes: Sequence[Outcome], final: Final | None) -> st
         trials=[row(one, space, one is best) for one in outcomes[:MAX_LISTED]],
         verdict="" if final is None else str(final),
         failed=() if final is None else final.failed,
-        table="" if compared is None else comparison_page.table_html(compared),
+        table="" if compared is None else table_html(compared),
         improvements=[] if compared is None else [one.cells for one in compared.improvements],
         definition="" if compared is None else compared.definition,
         journal=study.folder.journal.name,

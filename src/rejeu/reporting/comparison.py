@@ -17,6 +17,7 @@ from rejeu import validation
 from rejeu.io import atomic
 from rejeu.io.records import shown
 from rejeu.reporting import statistics
+from rejeu.reporting.charts import GROUP_COLORS, group_chart
 from rejeu.reporting.formatting import cell, counted, csv_text, markdown_table, number
 from rejeu.reporting.grouping import By, group_labels, settings
 from rejeu.reporting.run_curves import FINAL, N_POINTS, Axis, Curve, Score, cut_to_shortest, scale
@@ -33,6 +34,10 @@ CURVE_SAMPLES = 1000
 BOUNDS = ("value", "low", "high")
 """The rows of a curve: statistic, and bounds of its interval."""
 FORMATS = ("md", "csv", "json", "png", "html")
+MAX_LISTED = 500
+"""Most runs and probabilities that a page lists."""
+Key = tuple[str, str]
+"""Environment and label of a group."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +203,9 @@ class Comparison:
         Raises:
             MissingExtra: if matplotlib is not installed.
         """
-        from rejeu.reporting.plots import comparison
+        from rejeu.reporting.plots import results
 
-        return comparison.plot(self, path)
+        return results.comparison(self, path)
 
     def to_html(self) -> str:
         """Returns a page with interactive curves, which needs no network.
@@ -208,9 +213,7 @@ class Comparison:
         Raises:
             MissingExtra: if plotly or jinja2 is not installed.
         """
-        from rejeu.reporting import comparison_page
-
-        return comparison_page.render(self)
+        return page_of(self)
 
     def save(self, path: str | Path) -> list[Path]:
         """Writes a file in the format of its suffix, or all formats into a folder; returns the paths.
@@ -239,8 +242,6 @@ class Comparison:
         return "\n".join([*lines, self.definition, *(f"note: {one}" for one in self.notes)])
 
     def _repr_html_(self) -> str:
-        from rejeu.reporting.comparison_page import table_html
-
         lines = [self.definition, *(f"note: {one}" for one in self.notes)]
         return table_html(self) + "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
@@ -303,7 +304,21 @@ def compare(
             f"the runs are of {len(envs)} environments; each has rows of its own, because their returns cannot be averaged; "
             "normalize them (--normalize range, or --reference ENV=LOW,HIGH) to average"
         )
-    return summarize(curves, kind, x, score, statistic, normalize is not None, threshold, samples, seed, notes)
+    mixes = normalize is not None and kind != "env"
+    keyed = by_group(curves, mixes)
+    if len({env for env, _ in keyed}) > 1 and mixes:
+        notes.append("the groups are of different environments; only groups of the same environments are compared")
+    rng = np.random.default_rng(seed)
+    finals = {key: strata(members, [one.final() for one in members]) for key, members in keyed.items()}
+    draws = {key: statistics.draw(scores, samples, rng) for key, scores in finals.items()}
+    groups = tuple(
+        make_group(key, keyed[key], finals, draws[key], threshold, statistics.STATISTICS[statistic], mixes)
+        for key in sorted(keyed)
+    )
+    pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
+    improvements = tuple(compared(*pair, finals, draws) for pair in pairs)
+    notes += coverage_notes([min(map(len, group.scores)) for group in groups])
+    return Comparison(groups, improvements, kind, x, score, statistic, threshold, tuple(notes))
 
 
 def comparable(runs: Sequence[Run], axis: Axis, score: Score, notes: list[str]) -> list[Curve]:
@@ -326,11 +341,9 @@ def comparable(runs: Sequence[Run], axis: Axis, score: Score, notes: list[str]) 
 
 def warnings_of(curves: Sequence[Curve]) -> list[str]:
     """Returns notes about groups that mix settings, seeds that occur twice, and runs whose episodes are not known."""
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for one in curves:
-        groups.setdefault((one.label, one.env), []).append(one.run)
     mixed, repeated = [], []
-    for (label, _), runs in groups.items():
+    for (_, label), members in by_group(curves, mixes=False).items():
+        runs = [one.run for one in members]
         named = settings(runs)
         mixed += [label] if len({*named}) > 1 else []
         seeds = Counter((run.seed, setting) for run, setting in zip(runs, named, strict=True) if run.seed is not None)
@@ -351,41 +364,15 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
     return notes
 
 
-def summarize(
-    curves: Sequence[Curve],
-    by: By,
-    axis: Axis,
-    score: Score,
-    statistic: str,
-    mixes: bool,
-    threshold: float | None,
-    samples: int,
-    seed: int,
-    notes: list[str],
-) -> Comparison:
-    """Returns the comparison of prepared curves; ``mixes`` averages over environments."""
+def by_group(curves: Sequence[Curve], mixes: bool) -> dict[Key, list[Curve]]:
+    """Returns the curves of each group by environment and label; with ``mixes`` a group is of several environments."""
     envs: dict[str, set[str]] = {}
     for one in curves:
         envs.setdefault(one.label, set()).add(one.env)
-    mixes = mixes and by != "env"
-    keyed: dict[tuple[str, str], list[Curve]] = {}
+    keyed: dict[Key, list[Curve]] = {}
     for one in curves:
         keyed.setdefault((", ".join(sorted(envs[one.label])) if mixes else one.env, one.label), []).append(one)
-    if len({env for env, _ in keyed}) > 1 and mixes:
-        notes.append("the groups are of different environments; only groups of the same environments are compared")
-    rng = np.random.default_rng(seed)
-    groups = []
-    finals = {key: strata([(one.env, one.final()) for one in members]) for key, members in keyed.items()}
-    draws = {key: statistics.draw(scores, samples, rng) for key, scores in finals.items()}
-    for key in sorted(keyed):
-        peers = [finals[other] for other in keyed if other[0] == key[0]]
-        everything = np.concatenate([one for scores in peers for one in scores])
-        levels = np.linspace(everything.min(), everything.max(), N_LEVELS)
-        groups.append(make_group(key, keyed[key], finals[key], draws[key], levels, threshold, statistic, mixes))
-    pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
-    improvements = [compared(*pair, finals, draws) for pair in pairs]
-    notes += coverage_notes([min(map(len, group.scores)) for group in groups])
-    return Comparison(tuple(groups), tuple(improvements), by, axis, score, statistic, threshold, tuple(notes))
+    return keyed
 
 
 def coverage_notes(n_runs: Sequence[int]) -> list[str]:
@@ -404,34 +391,34 @@ def coverage_notes(n_runs: Sequence[int]) -> list[str]:
     return [*(notes if single else []), *(few if shares else [])]
 
 
-def strata(pairs: Iterable[tuple[str, Any]]) -> tuple[np.ndarray, ...]:
-    """Returns values by environment, one array for each."""
+def strata(members: Sequence[Curve], values: Sequence[Any]) -> tuple[np.ndarray, ...]:
+    """Returns one value of each run as arrays, one for each environment."""
     found: dict[str, list[Any]] = {}
-    for env, value in pairs:
-        found.setdefault(env, []).append(value)
+    for one, value in zip(members, values, strict=True):
+        found.setdefault(one.env, []).append(value)
     return tuple(np.array(found[env]) for env in sorted(found))
 
 
 def make_group(
-    key: tuple[str, str],
+    key: Key,
     members: Sequence[Curve],
-    scores: tuple[np.ndarray, ...],
+    finals: Mapping[Key, tuple[np.ndarray, ...]],
     draws: list[np.ndarray],
-    levels: np.ndarray,
     threshold: float | None,
-    statistic: str,
+    statistic: statistics.Statistic,
     mixed: bool,
 ) -> Group:
-    """Returns a group with its statistics."""
-    function = statistics.STATISTICS[statistic]
+    """Returns a group with its statistics; the levels of its profile are those of all groups of the environment."""
+    scores = finals[key]
+    peers = np.concatenate([one for other in finals if other[0] == key[0] for one in finals[other]])
+    levels = np.linspace(peers.min(), peers.max(), N_LEVELS)
     samples = statistics.resampled(scores, draws)
     points = [one.points() for one in members]
-    curves = strata(list(zip([one.env for one in members], points, strict=True)))
-    grid = np.linspace(0, 1 if mixed else members[0].end, N_POINTS)
+    curves = strata(members, points)
     low, high = statistics.interval(statistics.iqm(samples))
     with np.errstate(invalid="ignore"):  # points before the first episode
-        band = statistics.interval(function(statistics.resampled(curves, [rows[:CURVE_SAMPLES] for rows in draws])))
-        middle = function(curves)
+        band = statistics.interval(statistic(statistics.resampled(curves, [rows[:CURVE_SAMPLES] for rows in draws])))
+        middle = statistic(curves)
     return Group(
         label=key[1],
         env_id=key[0],
@@ -442,7 +429,7 @@ def make_group(
         mean=float(statistics.mean(scores)),
         median=float(statistics.median(scores)),
         curve=np.stack([middle, *band]),
-        x=grid,
+        x=np.linspace(0, 1 if mixed else members[0].end, N_POINTS),
         profile=np.stack([statistics.above(scores, levels), *statistics.interval(statistics.above(samples, levels).T)]),
         levels=levels,
         reached=None if threshold is None else reached(members, points, threshold),
@@ -458,7 +445,7 @@ def reached(members: Sequence[Curve], points: Sequence[np.ndarray], threshold: f
     return int(np.isfinite(times).sum()), float(np.median(times))
 
 
-def compared(one: tuple[str, str], other: tuple[str, str], finals: Any, draws: Any) -> Improvement:
+def compared(one: Key, other: Key, finals: Any, draws: Any) -> Improvement:
     """Returns the probability of improvement of the better of two groups over the other, with its interval."""
     probability = float(statistics.improvement(finals[one], finals[other]))
     if probability < 0.5:
@@ -473,3 +460,60 @@ def write_text(path: Path, content: str) -> Path:
     with atomic.replacing(path) as file:
         file.write(content.encode())
     return path
+
+
+def page_of(comparison: Comparison) -> str:
+    """Returns the page of a comparison.
+
+    Raises:
+        MissingExtra: if plotly or jinja2 is not installed.
+    """
+    from rejeu.reporting.report import page
+
+    envs = list(dict.fromkeys(group.env_id for group in comparison.groups))
+    labels = list(dict.fromkeys(group.label for group in comparison.groups))
+    charts: dict[str, Any] = {}
+    entries: dict[str, list[dict[str, str]]] = {"curve": [], "profile": []}
+    for place, env in enumerate(envs):
+        for kind in entries:
+            key = f"{kind}{place}"
+            charts[key] = group_chart(kind, comparison, env)
+            entries[kind].append({"id": key, "title": env or "unknown environment", "note": ""})
+    names = {"algorithm": "algorithms", "setting": "settings", "env": "environments"}
+    n_runs = sum(len(group.runs) for group in comparison.groups)
+    title = f"Comparison of {len(labels)} {names[comparison.by]}" if len(labels) > 1 else labels[0]
+    return page.render(
+        "compare.html",
+        {"charts": charts, "histograms": {}},
+        title=title,
+        colors=GROUP_COLORS,
+        facts=[counted(n_runs, "run"), *(envs if len(envs) <= 3 else [counted(len(envs), "environment")])],
+        notes=comparison.notes,
+        table=table_html(comparison),
+        definition=f"{comparison.definition.capitalize()}. Intervals are 95 % stratified bootstrap intervals.",
+        curves=entries["curve"],
+        profiles=entries["profile"],
+        improvements=[one.cells for one in comparison.improvements[:MAX_LISTED]],
+        runs=run_rows(comparison)[:MAX_LISTED],
+    )
+
+
+def run_rows(comparison: Comparison) -> list[list[str]]:
+    """Returns one row for each run."""
+    rows = []
+    for group in comparison.groups:
+        for run, score in zip(group.runs, group.run_scores, strict=True):
+            seed = "" if run.seed is None else str(run.seed)
+            rows.append([run.name, group.label, run.env_id, seed, run.state, f"{run.steps:,}", number(score)])
+    return rows
+
+
+def table_html(comparison: Comparison) -> str:
+    """Returns the table of the groups as HTML, everything escaped; needs no other package."""
+    head, *rows = comparison.text_table()
+    lines = [
+        "".join(f"<{tag}{' class=text' * (i < 2)}>{html.escape(one)}</{tag}>" for i, one in enumerate(cells))
+        for tag, cells in [("th", head), *(("td", row) for row in rows)]
+    ]
+    body = "".join(f"<tr>{line}</tr>" for line in lines[1:])
+    return f'<div class="scroll"><table class="numbers"><thead><tr>{lines[0]}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -76,7 +76,7 @@ def read_monitor(path: Path) -> Run:
     steps = np.cumsum(length[order])
     columns = {"env": env, "return": returns, "length": length, "success": success, "seconds": seconds}
     table = ordered(Table({"step": steps, **{name: one[order] for name, one in columns.items()}}, tuple(notes)))
-    episodes = Episodes(*(table.column(name) for name in ("step", "env", "return", "length", "success", "seconds")))
+    episodes = Episodes.of(table)
     folder = path if path.is_dir() else path.parent
     said = named(folder)
     return Run(

@@ -6,13 +6,12 @@ evaluated, and whatever is missing or damaged becomes a note. A folder can be re
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import stat
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -73,6 +72,11 @@ class Episodes:
 
     def __len__(self) -> int:
         return len(self.step)
+
+    @classmethod
+    def of(cls, table: Table) -> Episodes:
+        """Returns the episodes of a table with the columns of ``episodes.csv``."""
+        return cls(*(table.column(name) for name in ("step", "env", "return", "length", "success", "seconds")))
 
 
 NO_EPISODES = Episodes(*[np.zeros(0)] * 6)
@@ -154,7 +158,7 @@ class Run:
         }
         given = {name: value for name, value in values.items() if name not in same}
         minutes = self.config.checkpoint_minutes or 0.0
-        words = dataclasses.replace(self.config, hyperparameters=given, checkpoint_minutes=minutes).words()
+        words = replace(self.config, hyperparameters=given, checkpoint_minutes=minutes).words()
         return " ".join(quoted(shown(word, MAX_WORD)) for word in ["rejeu", *words])
 
 
@@ -182,46 +186,37 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
     metrics = statistics_rows(metrics)
     table = ordered(read_table(folder / EPISODES, columns))
     replays = read_table(files.replays) if is_file(files.replays) else EMPTY
-    names = ("step", "env", "return", "length", "success", "seconds")
-    episodes = Episodes(*(table.column(name) for name in names))
-    for part in (table, metrics, evaluations, replays):
-        notes += part.notes
-    steps = max((int(part.column("step")[-1]) for part in (table, metrics, evaluations) if len(part)), default=0)
-    seconds = [
-        *table.column("seconds")[-1:],
-        *metrics.column("time/time_elapsed")[-1:],
-        *evaluations.column("seconds")[-1:],
-    ]
-    asked = (None, None) if config is None else (config.steps, config.minutes)
-    total = max((one for one in seconds if math.isfinite(one)), default=math.nan)
-    models = tuple(name for name in ("best.safetensors", "agent.safetensors") if is_file(folder / name))
-    return Run(
+    tables = (table, metrics, evaluations)
+    times = (table.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
+    run = Run(
         path=folder,
         name=shown(folder.name, MAX_NAME),
-        algorithm="" if config is None else shown(config.algorithm or "", MAX_NAME),
-        env_id="" if config is None else shown(config.env, MAX_NAME),
-        env_kwargs={} if config is None else config.env_kwargs,
-        seed=None if config is None else config.seed,
-        n_envs=None if config is None else config.n_envs,
-        config=config,
-        hyperparameters={} if config is None else config.hyperparameters,
         versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
-        state=state_of(
-            folder, "agent.safetensors" in models, steps in evaluations.column("step"), steps, total, *asked
-        ),
-        steps=steps,
-        steps_asked=asked[0],
-        minutes_asked=asked[1],
-        seconds=total,
-        episodes=episodes,
+        steps=max((int(part.column("step")[-1]) for part in tables if len(part)), default=0),
+        seconds=max((one[-1] for one in times if len(one) and math.isfinite(one[-1])), default=math.nan),
+        episodes=Episodes.of(table),
         evaluations=evaluations,
         metrics=metrics,
         replays=replays,
         warnings=read_warnings(files.warnings),
         videos=tuple(find_videos(files)),
-        models=models,
-        notes=tuple(notes),
+        models=tuple(name for name in ("best.safetensors", "agent.safetensors") if is_file(folder / name)),
+        notes=(*notes, *(note for part in (*tables, replays) for note in part.notes)),
     )
+    if config is not None:
+        run = replace(
+            run,
+            algorithm=shown(config.algorithm or "", MAX_NAME),
+            env_id=shown(config.env, MAX_NAME),
+            env_kwargs=config.env_kwargs,
+            seed=config.seed,
+            n_envs=config.n_envs,
+            config=config,
+            hyperparameters=config.hyperparameters,
+            steps_asked=config.steps,
+            minutes_asked=config.minutes,
+        )
+    return replace(run, state=state_of(run))
 
 
 def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes = NO_EPISODES) -> Table:
@@ -264,10 +259,7 @@ def statistics_rows(table: Table) -> Table:
 def read_config(path: Path) -> tuple[RunConfig | None, dict[str, str | None], list[str]]:
     """Returns the description of a run, the versions of what ran, and notes; None and none if they are missing or damaged."""
     try:
-        data = read_bytes(path, MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
-        content = parse_json(data)
+        content = parse_json(read_bytes(path, MAX_BYTES))
         if is_deep(content, MAX_DEPTH):
             raise Malformed("it is nested too deeply")
         return parse(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
@@ -296,22 +288,15 @@ def ordered(table: Table) -> Table:
     return Table(columns, notes)
 
 
-def state_of(
-    folder: Path,
-    has_model: bool,
-    is_evaluated: bool,
-    steps: int,
-    seconds: float,
-    steps_asked: int | None,
-    minutes_asked: float | None,
-) -> State:
+def state_of(run: Run) -> State:
     """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
-    locks = [is_locked(path) for path in (folder / "lock", folder / "checkpoints" / "lock") if is_file(path)]
-    if any(locks) or (not locks and not has_model and is_recent(folder)):
+    has_model = "agent.safetensors" in run.models
+    locks = [is_locked(path) for path in (run.path / "lock", run.path / "checkpoints" / "lock") if is_file(path)]
+    if any(locks) or (not locks and not has_model and is_recent(run.path)):
         return "running"
-    reached_steps = steps_asked is not None and steps >= steps_asked
-    reached_minutes = minutes_asked is not None and seconds >= 0.98 * 60 * minutes_asked
-    if has_model and is_evaluated and (reached_steps or reached_minutes):
+    reached_steps = run.steps_asked is not None and run.steps >= run.steps_asked
+    reached_minutes = run.minutes_asked is not None and run.seconds >= 0.98 * 60 * run.minutes_asked
+    if has_model and run.steps in run.evaluations.column("step") and (reached_steps or reached_minutes):
         return "finished"
     return "interrupted" if has_model else "crashed"
 

@@ -3,9 +3,8 @@
 Every function returns a figure, which notebooks display, and writes it to ``path`` if one is given.
 """
 
-from rejeu.reporting.plots.evaluations import evaluation
 from rejeu.reporting.plots.exploration import noise, repulsive_boundary, saturation
-from rejeu.reporting.plots.learning import learning_curve
+from rejeu.reporting.plots.results import evaluation, learning_curve
 from rejeu.reporting.plots.trajectories import trajectory
 
 __all__ = ["evaluation", "learning_curve", "noise", "repulsive_boundary", "saturation", "trajectory"]

@@ -1,0 +1,144 @@
+"""Figures of results: learning curves, evaluations, and comparisons of groups of runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rejeu.reporting import charts
+from rejeu.reporting.plots import drawing
+from rejeu.reporting.runs import Episodes, evaluation_table
+from rejeu.reporting.tables import Table
+from rejeu.validation import whole
+
+if TYPE_CHECKING:
+    from rejeu.reporting.plots.picture import Picture
+
+AXES: dict[str, tuple[str, float, str]] = {
+    "step": ("x", 1.0, "environment steps"),
+    "seconds": ("t", 60.0, "seconds of training"),
+}
+"""For each axis its name in a chart, its factor and its title."""
+RIGHT_MARGIN = 0.02
+"""Share of the horizontal axis beyond the last episode."""
+MAX_PANELS = 12
+"""Most environments in the figure of a comparison."""
+
+
+def learning_curve(
+    history: Any,
+    path: str | Path | None = None,
+    against: str = "step",
+    window: int | None = None,
+    evaluations: Iterable[tuple[int, Any]] = (),
+    title: str = "",
+) -> Picture:
+    """Draws the returns of the episodes, their moving mean, the records and, if known, the success rate below.
+
+    Args:
+        history: ``agent.history``.
+        path: file to write, in the format of its suffix (``.png``, ``.svg``, ``.pdf``); None for none.
+        against: ``"step"`` or ``"seconds"``.
+        window: episodes in the moving mean; None for a fifth of the run, at least 3 and at most 50, or more in a run of more
+            than 20,000 episodes.
+        evaluations: steps and results of evaluations, such as the ``results`` of a callback :class:`rejeu.callbacks.Evaluate`.
+        title: title of the figure, empty for none.
+
+    Raises:
+        MissingExtra: if matplotlib is not installed.
+        ValueError: for another axis, or a ``window`` below 1.
+    """
+    if against not in AXES:
+        raise ValueError(f"against={against!r} must be one of {', '.join(AXES)}")
+    window = None if window is None else whole("window", window, least=1)
+    along, unit, x_title = AXES[against]
+    episodes = Episodes.of(Table(history.to_dict()))
+    table = evaluation_table(evaluations, episodes)
+    empty: charts.Chart = {"y": "return", "series": []}
+    found = [charts.episode_chart(episodes, table, "return", window) or empty]
+    if np.isfinite(episodes.success).any():
+        found.append(charts.episode_chart(episodes, table, "success", window) or empty)
+    rows = history.record_rows
+    if len(rows):
+        records = episodes.step[rows], episodes.seconds[rows] / 60, episodes.returns[rows]
+        found[0]["series"].insert(1, charts.series("marks", "records", "good", *records))
+        found[0]["range"] = charts.widened(found[0]["range"], history.best_return)
+
+    figure = drawing.make_figure("drawing a learning curve", height=6.4 if len(found) > 1 else 4.2)
+    panels = figure.subplots(len(found), sharex=True, squeeze=False, height_ratios=[3, 2][: len(found)])[:, 0]
+    for panel, chart in zip(panels, found, strict=True):
+        drawing.draw(panel, chart, along, unit)
+    last = max((x for series in found[0]["series"] for x in series[along] if x is not None), default=0) * unit
+    panels[-1].set_xlabel(x_title)
+    panels[-1].set_xlim(0, (last or 1.0) * (1 + RIGHT_MARGIN))
+    drawing.add_title_and_legend(panels[0], title)
+    return drawing.save(figure, path)
+
+
+def evaluation(evaluation: Any, path: str | Path | None = None, title: str = "") -> Picture:
+    """Draws the return of every episode, their mean and its 95 % confidence interval.
+
+    Args:
+        evaluation: the :class:`rejeu.Evaluation` that ``agent.evaluate()`` returns. If success is known, successful episodes
+            are green and the others red.
+        path: file to write, in the format of its suffix (``.png``, ``.svg``, ``.pdf``); None for none.
+        title: title of the figure, empty for none.
+
+    Raises:
+        MissingExtra: if matplotlib is not installed.
+    """
+    figure = drawing.make_figure("drawing an evaluation")
+    panel = figure.subplots()
+    returns, successes = evaluation.returns, evaluation.successes
+    numbers = np.arange(1, len(returns) + 1)
+    low, high = evaluation.return_interval
+    if math.isfinite(low):
+        panel.axhspan(low, high, color=drawing.LINE_COLOR, alpha=0.15, linewidth=0, label="95 % CI")
+    panel.axhline(
+        evaluation.mean_return,
+        label=f"mean {drawing.thousands(round(evaluation.mean_return, 2))}",
+        zorder=3,
+        **drawing.LINE,
+    )
+    for chosen, marker, color, label in (
+        (np.isnan(successes), "o", drawing.DOT_COLOR, "episodes"),
+        (successes == 1, "o", drawing.GOOD_COLOR, f"success ({np.sum(successes == 1):,})"),
+        (successes == 0, "X", drawing.BAD_COLOR, f"no success ({np.sum(successes == 0):,})"),
+    ):
+        if chosen.any():
+            size = drawing.dot_size(len(returns))
+            panel.plot(numbers[chosen], returns[chosen], marker, color=color, markersize=size, alpha=0.8, label=label)
+    drawing.steps_axis(panel, len(returns) + 1)
+    panel.set_xlabel("episode")
+    panel.set_ylabel("return")
+    panel.yaxis.set_major_formatter(drawing.thousands)
+    drawing.format_axes(panel)
+    drawing.add_title_and_legend(panel, title)
+    return drawing.save(figure, path)
+
+
+def comparison(comparison: Any, path: str | Path | None = None) -> Picture:
+    """Draws the curves of a :class:`rejeu.reporting.comparison.Comparison`.
+
+    Args:
+        comparison: the comparison.
+        path: file to write, in the format of its suffix; None for none.
+
+    Raises:
+        MissingExtra: if matplotlib is not installed.
+    """
+    envs = list(dict.fromkeys(group.env_id for group in comparison.groups))[:MAX_PANELS]
+    drawn = [charts.group_chart("curve", comparison, env) for env in envs]
+    names = [[series["name"] for series in chart["series"] if series["name"]] for chart in drawn]
+    heights = [3.7 + 0.2 * math.ceil(len(one) / drawing.legend_columns(one)) for one in names]
+    figure = drawing.make_figure("drawing a comparison", height=0.6 + sum(heights))
+    panels = figure.subplots(len(envs), squeeze=False, height_ratios=heights)[:, 0]
+    for panel, env, chart in zip(panels, envs, drawn, strict=True):
+        drawing.draw(panel, chart)
+        panel.set_xlabel(chart["x"])
+        drawing.add_title_and_legend(panel, drawing.literal(env))
+    return drawing.save(figure, path)
