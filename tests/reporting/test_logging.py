@@ -15,7 +15,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Evaluate
-from rejeu.reporting import trackers
+from rejeu.reporting import logging
 from rejeu.reporting.logging import CsvFile, JsonLines, check_logs
 from tests.helpers import small_sac
 
@@ -169,7 +169,7 @@ def learn(monkeypatch, fake, steps=60):
     monkeypatch.setattr(
         rejeu.agents.outputs,
         "guarded",
-        lambda sink, failed, closes=False: trackers.Background(sink, failed, closes),
+        lambda sink, failed, closes=False: logging.RetryingSink(sink, failed, closes, in_background=True),
     )
     agent = small_sac(BALL, log="wandb")
     with warnings.catch_warnings(record=True) as caught:
@@ -189,7 +189,7 @@ def test_a_tracker_gets_the_configuration_and_every_row_and_is_closed(monkeypatc
 
 
 def test_a_tracker_that_fails_does_not_end_training_and_is_warned_of_once_and_at_the_end(monkeypatch):
-    monkeypatch.setattr(trackers, "RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(logging, "RETRY_SECONDS", 0.0)
     agent, said = learn(monkeypatch, Fake(lambda n: True))
     assert agent.num_timesteps == 60
     assert said == [
@@ -199,7 +199,7 @@ def test_a_tracker_that_fails_does_not_end_training_and_is_warned_of_once_and_at
 
 
 def test_rows_that_failed_are_written_later_in_order(monkeypatch):
-    monkeypatch.setattr(trackers, "RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(logging, "RETRY_SECONDS", 0.0)
     fake = Fake(lambda n: n < 4)
     agent, _ = learn(monkeypatch, fake)
     assert fake.rows == sorted(set(agent.history["step"].astype(int).tolist()))
@@ -208,7 +208,7 @@ def test_rows_that_failed_are_written_later_in_order(monkeypatch):
 
 
 def test_a_tracker_that_hangs_delays_neither_training_nor_its_end(monkeypatch):
-    monkeypatch.setattr(trackers, "CLOSE_SECONDS", 0.1)
+    monkeypatch.setattr(logging, "CLOSE_SECONDS", 0.1)
     release = threading.Event()
     fake = Fake(lambda n: not release.wait(30))
     agent, said = learn(monkeypatch, fake)
@@ -218,10 +218,10 @@ def test_a_tracker_that_hangs_delays_neither_training_nor_its_end(monkeypatch):
 
 
 def test_of_too_many_rows_the_newest_wait_and_the_loss_is_reported(monkeypatch):
-    monkeypatch.setattr(trackers, "MAX_ROWS", 3)
+    monkeypatch.setattr(logging, "MAX_ROWS", 3)
     failed, fake, release = rejeu.io.failed_writes.FailedWrites(), Fake(), threading.Event()
     fake.fails = lambda n: not release.wait(30)
-    log = trackers.Background(fake, failed, closes=True)
+    log = logging.RetryingSink(fake, failed, in_background=True)
     with pytest.warns(UserWarning, match="at most 3 can wait"):  # noqa: PT031
         for step in range(10):
             log.write(step, {})

@@ -16,10 +16,9 @@ from rejeu.algorithms import config as configs
 from rejeu.loops.run import time_shares
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.history import COLUMNS
 from rejeu.reporting.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
 from rejeu.reporting.runs import Episodes, Run, evaluation_table
-from rejeu.reporting.trackers import Background
+from rejeu.reporting.tables import Table
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
@@ -31,7 +30,7 @@ LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
 
 def open_outputs(
     agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
-) -> Sequence[RetryingSink | Background]:
+) -> Sequence[RetryingSink]:
     """Returns the outputs for rows of statistics; ``stack`` closes those that are opened here."""
     given, opened = [*sinks, *agent.logger.outputs], list[Sink]()
     if agent.verbose and not agent.logger.outputs:
@@ -41,7 +40,7 @@ def open_outputs(
         opened += [open_log(kind, folder, run_name(agent), tracker_id(agent)) for kind in agent.log]
     outputs = [guarded(one, agent.failed_writes) for one in given]
     for one, output in zip(given, outputs, strict=True):
-        if isinstance(output, Background) and output is not one:
+        if output.in_background and output is not one:
             stack.callback(output.close)
     for one in opened:
         outputs.append(guarded(one, agent.failed_writes, closes=True))
@@ -120,7 +119,7 @@ def record(agent: BaseAgent, path: Path, evaluations: Sequence[tuple[int, Evalua
         state="running" if agent.is_learning else "finished",
         steps=agent.run.step,
         seconds=agent.seconds["total"],
-        episodes=Episodes(*(history[column] for column in COLUMNS)),
+        episodes=Episodes.of(Table(history.to_dict())),
         evaluations=evaluation_table(evaluations),
     )
 

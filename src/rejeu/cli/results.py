@@ -16,7 +16,6 @@ from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
 from rejeu.reporting import plots, report, video
 from rejeu.reporting.logging import RetryingSink
-from rejeu.reporting.trackers import Background
 from rejeu.runs.folder import RunFolder, write_arrivals as write_order
 
 VIDEO_EPISODES = 3
@@ -63,7 +62,7 @@ def plot_curve(agent: Agent, folder: RunFolder, environment: Environment, evalua
 
 
 def record_video(
-    agent: Agent, folder: RunFolder, environment: Environment, seed: int, outputs: Iterable[RetryingSink | Background]
+    agent: Agent, folder: RunFolder, environment: Environment, seed: int, outputs: Iterable[RetryingSink]
 ) -> None:
     """Records a video of the best model and adds it to the outputs, or prints why not."""
     render = environment.rendering

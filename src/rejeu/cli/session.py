@@ -22,7 +22,6 @@ from rejeu.loops.run import Progress
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
-from rejeu.reporting.trackers import Background
 from rejeu.runs.config import DecidedRun
 from rejeu.runs.folder import RunFolder
 from rejeu.runs.values import quoted
@@ -47,7 +46,7 @@ class Learning(NamedTuple):
     evaluate: Evaluate
     callbacks: list[Any]
     """All of them, with ``evaluate``."""
-    outputs: list[RetryingSink | Background]
+    outputs: list[RetryingSink]
     """Of the rows of statistics, and of the video."""
     sinks: list[Sink]
     """The same, and the table of episodes."""
@@ -140,7 +139,7 @@ class Session(NamedTuple):
             return 128 + stop.signal, result
         return (0 if agent.failed_writes.complete else 2), result
 
-    def outputs(self) -> list[RetryingSink | Background]:
+    def outputs(self) -> list[RetryingSink]:
         """Returns the outputs of the rows of statistics."""
         agent, up_to = self.agent, None if self.is_new else self.agent.num_timesteps
         sinks = [
