@@ -299,7 +299,7 @@ def test_a_rollouts_rewards_are_scaled_by_its_own_returns_as_well():
     [
         (3, TypeError, "must be True, False or a dict"),
         ("yes", TypeError, "must be True, False or a dict"),
-        ({"norm_observations": True}, TypeError, "no setting 'norm_observations'; known: norm_obs"),
+        ({"norm_observations": True}, TypeError, "no setting 'norm_observations'; did you mean norm_obs"),
         ({"norm_obs": 1}, TypeError, "norm_obs=1 must be True or False"),
         ({"clip_obs": 0.0}, ValueError, "clip_obs=0.0 must be a finite number, above 0"),
         ({"clip_reward": float("inf")}, ValueError, "clip_reward=inf must be a finite number, above 0"),

@@ -12,58 +12,65 @@ from typing import TYPE_CHECKING, Any
 
 from rejeu import interrupt
 
-interrupt.guard_imports()
-if not interrupt.is_command():  # which imports it when it makes an environment
+if interrupt.is_command():  # which imports them when it makes an environment, and ends with one line until then
+    interrupt.install(lambda number, frame: interrupt.leave(number))
+else:
     importlib.import_module("rejeu.envs")  # registers rejeu's environments
 
 if TYPE_CHECKING:
     from rejeu.agents import (
-        A2C,
-        AGENTS,
-        DDPG,
-        DQN,
-        PPO,
-        PQN,
-        QRDQN,
-        SAC,
-        TD3,
-        TQC,
-        CrossQ,
-        MaskablePPO,
-        OffPolicyAgent,
-        OnPolicyAgent,
-        RecurrentPPO,
-        load,
-        register,
+        A2C as A2C,
+        AGENTS as AGENTS,
+        DDPG as DDPG,
+        DQN as DQN,
+        PPO as PPO,
+        PQN as PQN,
+        QRDQN as QRDQN,
+        SAC as SAC,
+        TD3 as TD3,
+        TQC as TQC,
+        CrossQ as CrossQ,
+        MaskablePPO as MaskablePPO,
+        OffPolicyAgent as OffPolicyAgent,
+        OnPolicyAgent as OnPolicyAgent,
+        RecurrentPPO as RecurrentPPO,
+        load as load,
+        register as register,
     )
-    from rejeu.agents.together import train_seeds
-    from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer
-    from rejeu.buffers.replay_memory import ReplayMemory
-    from rejeu.buffers.uniform import ReplayBuffer
-    from rejeu.core import Algorithm, Clock, Rollout, Transition
-    from rejeu.envs.checker import check_env
-    from rejeu.envs.make import make_vec, make_vector
-    from rejeu.envs.time_limit import TimeLimitTerminates
+    from rejeu.agents.together import train_seeds as train_seeds
+    from rejeu.buffers.hindsight import (
+        GoalSelectionStrategy as GoalSelectionStrategy,
+        HerReplayBuffer as HerReplayBuffer,
+    )
+    from rejeu.buffers.replay_memory import ReplayMemory as ReplayMemory
+    from rejeu.buffers.uniform import ReplayBuffer as ReplayBuffer
+    from rejeu.core import Algorithm as Algorithm, Clock as Clock, Rollout as Rollout, Transition as Transition
+    from rejeu.envs.checker import check_env as check_env
+    from rejeu.envs.make import make_vec as make_vec, make_vector as make_vector
+    from rejeu.envs.time_limit import TimeLimitTerminates as TimeLimitTerminates
     from rejeu.errors import (
-        BadEnvironmentError,
-        CheckpointError,
-        MissingExtra,
-        NonFiniteError,
-        RunInUseError,
-        WorkerError,
+        BadEnvironmentError as BadEnvironmentError,
+        CheckpointError as CheckpointError,
+        MissingExtra as MissingExtra,
+        NonFiniteError as NonFiniteError,
+        RunInUseError as RunInUseError,
+        WorkerError as WorkerError,
     )
-    from rejeu.experiments.sweep import sweep
-    from rejeu.experiments.tune import tune
-    from rejeu.exploration.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-    from rejeu.exploration.parameter_space import ParameterNoise
-    from rejeu.reporting import plots
-    from rejeu.reporting.comparison import compare
-    from rejeu.reporting.evaluation import Evaluation
-    from rejeu.reporting.report import write_report
-    from rejeu.reporting.video import record_video, show_videos
-    from rejeu.sb3.common.evaluation import evaluate_policy
-    from rejeu.sb3.common.monitor import Monitor
-    from rejeu.schedules import Exponential, Linear
+    from rejeu.experiments.sweep import sweep as sweep
+    from rejeu.experiments.tune import tune as tune
+    from rejeu.exploration.noise import (
+        NormalActionNoise as NormalActionNoise,
+        OrnsteinUhlenbeckActionNoise as OrnsteinUhlenbeckActionNoise,
+    )
+    from rejeu.exploration.parameter_space import ParameterNoise as ParameterNoise
+    from rejeu.reporting import plots as plots
+    from rejeu.reporting.comparison import compare as compare
+    from rejeu.reporting.evaluation import Evaluation as Evaluation
+    from rejeu.reporting.report import write_report as write_report
+    from rejeu.reporting.video import record_video as record_video, show_videos as show_videos
+    from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_policy
+    from rejeu.sb3.common.monitor import Monitor as Monitor
+    from rejeu.schedules import Exponential as Exponential, Linear as Linear
 
 __version__ = "0.1.0"
 
@@ -94,59 +101,7 @@ _MODULES = {
 }
 """The public names by the module that defines them."""
 
-__all__ = [
-    "A2C",
-    "AGENTS",
-    "DDPG",
-    "DQN",
-    "PPO",
-    "PQN",
-    "QRDQN",
-    "SAC",
-    "TD3",
-    "TQC",
-    "Algorithm",
-    "BadEnvironmentError",
-    "CheckpointError",
-    "Clock",
-    "CrossQ",
-    "Evaluation",
-    "Exponential",
-    "GoalSelectionStrategy",
-    "HerReplayBuffer",
-    "Linear",
-    "MaskablePPO",
-    "MissingExtra",
-    "Monitor",
-    "NonFiniteError",
-    "NormalActionNoise",
-    "OffPolicyAgent",
-    "OnPolicyAgent",
-    "OrnsteinUhlenbeckActionNoise",
-    "ParameterNoise",
-    "RecurrentPPO",
-    "ReplayBuffer",
-    "ReplayMemory",
-    "Rollout",
-    "RunInUseError",
-    "TimeLimitTerminates",
-    "Transition",
-    "WorkerError",
-    "check_env",
-    "compare",
-    "evaluate_policy",
-    "load",
-    "make_vec",
-    "make_vector",
-    "plots",
-    "record_video",
-    "register",
-    "show_videos",
-    "sweep",
-    "train_seeds",
-    "tune",
-    "write_report",
-]
+__all__ = sorted(" ".join(_MODULES.values()).split())
 
 if not TYPE_CHECKING:  # type checkers find the names above, and report misspelt ones
 

@@ -164,9 +164,3 @@ def is_command() -> bool:
         return sys.orig_argv[-len(sys.argv)].removeprefix("-m") == "rejeu"
     path = Path(sys.argv[0])
     return path.name.lower() in ("rejeu", "rejeu.exe", "rejeu-script.py") or path.parts[-2:] == ("rejeu", "__main__.py")
-
-
-def guard_imports() -> None:
-    """Lets these signals end the command ``rejeu`` with one line while it imports. Otherwise does nothing."""
-    if is_command():
-        install(lambda number, frame: leave(number))

@@ -25,7 +25,7 @@ from jax import Array
 
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, Transition
 from rejeu.spaces import Leaf
-from rejeu.validation import coerce, flag, number
+from rejeu.validation import coerce, flag, nested, number
 
 MAX_COUNT = 2.0**23
 """Maximum count of the moments; from then on older values are forgotten. float32 cannot count beyond 2^24 by ones."""
@@ -59,15 +59,8 @@ def parse(value: Any) -> NormalizationConfig | None:
     """
     if value is None or value is False:
         return None
-    if value is True:
-        return NormalizationConfig()
-    if isinstance(value, NormalizationConfig):
-        return value
-    if isinstance(value, Mapping):
-        known = list(NormalizationConfig.__dataclass_fields__)
-        if unknown := set(value) - set(known):
-            raise TypeError(f"normalize has no setting {sorted(unknown)[0]!r}; known: {', '.join(known)}")
-        return NormalizationConfig(**value)
+    if value is True or isinstance(value, NormalizationConfig | Mapping):
+        return nested("normalize", {} if value is True else value, NormalizationConfig)
     raise TypeError(f"normalize={value!r} must be True, False or a dict such as dict(norm_obs=True, norm_reward=False)")
 
 

@@ -15,12 +15,12 @@ from rejeu.callbacks import (
     Film,
     ProgressBar,
     RecordVideo,
-    better,
-    crossed,
     progress_bar,
     stop_on_return,
     stop_on_success,
 )
+from rejeu.callbacks.base import crossed
+from rejeu.callbacks.evaluate import better
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops.run import Episode, Progress
 from rejeu.reporting.evaluation import Evaluation

@@ -99,6 +99,8 @@ def put_rows(ring: Ring, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
     for rows in parts:
         check_rows(ring, rows)
         first, head = rows["first"], rows["head"]
+        if len(rows["kind"]) != (n := int((head - first + 1).sum())):  # before anything of that size is made
+            raise ValueError(f"rows of the replay buffer are {len(rows['kind'])}, and {n} by their counters")
         spans = [np.arange(first[env], head[env] + 1) for env in range(ring.n_envs)]
         index = np.concatenate([ring.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
         for name, array in own.items():

@@ -106,7 +106,7 @@ def act(
     draw_key, action_key = jax.random.split(key)
     n_envs = ended.shape[0]
     discrete = jnp.issubdtype(jax.eval_shape(algorithm.exploit, actor, obs).dtype, jnp.integer)
-    behavior = preferences if discrete else algorithm.exploit
+    behavior = (lambda actor, obs: actor(obs)) if discrete else algorithm.exploit  # values or logits of all actions
     plain = behavior(actor, obs)
     target = divergence_target(noise.target_distance, plain.shape[-1]) if discrete else noise.target_distance**2
     state = begin_episodes(noise, state, ended | (state.count < 0), target, draw_key)
@@ -173,11 +173,6 @@ def perturbed_leaves(actor: PyTree) -> list[int]:
             positions.append(n)
         n += len(leaves)
     return positions
-
-
-def preferences(actor: PyTree, obs: PyTree) -> Array:
-    """Returns what a network for discrete actions gives for each, ``(batch, n_actions)``: values or logits."""
-    return actor(obs)
 
 
 def squared_distance(plain: Array, varied: Array) -> Array:

@@ -10,22 +10,18 @@ from rejeu.networks.encoder import (
     NATURE,
     SMALL,
     Convolution,
-    Convolutions,
     Encoder,
-    OwnEncoder,
     channels_last,
     convolutions,
-    encode_leaf,
     image_shape,
     make_encoder,
-    n_features,
     reads_image,
 )
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
 from rejeu.networks.network import Network, QNetwork, action_values, values_by_critics
-from rejeu.networks.own import ENCODERS, OwnModule, own_module, register_encoder
+from rejeu.networks.own import ENCODERS, register_encoder
 from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled, split_net_arch
-from rejeu.networks.torsos import Branches, ResidualBlock, SimBa, Torso, joined_width, make_head, make_torso
+from rejeu.networks.torsos import Branches, SimBa, Torso, make_head, make_torso
 
 __all__ = [
     "ACTIVATIONS",
@@ -37,30 +33,22 @@ __all__ = [
     "SMALL",
     "Branches",
     "Convolution",
-    "Convolutions",
     "Encoder",
     "LayerNorm",
     "Linear",
     "Network",
-    "OwnEncoder",
-    "OwnModule",
     "PolicyConfig",
     "QNetwork",
-    "ResidualBlock",
     "SimBa",
     "Torso",
     "Widths",
     "action_values",
     "channels_last",
     "convolutions",
-    "encode_leaf",
     "image_shape",
-    "joined_width",
     "make_encoder",
     "make_head",
     "make_torso",
-    "n_features",
-    "own_module",
     "product",
     "reads_image",
     "register_encoder",

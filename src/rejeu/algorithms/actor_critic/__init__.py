@@ -5,18 +5,9 @@ distribution over actions and to a value. Actions may be Box (a normal distribut
 MultiDiscrete or MultiBinary. A policy with memory puts a recurrent cell between the features and the hidden layers.
 """
 
-from rejeu.algorithms.actor_critic.config import (
-    HIDDEN_LAYERS,
-    ActorCriticConfig,
-    OnPolicyConfig,
-    check_value_rate,
-)
+from rejeu.algorithms.actor_critic.config import ActorCriticConfig, OnPolicyConfig
 from rejeu.algorithms.actor_critic.network import (
     HIDDEN_GAIN,
-    LOG_STD_RANGE,
-    POLICY_GAIN,
-    SDE_EPSILON,
-    VALUE_GAIN,
     ActionKind,
     ActorCritic,
     Distribution,
@@ -24,7 +15,6 @@ from rejeu.algorithms.actor_critic.network import (
     checked,
     is_value,
     orthogonal,
-    sde_log_std,
     unmasked,
 )
 from rejeu.algorithms.actor_critic.state_dependent import explorer_of, sde_explorer
@@ -35,7 +25,6 @@ from rejeu.algorithms.actor_critic.steps import (
     explained_variance,
     flat,
     masked_mean,
-    masked_variance,
     minibatches,
     samples,
     shuffled,
@@ -45,11 +34,6 @@ from rejeu.algorithms.actor_critic.steps import (
 
 __all__ = [
     "HIDDEN_GAIN",
-    "HIDDEN_LAYERS",
-    "LOG_STD_RANGE",
-    "POLICY_GAIN",
-    "SDE_EPSILON",
-    "VALUE_GAIN",
     "ActionKind",
     "ActorCritic",
     "ActorCriticConfig",
@@ -57,7 +41,6 @@ __all__ = [
     "OnPolicyConfig",
     "Samples",
     "action_kind",
-    "check_value_rate",
     "checked",
     "clip_and_descend",
     "entropy_of",
@@ -66,12 +49,10 @@ __all__ = [
     "flat",
     "is_value",
     "masked_mean",
-    "masked_variance",
     "minibatches",
     "orthogonal",
     "samples",
     "sde_explorer",
-    "sde_log_std",
     "shuffled",
     "standardized",
     "unmasked",

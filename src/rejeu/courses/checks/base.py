@@ -141,7 +141,8 @@ def of_table(name: str, module: str, section: Mapping[str, Any]) -> Callable[...
         ]
         right = np.asarray(evaluated(section["right"], names))
         results = [call(student, *arguments) for arguments in given]
-        wrong = {key: evaluated(one["result"], names) for key, one in section.items() if is_mistake(one)}
+        entries = {key: one for key, one in section.items() if isinstance(one, dict) and "result" in one}
+        wrong = {key: evaluated(one["result"], names) for key, one in entries.items()}
         mistakes(**{key: np.shape(results[0]) == np.shape(one) != right.shape for key, one in wrong.items()})
         found = [numbers(result, right.shape[1:] if each else right.shape) for result in results]
         diagnose(np.stack(found) if each else found[0], right, **wrong)
@@ -151,11 +152,6 @@ def of_table(name: str, module: str, section: Mapping[str, Any]) -> Callable[...
     check.__name__, check.__module__ = name, module
     check.__doc__ = f"Checks ``{name}({', '.join(case)})``."
     return exercise(check)
-
-
-def is_mistake(entry: Any) -> bool:
-    """Returns whether an entry of a section is a mistake with its result."""
-    return isinstance(entry, dict) and "result" in entry
 
 
 def evaluated(value: Any, names: dict[str, Any]) -> Any:
