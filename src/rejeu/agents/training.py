@@ -13,7 +13,7 @@ from rejeu.agents import device
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.agents.outputs import open_outputs, run_config, statistics_row
 from rejeu.callbacks import calling
-from rejeu.callbacks.base import Callback, Stateful
+from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.interrupt import Interrupt
@@ -127,7 +127,7 @@ def session(
     Yields a function that is called after every turn of the loop. It records the turn, calls the callbacks, and returns
     whether training is over.
     """
-    agent.training_call, agent.callbacks = call, [one for one in callbacks if isinstance(one, Stateful)]
+    agent.training_call, agent.callbacks = call, calling.stateful(callbacks)
     agent.interrupted, agent.interrupted_by = False, None
     agent.run.success_threshold = agent.success_threshold
     agent.failed_writes.forget_written()

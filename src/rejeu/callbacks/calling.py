@@ -33,6 +33,11 @@ def in_order(callbacks: Iterable[Callback]) -> list[Callback]:
     return sorted(callbacks, key=lambda callback: isinstance(callback, TrainingCallback) and callback.runs_last)
 
 
+def stateful(callbacks: Iterable[Any]) -> list[Stateful]:
+    """Returns the callbacks whose state a checkpoint contains."""
+    return [one for one in callbacks if isinstance(one, Stateful)]
+
+
 def called(callback: Callback, agent: Any, turn: Progress) -> bool | None:
     """Returns the answer of a callback, ``False`` if Ctrl-C or SIGTERM ended it.
 

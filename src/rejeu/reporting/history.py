@@ -230,13 +230,13 @@ class Summary:
     @classmethod
     def of(cls, history: History, window: int) -> Summary:
         """Returns the summary of a history; see :meth:`History.summary`."""
-        columns = [history[column] for column in ("return", "length", "success")]
+        returns, lengths, successes = (history[column] for column in ("return", "length", "success"))
         records = history.records()
         return cls(
             steps=int(history["step"][-1]) if len(history) else 0,
             seconds=float(history["seconds"][-1]) if len(history) else 0.0,
-            all=Evaluation(*columns),
-            last=Evaluation(*(column[-window:] for column in columns)),
+            all=Evaluation(returns, lengths, successes),
+            last=Evaluation(returns[-window:], lengths[-window:], successes[-window:]),
             records=len(records),
             best=records[-1] if records else None,
         )
