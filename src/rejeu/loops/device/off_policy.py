@@ -238,7 +238,7 @@ class OffPolicyTrainer(DeviceTrainer):
         return self.compiled(drawn)(experience, carry.key, clock, np.uint32(number + 1))
 
 
-def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, progress: Any) -> Array:
+def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, progress: Any) -> Array | None:
     """Returns the first actions of a run."""
     program = program.with_hyperparameters(carry.hyper)
     clock = Clock(carry.counts.step, carry.episodes.n_finished, progress)
