@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rejeu.algorithms.search import Choice, Integers, LogUniform, NearOne, Uniform
-from rejeu.experiments.final import Final
+from rejeu.experiments.search import Final
 from rejeu.experiments.study import Outcome
 from rejeu.experiments.study_plan import Plan
 from rejeu.experiments.tune import Result, tune

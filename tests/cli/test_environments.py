@@ -98,8 +98,8 @@ def test_the_command_that_train_prints_works_for_an_environment_of_ones_own(name
 
 
 def test_commands_to_type_name_what_was_imported():
-    made = Environment("CartPole-v1", "CartPole-v1", {}, (), (), modules=("awac.py",))
-    assert made.options() == " --import awac.py"
+    made = Environment("CartPole-v1", RunConfig(env="CartPole-v1", imports=("awac.py",)))
+    assert made.run.again() == " --import awac.py"
     run = RunConfig(env="my_env.py", seed=0, env_kwargs={"g": 9.8}, wrappers=("my_env:Double",))
     typed = dataclasses.replace(run, imports=("awac.py",))
     assert (
@@ -145,7 +145,7 @@ def test_a_traceback_from_a_worker_process_keeps_its_lines(monkeypatch, capsys):
     def fail(arguments):
         raise WorkerError("environment 0 failed in a worker process:\nTraceback\n  line 3")
 
-    monkeypatch.setattr("rejeu.cli.list.run", fail)
+    monkeypatch.setattr("rejeu.cli.list.run_list", fail)
     assert main(["list"]) == 2
     assert "process:\nTraceback\n  line 3 (" in capsys.readouterr().err
 

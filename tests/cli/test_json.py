@@ -13,7 +13,7 @@ import gymnasium as gym
 import pytest
 
 from rejeu import cli
-from rejeu.cli import main, status
+from rejeu.cli import main, runs
 from rejeu.cli.commands import COMMANDS
 from rejeu.interrupt import Stopped
 
@@ -169,10 +169,10 @@ def test_exit_codes_are_those_of_the_documentation(monkeypatch, capsys):
         monkeypatch.setattr(
             cli.importlib,
             "import_module",
-            lambda name, run=raise_error: SimpleNamespace(run=run) if name == "rejeu.cli.list" else real(name),
+            lambda name, run=raise_error: SimpleNamespace(run_list=run) if name == "rejeu.cli.list" else real(name),
         )
         seen.add(main(["list"]))
-    elsewhere = {129, 141, *status.EXIT.values()}  # a closed terminal and a closed output have tests of their own
+    elsewhere = {129, 141, *runs.EXIT.values()}  # a closed terminal and a closed output have tests of their own
     assert seen | elsewhere == codes == {0, 1, 2, 3, 4, 129, 130, 141, 143}
 
 

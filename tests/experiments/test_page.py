@@ -8,7 +8,7 @@ import pytest
 
 from rejeu import presets
 from rejeu.errors import MissingExtra
-from rejeu.experiments import final, page, study as studies, study_plan as plans, tune as tuning
+from rejeu.experiments import page, search, study as studies, study_plan as plans, tune as tuning
 from rejeu.experiments.study import StudyFolder
 from rejeu.reporting.report import page as pages
 from rejeu.runs.config import RunConfig
@@ -74,7 +74,7 @@ def test_texts_of_a_study_are_escaped_and_the_policy_allows_no_network(study):
 
 
 def test_the_page_says_what_the_comparison_found(study):
-    compared = final.Final("no difference found", (1.0, -2.0, 4.0), None, ("default, seed 1: the loss is NaN",))
+    compared = search.Final("no difference found", (1.0, -2.0, 4.0), None, ("default, seed 1: the loss is NaN",))
     text = page.render(study, study.outcomes(), compared)
     assert "On fresh seeds the winner is not shown to be better than the default" in text
     assert "default, seed 1: the loss is NaN" in text

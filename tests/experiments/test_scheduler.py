@@ -9,13 +9,12 @@ from filelock import FileLock
 
 from rejeu.errors import CheckpointError
 from rejeu.experiments import scheduler
-from rejeu.experiments.coordinator import Coordinator
 from rejeu.experiments.folder import NOTHING, Sweep, open_folder, read_folder
 from rejeu.experiments.jobs import Job
 from rejeu.experiments.scheduler import MAX_LOST, Scheduler, Work
+from rejeu.experiments.sweep import Coordinator
 from rejeu.interrupt import Interrupt
-from rejeu.runs.config import RunConfig
-from rejeu.runs.task import Task
+from rejeu.runs.config import RunConfig, Task
 
 
 class Handle:

@@ -12,7 +12,7 @@ import pytest
 
 from rejeu import presets
 from rejeu.errors import CheckpointError
-from rejeu.experiments import final, process, study as studies, study_plan as plans, tune as tuning
+from rejeu.experiments import process, search, study as studies, study_plan as plans, tune as tuning
 from rejeu.experiments.search import Search
 from rejeu.experiments.study import StudyFolder
 from rejeu.interrupt import Interrupt
@@ -205,10 +205,10 @@ def test_difference_says_whether_zero_is_in_the_interval():
 
     rng = np.random.default_rng(0)
     good, bad = rng.normal(10, 1, 20), rng.normal(0, 1, 20)
-    value, low, high = final.difference([good], [bad], 0)
+    value, low, high = search.difference([good], [bad], 0)
     assert low < value < high
     assert low > 5
-    value, low, high = final.difference([bad], [bad[::-1]], 0)
+    value, low, high = search.difference([bad], [bad[::-1]], 0)
     assert low < 0 < high
     assert value == pytest.approx(0)
 

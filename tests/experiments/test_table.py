@@ -2,10 +2,10 @@
 
 from rich.progress import Progress, TextColumn
 
-from rejeu.experiments import table
-from rejeu.experiments.coordinator import Coordinator
+from rejeu.experiments import sweep
 from rejeu.experiments.folder import Sweep, open_folder
 from rejeu.experiments.jobs import Job
+from rejeu.experiments.sweep import Coordinator
 from rejeu.interrupt import Interrupt
 from rejeu.runs.config import RunConfig
 from tests.experiments.test_scheduler import Launcher
@@ -30,14 +30,14 @@ def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     coordinator = make(tmp_path)
     with Progress(TextColumn("{task.description} {task.fields[text]}")) as bars:
         bars.add_task("all steps", total=None, text="")
-        table.draw(bars, coordinator)
+        sweep.draw(bars, coordinator)
         everything, one = bars.tasks
     assert (one.description, one.completed, one.total) == ("job-2", 500, 1000)
     assert (everything.completed, everything.total) == (1500, 3000)  # the failed run is not trained
     states = "1 running, 1 done, 1 failed, 1 waiting"
     assert everything.fields["text"] == states
-    assert table.line(coordinator) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
-    assert table.closing_lines(coordinator)[0] == f"4 runs: {states}"
+    assert sweep.line(coordinator) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
+    assert sweep.closing_lines(coordinator)[0] == f"4 runs: {states}"
     (coordinator.folder.run(coordinator.folder.jobs[2]) / "agent.safetensors").touch()
     coordinator.scheduler.running[0].handle.status = 0
     while coordinator.scheduler.running:
@@ -45,5 +45,5 @@ def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     with Progress() as bars:
         bars.add_task("all steps", total=None, text="")
         bars.add_task("job-2", text="")
-        table.draw(bars, coordinator)
+        sweep.draw(bars, coordinator)
         assert "job-2" not in {task.description for task in bars.tasks}

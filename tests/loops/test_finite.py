@@ -21,9 +21,9 @@ from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.callbacks import Checkpoint
 from rejeu.core import EXPLAINED_VARIANCE, TD_ERROR, Rollout
 from rejeu.envs.make import InProcess
-from rejeu.errors import BadEnvironmentError, NonFiniteError
+from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
 from rejeu.io.checkpoint import read
-from rejeu.loops import nonfinite
+from rejeu.loops import finite, nonfinite
 from rejeu.loops.packing import Readings
 from rejeu.normalization import merged, no_moments
 from rejeu.spaces import Leaf
@@ -269,6 +269,26 @@ def test_the_message_names_step_update_batch_model_and_what_to_try(tmp_path):
     assert "normalize=True" in message
     assert "\n" not in message
     assert 'nonfinite="skip"' in message
+
+
+def test_the_saved_batch_breaks_a_loaded_model_again(tmp_path):
+    agent = MAKE["SAC"]()
+    agent.report_folder = tmp_path
+    poison(agent, 3, 1e25)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"))
+    found = finite.examine(loaded, caught.value.batch)
+    assert found
+    assert found.metrics == ["critic_loss (inf)"]
+    assert not found.batch
+    batch, clock = finite.load_batch(loaded, caught.value.batch)
+    assert batch.reward[0] == np.float32(1e25)
+    assert int(clock.step) == caught.value.step
+    with pytest.raises(CheckpointError, match="a batch of another kind of agent than this A2C"):
+        finite.load_batch(MAKE["A2C"](), caught.value.batch)
+    with pytest.raises(CheckpointError, match="holds 'agent', expected 'batch'"):
+        finite.load_batch(agent, tmp_path / "model")
 
 
 def test_a_batch_never_replaces_another_and_goes_where_logs_or_the_process_are(tmp_path, monkeypatch):

@@ -11,9 +11,8 @@ import pytest
 import rejeu
 from rejeu.cli import commands, main, parsing
 from rejeu.errors import CheckpointError
-from rejeu.runs import config, folder, task
-from rejeu.runs.config import DecidedRun, RunConfig
-from rejeu.runs.task import Task
+from rejeu.runs import config, folder
+from rejeu.runs.config import DecidedRun, RunConfig, Task, read_task, write_task
 from tests.cli.test_cli import FEWER_FILES, TINY
 
 EARLIER = {
@@ -105,8 +104,8 @@ def test_a_run_is_the_same_as_words_of_the_command_line_and_as_data(run, tmp_pat
     command, arguments = parsing.parse(run.words(), commands.COMMANDS, "")
     assert command == "train"
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
-    task.write(tmp_path / "task.json", Task(folder="runs/1", run=run, pause=7))
-    command, arguments = commands.of_task(task.read(tmp_path / "task.json"))
+    write_task(tmp_path / "task.json", Task(folder="runs/1", run=run, pause=7))
+    command, arguments = commands.of_task(read_task(tmp_path / "task.json"))
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
     assert (command, str(arguments.out), arguments.pause) == ("train", "runs/1", 7)
 
@@ -122,7 +121,7 @@ def test_a_process_trains_and_continues_what_its_file_says(tmp_path):
     )
     one = Task(folder=str(tmp_path / "data"), run=run, pause=70, no_report=True, no_video=True)
     for part in (one, dataclasses.replace(one, resume=True, pause=None)):
-        task.write(tmp_path / "task.json", part)
+        write_task(tmp_path / "task.json", part)
         assert main(["--task", str(tmp_path / "task.json")]) == 0
     words = ["train", "Pendulum-v1", "--algo", "SAC", "--seed", "3", "--steps", "120", "--evaluate-episodes", "1"]
     assert main([*words, "--out", str(tmp_path / "words"), *FEWER_FILES, "--set", *TINY]) == 0

@@ -22,8 +22,8 @@ from typing import Any
 import rejeu
 from rejeu import errors, interrupt, supervised
 from rejeu.cli import parsing
-from rejeu.cli.commands import COMMANDS, MODULES, of_task
-from rejeu.runs import task as tasks
+from rejeu.cli.commands import COMMANDS, MODULES, check_options, of_task
+from rejeu.runs.config import read_task
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
 
@@ -64,12 +64,18 @@ def run_command(argv: Sequence[str]) -> int:
     try:
         is_task = [*argv[:1]] == ["--task"] and len(argv) == 2
         command, arguments = (
-            of_task(tasks.read(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, DESCRIPTION)
+            of_task(read_task(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, DESCRIPTION)
         )
-        importlib.import_module("rejeu.cli.settings").check_values(arguments)
+        check_options(arguments)
         for name in getattr(arguments, "imports", ()):
             importlib.import_module("rejeu.cli.importing").import_source(name)
-        return importlib.import_module(f"rejeu.cli.{MODULES.get(command, command)}").run(arguments)
+        from rejeu.cli import jsonout  # NumPy takes longer than all that --help needs
+
+        module = importlib.import_module(f"rejeu.cli.{MODULES.get(command, command)}")
+        with jsonout.messages(getattr(arguments, "json", False)) as emit:
+            status, result = getattr(module, f"run_{command}")(arguments)
+            emit(result)
+        return status
     except KeyboardInterrupt as error:
         print("rejeu: interrupted", file=sys.stderr)
         return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)

@@ -7,47 +7,38 @@ import sys
 import warnings
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from rejeu.cli import environment, jsonout
+from rejeu.cli import environment
 from rejeu.cli.commands import Check
 from rejeu.cli.environment import Environment
 from rejeu.cli.importing import module_of
 from rejeu.errors import BadEnvironmentError
 
 
-def run(arguments: Check) -> int:
-    """Prints the findings, errors first, and returns the exit status: 1 if there are errors, else 0."""
+def run_check(arguments: Check) -> tuple[int, dict[str, Any]]:
+    """Prints the findings, errors first; the exit status is 1 if there are errors."""
     from rejeu.envs import checker  # Gymnasium's checker, which it imports, is for environments of one's own only
 
-    with (
-        jsonout.messages(arguments.json) as output,
-        closing(environment.from_arguments(arguments.env, arguments).make()) as env,
-    ):
+    with closing(environment.from_arguments(arguments.env, arguments).make()) as env:
         found = sorted(checker.findings(env))
         package = None if arguments.all else installed_package(env)
-    n_notes = 0
-    if package is not None:
-        n_notes = len(found)
-        found = [finding for finding in found if finding.level == "error"]
-        n_notes -= len(found)
-    n_errors = sum(finding.level == "error" for finding in found)
-    if arguments.json:
-        counts = {"errors": n_errors, "warnings": len(found) - n_errors, "hidden_warnings": n_notes}
-        found_as_dicts = [finding._asdict() for finding in found]
-        jsonout.emit({"env_id": arguments.env, **counts, "findings": found_as_dicts}, output)
-        return int(n_errors > 0)
-    for finding in found:
-        print(f"{finding.level}: {finding.text}")
-    print(f"{arguments.env}: {counted(n_errors, 'error')}, {counted(len(found) - n_errors, 'warning')}", flush=True)
-    if n_notes:
-        print(
-            f"{counted(n_notes, 'warning')} on what only the authors of {package} can change; --all shows it",
-            flush=True,
-        )
-    return int(n_errors > 0)
+    shown = found if package is None else [finding for finding in found if finding.level == "error"]
+    n_errors, n_hidden = sum(finding.level == "error" for finding in found), len(found) - len(shown)
+    n_warnings = len(shown) - n_errors
+    if not arguments.json:
+        for finding in shown:
+            print(f"{finding.level}: {finding.text}")
+        print(f"{arguments.env}: {counted(n_errors, 'error')}, {counted(n_warnings, 'warning')}", flush=True)
+        if n_hidden:
+            text = f"{counted(n_hidden, 'warning')} on what only the authors of {package} can change; --all shows it"
+            print(text, flush=True)
+    counts = {"errors": n_errors, "warnings": n_warnings, "hidden_warnings": n_hidden}
+    findings = [finding._asdict() for finding in shown]
+    return int(n_errors > 0), {"env_id": arguments.env, **counts, "findings": findings}
 
 
 def before_training(made: Environment) -> None:
@@ -75,7 +66,7 @@ def before_training(made: Environment) -> None:
         print(f"error: {text}", file=sys.stderr)
     if errors:
         raise BadEnvironmentError(
-            f"{made.typed} has {counted(len(errors), 'error')}, so nothing is trained; rejeu check shows its warnings too"
+            f"{made.run.env} has {counted(len(errors), 'error')}, so nothing is trained; rejeu check shows its warnings too"
         )
 
 

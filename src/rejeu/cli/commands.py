@@ -1,4 +1,8 @@
-"""The commands and their arguments. What a command does is in the module of its name, which is imported when it runs."""
+"""The commands and their arguments.
+
+What a command does is in the module of its name, or that in :data:`MODULES`, which is imported when it runs:
+``run_NAME(arguments)`` returns the exit status, and the result for ``--json``.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +14,33 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from rejeu.io.records import MAX_ENVS, Duration, Positive, Seed
-from rejeu.runs.config import MAX_EPISODES, EnvironmentOptions, RunConfig, Shown
-from rejeu.runs.task import Task
+from rejeu.runs.config import MAX_EPISODES, EnvironmentOptions, RunConfig, Shown, Task
 
-Which = Annotated[Literal["best", "last"], Shown("{best,last}")]
+WHICH = "Of a folder: the model that evaluated best in training, or the last."
+EPISODES = "Episodes of each evaluation; by default the preset's, else 20."
+
+Which = Annotated[Literal["best", "last"], Shown("{best,last}", help=WHICH)]
 EnvironmentId = Annotated[str, Shown("ENV", is_positional=True)]
-RunPath = Annotated[Path, Shown("RUN", is_positional=True)]
+ModelPath = Annotated[Path, Shown("RUN", is_positional=True, help="Folder of a run, or a .safetensors file.")]
+RunPath = Annotated[Path, Shown("RUN", is_positional=True, help="Its folder.")]
 Count = Annotated[Positive | None, Shown("N")]
 EnvCount = Annotated[Annotated[int, Meta(ge=1, le=MAX_ENVS)] | None, Shown("N")]
-EpisodeCount = Annotated[Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N")]
+EpisodeCount = Annotated[Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N", help=EPISODES)]
 Several = Annotated[Annotated[int, Meta(ge=1, le=1000)] | None, Shown("N")]
 SeedOrNone = Annotated[Seed | None, Shown("N")]
 Minutes = Annotated[Duration | None, Shown("M")]
-Rate = Annotated[float | None, Shown("N")]
+Rate = Annotated[float | None, Shown("N", help="Steps a second; by default the environment's own.")]
+Algorithm = Annotated[str | None, Shown("NAME", help="Algorithm; by default that of the preset.")]
 Name = Annotated[str | None, Shown("NAME")]
 Return = Annotated[float | None, Shown("RETURN")]
 Folder = Annotated[Path | None, Shown("DIR")]
-Assignments = tuple[tuple[str, ...], ...]
-Device = Annotated[str, Shown("NAME")]
+Imports = Annotated[tuple[str, ...], Shown("MODULE", "import")]
+Assignments = tuple[str, ...]
+Measure = Annotated[Literal["return", "success"], Shown("{return,success}")]
+NoReport = Annotated[bool, Shown(help="Write no report.html at the end.")]
+NoVideo = Annotated[bool, Shown(help="Record no video at the end.")]
+Json = Annotated[bool, Shown(help="Print the result as one JSON document, and messages to standard error.")]
+PrintJson = Annotated[bool, Shown(help="Print the result as JSON.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +67,9 @@ class Train(RunConfig):
     """With --seeds: how many are trained at once; by default half as many as there are cores."""
     out: Folder = None
     """Run folder, new or empty; by default one under runs, named after the run and the time."""
-    no_report: bool = False
-    """Write no report.html at the end."""
-    no_video: bool = False
-    """Record no video at the end."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    no_report: NoReport = False
+    no_video: NoVideo = False
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -77,10 +87,9 @@ class Sweep:
     """Runs trained at once; by default half as many as there are cores, with --ray as many as the cluster has room for."""
     ray: Annotated[str | None, Shown("ADDRESS")] = None
     """Train on this Ray cluster: auto, or HOST:PORT."""
-    imports: Annotated[tuple[str, ...], Shown("MODULE", "import")] = ()
+    imports: Imports = ()
     """Import this module or Python file first, in each run: one that registers algorithms or environments."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -91,7 +100,6 @@ class Resume(RunOptions):
     """
 
     run: RunPath
-    """Its folder."""
     finish: bool = False
     """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
     workers: Several = None
@@ -110,12 +118,9 @@ class Resume(RunOptions):
     """As for rejeu train; for this part of the run."""
     env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N")] = None
     """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
-    no_report: bool = False
-    """Write no report.html at the end."""
-    no_video: bool = False
-    """Record no video at the end."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    no_report: NoReport = False
+    no_video: NoVideo = False
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -127,8 +132,7 @@ class Tune(EnvironmentOptions):
 
     env: EnvironmentId
     """Id of an environment, as for rejeu train."""
-    algo: Name = None
-    """Algorithm; by default that of the preset."""
+    algo: Algorithm = None
     trials: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 30
     """How many trials; of a study that exists, how many in all."""
     steps: Count = None
@@ -151,13 +155,12 @@ class Tune(EnvironmentOptions):
     """Fresh seeds on which the winner is compared with the default, at least 5; 0 for no comparison."""
     pruner: Annotated[Literal["median", "halving", "none"], Shown("{median,halving,none}")] = "median"
     """Stop trials that are below the median of the others, or by successive halving, or none."""
-    measure: Annotated[Literal["return", "success"], Shown("{return,success}")] = "return"
+    measure: Measure = "return"
     """Maximize the mean return of the last evaluation, or its success rate."""
     evaluate_every: Count = None
     """Environment steps between two evaluations; by default a tenth of --steps."""
     evaluate_episodes: EpisodeCount = None
-    """Episodes of each evaluation; by default the preset's, else 20."""
-    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M", default="(default: 5)")] = 5.0
+    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M")] = 5.0
     """Minutes between two checkpoints of a training; 0 for none."""
     seed: Annotated[Seed, Shown("N")] = 0
     """Determines what is sampled and the seeds of all trainings."""
@@ -165,8 +168,7 @@ class Tune(EnvironmentOptions):
     """Trials at once; by default half as many as there are cores."""
     out: Folder = None
     """Study folder; an existing one is continued or joined. By default a new one under runs."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -178,8 +180,7 @@ class Pbt(EnvironmentOptions):
 
     env: EnvironmentId
     """Id of an environment, as for rejeu train."""
-    algo: Name = None
-    """Algorithm; by default that of the preset."""
+    algo: Algorithm = None
     members: Annotated[int, Meta(ge=2, le=1000), Shown("K")] = 8
     """Agents that are trained."""
     rounds: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 10
@@ -198,11 +199,10 @@ class Pbt(EnvironmentOptions):
     """Other ranges, or further hyperparameters, as for rejeu tune."""
     only: Annotated[Assignments, Shown("NAME ...")] = ()
     """Change these hyperparameters and no others."""
-    measure: Annotated[Literal["return", "success"], Shown("{return,success}")] = "return"
+    measure: Measure = "return"
     """Compare members by the mean return of the evaluation at the end of a round, or by its success rate."""
     evaluate_episodes: EpisodeCount = None
-    """Episodes of each evaluation; by default the preset's, else 20."""
-    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M", default="(default: 5)")] = 5.0
+    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M")] = 5.0
     """Minutes between two checkpoints within a round."""
     seed: Annotated[Seed, Shown("N")] = 0
     """Determines all hyperparameters and the seeds of all members."""
@@ -210,40 +210,35 @@ class Pbt(EnvironmentOptions):
     """Members trained at once; by default half as many as there are cores."""
     out: Folder = None
     """Folder of the population, new or empty; by default a new one under runs."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
 class Evaluate(RunOptions):
     """Evaluates the deterministic policy of a trained agent on whole episodes and prints the results."""
 
-    run: RunPath
-    """Folder of a run, or a .safetensors file."""
+    run: ModelPath
     episodes: Count = None
     """How many; 100, or with --minutes as many as there is time for."""
     minutes: Minutes = None
     """Wall time after which no further episode begins; running episodes are finished."""
     backend: Annotated[str, Shown("NAME")] = "auto"
     """auto, envpool, gymnasium, gymnasium-async or jax; gymnasium is the environment's own package."""
-    device: Device = "auto"
+    device: Annotated[str, Shown("NAME")] = "auto"
     """As for rejeu train."""
     seed: SeedOrNone = None
     """Of the environments; by default a random one."""
     success_threshold: Return = None
     """Return from which on an episode counts as a success; by default as in training."""
     which: Which = "best"
-    """Of a folder: the model that evaluated best in training, or the last."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
 class Record(RunOptions):
     """Records a video of a few episodes of a trained agent in the environment's own package."""
 
-    run: RunPath
-    """Folder of a run, or a .safetensors file."""
+    run: ModelPath
     out: Annotated[Path | None, Shown("FILE")] = None
     """Where to write; by default video.mp4 in the folder, or next to the file under its name."""
     episodes: Annotated[Positive, Shown("N")] = 3
@@ -251,9 +246,7 @@ class Record(RunOptions):
     seed: SeedOrNone = None
     """Of the environment; by default a random one."""
     which: Which = "best"
-    """Of a folder: the model that evaluated best in training, or the last."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -270,7 +263,6 @@ class Play(EnvironmentOptions):
     seed: SeedOrNone = None
     """Of the first episode; each further one has the next seed. By default a random one."""
     fps: Rate = None
-    """Steps a second; by default the environment's own."""
     episodes: Count = None
     """Close after so many; by default when you do."""
     record: Folder = None
@@ -278,9 +270,7 @@ class Play(EnvironmentOptions):
     against: Annotated[Path | None, Shown("RUN")] = None
     """Folder of a run, or a .safetensors file, whose agent plays the same episodes next to you."""
     which: Which = "best"
-    """Of a folder: the model that evaluated best in training, or the last."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -290,18 +280,14 @@ class Watch(RunOptions):
     r restarts the episode, p pauses, q quits.
     """
 
-    run: RunPath
-    """Folder of a run, or a .safetensors file."""
+    run: ModelPath
     episodes: Count = None
     """Close after so many; by default when you do."""
     seed: SeedOrNone = None
     """Of the first episode; each further one has the next seed. By default a random one."""
     which: Which = "best"
-    """Of a folder: the model that evaluated best in training, or the last."""
     fps: Rate = None
-    """Steps a second; by default the environment's own."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -315,18 +301,16 @@ class Check(EnvironmentOptions):
     """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
     all: bool = False
     """Of an installed package's environment, show the warnings too, which only its authors can act on."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
 class List:
     """Lists the algorithms and the environments with tuned hyperparameters."""
 
-    imports: Annotated[tuple[str, ...], Shown("MODULE", "import")] = ()
+    imports: Imports = ()
     """Import this module or Python file first: one that registers algorithms; repeat for several."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -341,8 +325,7 @@ class Course:
     """en or fr; or grade."""
     paths: Annotated[tuple[Path, ...], Shown("FOLDER ...", is_positional=True)]
     """Where to write; it is created. Of grade: notebooks, .ipynb or .py."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -387,8 +370,7 @@ class Class(EnvironmentOptions):
     """Of the leaderboard."""
     out: Annotated[Path, Shown("FILE")] = Path("leaderboard.html")
     """Page to write; a name that ends in .md or .json is written as Markdown or JSON."""
-    json: bool = False
-    """Print the result as one JSON document, and messages to standard error."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -398,7 +380,7 @@ class Compare:
     Also reads monitor.csv of Stable-Baselines3 and TensorBoard files. Example: rejeu compare runs --by setting --out page.html
     """
 
-    runs: Annotated[tuple[Path, ...], Shown("RUN ...", default="", is_positional=True)]
+    runs: Annotated[tuple[Path, ...], Shown("RUN ...", is_positional=True)]
     """Run folders, or folders of run folders."""
     by: Annotated[Literal["algorithm", "setting", "env"] | None, Shown("{algorithm,setting,env}")] = None
     """What makes a group; by default the first of these in which the runs differ."""
@@ -418,18 +400,16 @@ class Compare:
     """File to write (.md, .csv, .json, .png or .html), or a folder for all of them."""
     open: bool = False
     """Open the page in the web browser; it is written to compare.html unless --out says otherwise."""
-    json: bool = False
-    """Print the result as JSON."""
+    json: PrintJson = False
 
 
 @dataclass(frozen=True)
 class Runs:
     """Lists the runs in a folder and its subfolders with state, steps and best results."""
 
-    folder: Annotated[Path, Shown("FOLDER", default="(default: runs)", is_positional=True)] = Path("runs")
+    folder: Annotated[Path, Shown("FOLDER", is_positional=True)] = Path("runs")
     """Folder that is searched."""
-    json: bool = False
-    """Print the result as JSON."""
+    json: PrintJson = False
 
 
 @dataclass(frozen=True)
@@ -437,9 +417,7 @@ class Status:
     """Shows how far a run is, also while it trains; exit status 3 if it was interrupted, 4 if it crashed."""
 
     run: RunPath
-    """Its folder."""
-    json: bool = False
-    """Print the result as JSON."""
+    json: PrintJson = False
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {
@@ -462,8 +440,18 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "class": Class,
 }
 """The arguments of each command, by its name."""
-MODULES = {"class": "leaderboard"}
-"""The modules of commands whose name cannot be that of a module."""
+MODULES = {
+    "class": "courses",
+    "compare": "runs",
+    "course": "courses",
+    "evaluate": "models",
+    "pbt": "tune",
+    "play": "models",
+    "record": "models",
+    "status": "runs",
+    "watch": "models",
+}
+"""The modules of commands whose module has another name."""
 
 
 def of_task(task: Task) -> tuple[str, Any]:
@@ -479,3 +467,16 @@ def of_task(task: Task) -> tuple[str, Any]:
         run=Path(task.folder), finish=True, steps=task.pause, hyperparameters=task.changes, **again, **shared
     )
     return "resume", resume
+
+
+def check_options(arguments: Any) -> None:
+    """Raises ``ValueError`` if options exclude each other."""
+    given = {key: value for key, value in vars(arguments).items() if value is not None}
+    if {"steps", "minutes"} <= given.keys():
+        raise ValueError("--steps and --minutes exclude each other; give one of them")
+    if {"pause", "seeds"} <= given.keys():
+        raise ValueError("--pause is for a single run; leave it out, or --seeds")
+    if "jobs" in given and "seeds" not in given:
+        raise ValueError("--jobs is for several seeds; give --seeds N too")
+    if "backend" in vars(arguments) and given.get("backend") != "ray" and {"ray", "env_cpus"} & given.keys():
+        raise ValueError("--ray and --env-cpus are for --backend ray; give it too, or leave them out")

@@ -8,9 +8,8 @@ Everything else must be typed again, and the error says what.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,9 @@ from rejeu.envs.registry import are_plain, maker, register
 from rejeu.envs.rendering import make_rendering_env
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
-from rejeu.runs.config import DecidedRun, EnvironmentOptions
+from rejeu.runs.config import EnvironmentOptions, RunConfig
 from rejeu.runs.folder import RunFolder, read_config
-from rejeu.runs.values import assignment_words, merged, quoted
+from rejeu.runs.values import merged
 
 DEFAULT_WORKERS = WorkerOptions()
 """All environments step together; lost workers are not restarted."""
@@ -37,16 +36,15 @@ class Environment:
 
     env_id: str
     """Id in Gymnasium's registry, or one that only EnvPool knows."""
-    typed: str
-    """As typed."""
-    kwargs: Mapping[str, Any]
-    """Keyword arguments of the environment."""
-    wrapper_names: tuple[str, ...]
-    """As typed, innermost first."""
-    wrappers: tuple[Callable[[Any], Any], ...]
-    """The same, imported."""
-    modules: tuple[str, ...] = ()
-    """What ``--import`` named, as typed."""
+    run: RunConfig
+    """How it was named: as typed, with keyword arguments, wrappers and what ``--import`` named."""
+    wrappers: tuple[Callable[[Any], Any], ...] = ()
+    """The wrappers, imported, innermost first."""
+
+    @property
+    def kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of the environment."""
+        return self.run.env_kwargs
 
     def make(self, **more: Any) -> gym.Env:
         """Returns a new one; ``more`` are further keyword arguments, such as ``render_mode``."""
@@ -86,22 +84,10 @@ class Environment:
         """Returns whether Gymnasium has it, and not EnvPool alone."""
         return register(self.env_id)
 
-    def options(self) -> str:
-        """Returns what ``rejeu evaluate RUN`` and the like need to make it again, and to import; empty if the id is enough.
-
-        >>> Environment("Walk-v0", "my_env:Walk-v0", {"g": 9.8}, (), ()).options()
-        ' --env my_env:Walk-v0 --env-kwargs g=9.8'
-        >>> Environment("Walk-v0", "Walk-v0", {}, (), (), modules=("my_algorithm.py",)).options()
-        ' --import my_algorithm.py'
-        """
-        recorded = not imports(self.typed) and not self.wrapper_names and are_plain(dict(self.kwargs))
-        made = "" if recorded else options(self.typed, self.kwargs, self.wrapper_names)
-        return made + "".join(f" --import {quoted(name)}" for name in self.modules)
-
     def __str__(self) -> str:
         parts = [f"{key}={value!r}" for key, value in self.kwargs.items()]
         text = self.env_id + (f" ({', '.join(parts)})" if parts else "")
-        return text + "".join(f", {name}" for name in self.wrapper_names)
+        return text + "".join(f", {name}" for name in self.run.wrappers)
 
 
 @dataclass(frozen=True)
@@ -118,14 +104,6 @@ class Wrapped:
         return env
 
 
-def options(typed: str, kwargs: Mapping[str, Any], wrapper_names: Iterable[str]) -> str:
-    """Returns an environment as options of a command line, with a space before each."""
-    words = ["--env", typed]
-    words += assignment_words("--env-kwargs", kwargs)
-    words += chain.from_iterable(("--wrapper", name) for name in wrapper_names)
-    return "".join(f" {quoted(word)}" for word in words)
-
-
 def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
     """Returns the environment that was named on the command line; imports its module.
 
@@ -135,25 +113,16 @@ def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
     """
     kwargs = merged(given.env_kwargs, {}, "--env-kwargs")
     wrappers = tuple(find_wrapper(name) for name in given.wrappers)
-    return Environment(find_id(env), env, kwargs, given.wrappers, wrappers, given.imports)
+    run = RunConfig(env=env, env_kwargs=kwargs, wrappers=given.wrappers, imports=given.imports)
+    return Environment(find_id(env), run, wrappers)
 
 
-def from_run(
-    env_id: Any,
-    env_argument: str,
-    kwargs: Mapping[str, Any],
-    wrapper_names: Iterable[str],
-    run: Path,
-    given: RunOptions,
-) -> Environment:
-    """Returns the environment of a run: what the command line says, else what the run folder says.
+def from_run(run: RunConfig, where: Path, given: RunOptions) -> Environment:
+    """Returns the environment of a run: what the command line says, else what its folder says.
 
     Args:
-        env_id: as the folder or the model has it.
-        env_argument: how it was named when the run began.
-        kwargs: its keyword arguments.
-        wrapper_names: its wrappers.
-        run: the folder or file, for messages.
+        run: as the folder or the model has it.
+        where: the folder or file, for messages.
         given: the command line; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
 
     Raises:
@@ -162,22 +131,22 @@ def from_run(
     """
     if given.env is not None:
         return from_arguments(given.env, given)
-    if not isinstance(env_id, str) or imports(env_id) or not re.fullmatch(r"[\w./-]{1,200}", env_id):
+    if not isinstance(run.env, str) or imports(run.env) or not re.fullmatch(r"[\w./-]{1,200}", run.env):
         raise CheckpointError(
-            f"{run} names the environment {str(env_id)[:60]!r}, and no file may name what is imported; name it yourself: "
+            f"{where} names the environment {str(run.env)[:60]!r}, and no file may name what is imported; name it yourself: "
             "--env ID"
         )
     own = merged(given.env_kwargs, {}, "--env-kwargs")
-    kept = {key: value for key, value in kwargs.items() if key not in own}
-    wrapper_names = tuple(given.wrappers or wrapper_names)
-    if imports(env_argument or env_id) or (wrapper_names and not given.wrappers) or not are_plain(kept):
-        again = options(env_argument or env_id, {**kept, **own}, wrapper_names)
+    kept = {key: value for key, value in run.env_kwargs.items() if key not in own}
+    if imports(run.typed) or (run.wrappers and not given.wrappers) or not are_plain(kept):
+        wrappers = given.wrappers or run.wrappers
+        again = RunConfig(env=run.typed, env_kwargs={**kept, **own}, wrappers=wrappers).again()
         raise CheckpointError(
-            f"{run} was trained on an environment that is imported or made with more than numbers, which no file may ask "
+            f"{where} was trained on an environment that is imported or made with more than numbers, which no file may ask "
             f"for; if you trust it, name it again:{again if len(again) < 500 and again.isprintable() else ' --env ENV'}"
         )
-    wrappers = tuple(find_wrapper(name) for name in given.wrappers)
-    return Environment(env_id, env_id, {**kept, **own}, given.wrappers, wrappers, given.imports)
+    named = RunConfig(env=run.env, env_kwargs={**kept, **own}, wrappers=given.wrappers, imports=given.imports)
+    return Environment(run.env, named, tuple(find_wrapper(name) for name in given.wrappers))
 
 
 def environment_of(model: Path, given: RunOptions) -> Environment:
@@ -189,13 +158,12 @@ def environment_of(model: Path, given: RunOptions) -> Environment:
     """
     if given.env is not None:
         return from_arguments(given.env, given)
-    env_id = recorded_id(model)
-    folder = RunFolder(model.parent)
+    env_id, folder = recorded_id(model), RunFolder(model.parent)
     if model in (folder.best, folder.agent) and folder.config.is_file():
         config = read_config(folder)
         if config.env == env_id:
-            return of_run(folder, config, given)
-    return from_run(env_id, "", {}, (), model, given)
+            return from_run(config, folder.path, given)
+    return from_run(RunConfig(env=env_id), model, given)
 
 
 def recorded_id(model: Path) -> Any:
@@ -205,8 +173,3 @@ def recorded_id(model: Path) -> Any:
         CheckpointError: if the file is not a model.
     """
     return checkpoint.read_header(model, "agent").get("env_id")
-
-
-def of_run(folder: RunFolder, config: DecidedRun, given: RunOptions) -> Environment:
-    """Returns the environment of a run: what the command line says, else what its configuration says."""
-    return from_run(config.env, config.env_argument, config.env_kwargs, config.wrappers, folder.path, given)

@@ -7,32 +7,24 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, redirect_stdout
-from typing import Any, TextIO
+from contextlib import contextmanager, redirect_stdout
+from typing import Any
 
 import numpy as np
 
 
 @contextmanager
-def messages(is_json: bool) -> Iterator[TextIO]:
-    """Returns standard output. With ``is_json``, what is printed while entered goes to standard error instead."""
+def messages(is_json: bool) -> Iterator[Callable[[Any], None]]:
+    """Context that yields a function to call with the result, which prints it with ``is_json`` and else does nothing.
+
+    With ``is_json``, what is printed otherwise goes to standard error.
+    """
+    if not is_json:
+        yield lambda result: None
+        return
     output = sys.stdout
-    with redirect_stdout(sys.stderr) if is_json else nullcontext():
-        yield output
-
-
-def run(command: Callable[[Any], tuple[int, Any]], arguments: Any) -> int:
-    """Calls a command, which returns its exit status and its result, and prints the result if ``arguments.json``."""
-    with messages(arguments.json) as output:
-        status, result = command(arguments)
-        if arguments.json:
-            emit(result, output)
-    return status
-
-
-def emit(value: Any, output: TextIO | None = None) -> None:
-    """Prints a value as one JSON document to ``output``, by default standard output."""
-    print(dumps(value), file=output, flush=True)
+    with redirect_stdout(sys.stderr):
+        yield lambda result: print(dumps(result), file=output, flush=True)
 
 
 def dumps(value: Any) -> str:

@@ -3,39 +3,38 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rejeu import presets
-from rejeu.cli import jsonout
 from rejeu.cli.commands import List
 from rejeu.presets import Preset
 
 FOLDER = Path(presets.__file__).parents[1] / "agents"
 
 
-def run(arguments: List) -> int:
-    """Prints the lists and returns the exit status."""
+def run_list(arguments: List) -> tuple[int, dict[str, Any]]:
+    """Prints the lists."""
     algorithms = described(is_extended=bool(arguments.imports))
-    if arguments.json:
-        jsonout.emit({"algorithms": algorithms, "presets": [as_dict(preset) for preset in presets.every()]})
-        return 0
+    if not arguments.json:
+        show(algorithms)
+    return 0, {"algorithms": algorithms, "presets": [as_dict(preset) for preset in presets.every()]}
+
+
+def show(algorithms: Mapping[str, str]) -> None:
+    """Prints the algorithms, and the presets by environment."""
     print("algorithms")
     print(columns([*algorithms.items()]))
     print("\nenvironments with tuned hyperparameters, the preset of rejeu train first")
-    env_ids = list(dict.fromkeys(preset.env_id for preset in presets.every()))
-    rows = []
-    for env_id in env_ids:
-        of_env = [preset for preset in presets.every() if preset.env_id == env_id]
-        for i, preset in enumerate(of_env):
-            first = env_id if i == 0 else ""
-            result = presets.find_result(preset.env_id, preset.algorithm)
-            rows.append((first, preset.algorithm, f"{preset.total_steps:,} steps", str(result or preset.source)))
-    print(columns(rows))
+    rows: dict[str, list[tuple[str, ...]]] = {}
+    for one in presets.every():
+        result = presets.find_result(one.env_id, one.algorithm) or one.source
+        of_env = rows.setdefault(one.env_id, [])
+        of_env.append(("" if of_env else one.env_id, one.algorithm, f"{one.total_steps:,} steps", str(result)))
+    print(columns([row for of_env in rows.values() for row in of_env]))
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
-    return 0
 
 
 def described(is_extended: bool) -> dict[str, str]:
@@ -56,17 +55,9 @@ def described(is_extended: bool) -> dict[str, str]:
 
 def as_dict(preset: Preset) -> dict[str, Any]:
     """Returns a preset with its measured result, which is None if there is none."""
-    return {
-        "env_id": preset.env_id,
-        "algorithm": preset.algorithm,
-        "n_envs": preset.n_envs,
-        "total_steps": preset.total_steps,
-        "evaluate_every": preset.evaluate_every,
-        "evaluate_episodes": preset.evaluate_episodes,
-        "hyperparameters": preset.hyperparameters,
-        "source": preset.source,
-        "result": presets.find_result(preset.env_id, preset.algorithm),
-    }
+    names = ("env_id", "algorithm", "n_envs", "total_steps", "evaluate_every", "evaluate_episodes", "hyperparameters")
+    known = {name: getattr(preset, name) for name in (*names, "source")}
+    return {**known, "result": presets.find_result(preset.env_id, preset.algorithm)}
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> str:

@@ -80,56 +80,14 @@ def reporter(agent: Agent, table: Sink, label: str = "") -> Callable[[Evaluated,
     return report
 
 
-def summary(
-    agent: Agent,
-    folder: RunFolder,
-    environment: Environment,
-    evaluate: Evaluate,
-    signal: int | None,
-    is_complete: bool,
-    seconds: float,
-    compile_seconds: float,
-) -> str:
-    """Returns the last lines of a run."""
-    options = environment.options()
-    lines = [""]
-    if not is_complete:
-        can_resume = folder.checkpoints.is_dir()
-        how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
-        what = "paused" if signal is None else f"stopped by {NAMES[signal]}"
-        saved = "; everything is saved" if agent.failed_writes.complete else ""
-        lines.append(f"{what}{saved}{how}")
-    if agent.ep_info_buffer:
-        lines.append(
-            f"training      last {counted(len(agent.ep_info_buffer), 'episode')}: {training_statistics(agent)}"
-        )
-    if evaluate.best is not None:
-        lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
-    files = ", ".join(sorted(path.name for path in folder.path.iterdir()))
-    backend = " --backend gymnasium" if environment.is_registered() else ""
-    return "\n".join(
-        [
-            *lines,
-            f"files         {folder.path}: {files}",
-            f"time          {seconds:.1f} s in all, {compile_seconds:.1f} s of them compiling; "
-            f"{agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s",
-            f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
-        ]
-    )
-
-
 def as_dict(
-    agent: Agent,
-    folder: RunFolder,
-    evaluate: Evaluate,
-    signal: int | None,
-    is_complete: bool,
-    seconds: float,
-    compile_seconds: float,
+    agent: Agent, folder: RunFolder, evaluate: Evaluate, signal: int | None, is_complete: bool, stopwatch: Stopwatch
 ) -> dict[str, Any]:
-    """Returns what :func:`summary` says, for ``--json``."""
+    """Returns how a run ended, for :func:`summary` and ``--json``."""
+    means = ("mean_return", "std_return", "mean_length", "success_rate")
     last = agent.history.summary(agent.stats_window_size).last
     best = evaluate.best
+    seconds, compile_seconds = stopwatch.seconds()
     return {
         "run": folder.path,
         "env_id": None if agent.env is None else agent.env.env_id,
@@ -142,17 +100,40 @@ def as_dict(
         "seconds": seconds,
         "compile_seconds": compile_seconds,
         "steps_per_second": agent.steps_per_second,
-        "training": {
-            "episodes": last.n,
-            "mean_return": last.mean_return,
-            "std_return": last.std_return,
-            "mean_length": last.mean_length,
-            "success_rate": last.success_rate,
-        },
+        "training": {"episodes": last.n, **{name: getattr(last, name) for name in means}},
         "best": None if best is None else {"step": best.step, **best.evaluation.to_dict()},
         "files": sorted(path.name for path in folder.path.iterdir()),
         "not_written": [what for what, failure in agent.failed_writes.failures.items() if not failure.written],
     }
+
+
+def summary(
+    facts: dict[str, Any], agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate
+) -> str:
+    """Returns the last lines of a run; ``facts`` are those of :func:`as_dict`."""
+    options = environment.run.again()
+    lines = [""]
+    if not facts["complete"]:
+        can_resume = folder.checkpoints.is_dir()
+        how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
+        what = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
+        saved = "; everything is saved" if agent.failed_writes.complete else ""
+        lines.append(f"{what}{saved}{how}")
+    if agent.ep_info_buffer:
+        last = counted(len(agent.ep_info_buffer), "episode")
+        lines.append(f"training      last {last}: {training_statistics(agent)}")
+    if evaluate.best is not None:
+        lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
+    backend = " --backend gymnasium" if environment.is_registered() else ""
+    return "\n".join(
+        [
+            *lines,
+            f"files         {folder.path}: {', '.join(facts['files'])}",
+            f"time          {facts['seconds']:.1f} s in all, {facts['compile_seconds']:.1f} s of them compiling; "
+            f"{agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s",
+            f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
+        ]
+    )
 
 
 def training_statistics(agent: Agent) -> str:

@@ -1,21 +1,19 @@
-"""The parser of the command line: from words to the dataclass of a command, and help from its docstrings.
+"""The parser of the command line: one of ``argparse`` for each command, made from the dataclass of its arguments.
 
 A mistake gives one line that names the fix.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import argparse
 import difflib
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, get_args, get_origin
 
-from msgspec import Meta
-
-from rejeu.runs.config import Shown
+from rejeu.runs.config import Option, options
 from rejeu.runs.values import assigned
 from rejeu.validation import field_docs, number, whole
 
@@ -46,30 +44,16 @@ PARTS = {"net_arch": "[64,64]", "activation_fn": "relu"}
 """The same that are parts of ``policy_kwargs``."""
 
 
+DASHED = "{name} needs a value, got {text!r}; a path that begins with a dash is written ./{text}"
 MOST = 1e300
 """The upper limit of numbers that have none."""
 
 
-class Option(NamedTuple):
-    """An option or a positional argument of a command."""
+class Parser(argparse.ArgumentParser):
+    """Raises an error where ``argparse`` prints one and exits."""
 
-    field: str
-    name: str
-    """With its dashes; of a positional argument its metavar."""
-    shown: Shown
-    kind: Any
-    """The type of the value: ``bool``, ``int``, ``float``, ``str``, ``Path``, ``dict``, ``tuple`` or a ``Literal``."""
-    item: Any
-    """The type of one word: that of the value, or of an element of a tuple."""
-    limits: dict[str, float]
-    """Of a number: ``ge``, ``gt`` and ``le``."""
-    default: Any
-    """``dataclasses.MISSING`` if it is required."""
-
-    @property
-    def takes_many(self) -> bool:
-        """Whether it takes all words up to the next option; a positional argument, all further positional words."""
-        return self.shown.metavar.endswith("...")
+    def error(self, message: str) -> NoReturn:
+        raise argparse.ArgumentError(None, message)
 
 
 def parse(argv: Sequence[str], commands: Mapping[str, Any], about: str) -> tuple[str, Any]:
@@ -89,66 +73,113 @@ def parse(argv: Sequence[str], commands: Mapping[str, Any], about: str) -> tuple
         raise ValueError("expected a command, such as rejeu train parking-v0; rejeu --help lists all")
     command, *words = argv
     if command in ("-h", "--help"):
-        print_help("rejeu", about, [], {name: kind.__doc__.partition("\n")[0] for name, kind in commands.items()})
+        overview(commands, about).parse_args([command])
     if command not in commands:
         raise ValueError(f"no command is called {command!r}; {nearest(command, commands)}")
-    kind = commands[command]
-    known = [*options(kind)]
-    if {"-h", "--help"} & {*words}:
-        docs = field_docs(kind)
-        print_help(f"rejeu {command}", kind.__doc__, known, {one.name: docs.get(one.field, "") for one in known})
-    found: dict[str, Any] = {}
-    for option, texts in matched(command, words, known):
-        found[option.field] = with_words(option, texts, found.get(option.field))
-    required = (one for one in known if one.default is dataclasses.MISSING)
-    if missing := [one.name for one in required if one.field not in found]:
-        raise ValueError(f"rejeu {command} needs {' and '.join(missing)}; rejeu {command} --help shows what it takes")
-    return command, kind(**found)
+    known = {one.name: one for one in options(commands[command])}
+    parser = make_parser(command, commands[command], known.values(), {"-h", "--help"} & {*words})
+    try:
+        found, rest = parser.parse_known_intermixed_args([normalized(word) for word in words])
+    except argparse.ArgumentError as error:
+        raise ValueError(problem(error, command, words)) from None
+    if unknown := next((word for word in rest if word.startswith("-")), ""):
+        name = unknown.partition("=")[0]
+        named = {key: one for key, one in known.items() if not one.shown.is_positional}
+        raise ValueError(f"rejeu {command} has no option {name}; {replacement(name, command, named)}")
+    if rest:
+        raise ValueError(f"rejeu {command} does not expect {rest[0]!r}; rejeu {command} --help shows what it takes")
+    values = {name: value for name, value in vars(found).items() if value is not None}
+    given = {one.field: collected(one, values[one.field]) for one in known.values() if one.field in values}
+    return command, commands[command](**given)
 
 
-def matched(command: str, words: Sequence[str], known: Sequence[Option]) -> Iterator[tuple[Option, list[str]]]:
-    """Yields each option of a command line with its words."""
-    by_name = {one.name: one for one in known if not one.shown.is_positional}
-    places = [one for one in known if one.shown.is_positional]
-    rest = [*words]
-    while rest:
-        word = rest.pop(0)
-        if not word.startswith("-"):
-            if not places:
-                raise ValueError(
-                    f"rejeu {command} does not expect {word!r}; rejeu {command} --help shows what it takes"
-                )
-            yield places[0], [word]
-            places = places if places[0].takes_many else places[1:]
+def overview(commands: Mapping[str, Any], about: str) -> argparse.ArgumentParser:
+    """Returns the parser whose help lists the commands."""
+    parser = Parser("rejeu", description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    listed = parser.add_subparsers(metavar="COMMAND")
+    for name, kind in commands.items():
+        listed.add_parser(name, help=kind.__doc__.partition("\n")[0].replace("%", "%%"))
+    return parser
+
+
+def make_parser(command: str, kind: type, known: Iterable[Option], with_help: object) -> argparse.ArgumentParser:
+    """Returns the parser of a command, by default without help texts. What is not given is no attribute of its result."""
+    parser = Parser(
+        f"rejeu {command}",
+        description=inspect.cleandoc(kind.__doc__ or ""),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,
+        allow_abbrev=False,
+        exit_on_error=False,
+    )
+    docs = field_docs(kind) if with_help else {}
+    for one in known:
+        text = docs.get(one.field, one.shown.help).replace("%", "%%")
+        if one.kind is bool:
+            parser.add_argument(one.name, dest=one.field, action="store_true", default=argparse.SUPPRESS, help=text)
             continue
+        if isinstance(one.default, str | int | float | Path):
+            text += f" (default: {one.default:g})" if isinstance(one.default, float) else f" (default: {one.default})"
+        settings: dict[str, Any] = {
+            "metavar": one.shown.metavar.removesuffix(" ..."),
+            "help": text,
+            "type": reader(one),
+        }
+        if one.takes_many:
+            settings["nargs"] = "+" if one.is_required or not one.shown.is_positional else "*"
+        elif one.shown.is_positional and not one.is_required:
+            settings |= {"nargs": "?", "default": None}
+        if one.shown.is_positional:
+            parser.add_argument(one.field, **settings)
+        else:
+            many = {dict: "extend", tuple: "extend" if one.takes_many else "append"}
+            parser.add_argument(one.name, dest=one.field, action=many.get(one.kind, "store"), **settings)
+    return parser
+
+
+def normalized(word: str) -> str:
+    """Returns a word as ``argparse`` reads it: options by their present names, with dashes, and -1e3 as -1000.0.
+
+    >>> [normalized(word) for word in ("--evaluate_every=5", "--film-every", "-1e3", "a_b")]
+    ['--evaluate-every=5', '--video-every', '-1000.0', 'a_b']
+    """
+    if word.startswith("--"):
         name, equals, text = word.partition("=")
-        name = OLDER.get(name.replace("_", "-"), name.replace("_", "-"))
-        if name not in by_name:
-            raise ValueError(f"rejeu {command} has no option {name}; {replacement(name, command, by_name)}")
-        option = by_name[name]
-        if option.kind is bool:
-            if equals:
-                raise ValueError(f"{name} takes no value, got {text!r}; leave it out or write {name} alone")
-            yield option, []
-            continue
-        texts = [text] if equals else []
-        while not equals and rest and not rest[0].startswith("--") and (option.takes_many or not texts):
-            texts.append(rest.pop(0))
-        if not texts:
-            raise ValueError(f"{name} needs a value")
-        yield option, texts
+        name = name.replace("_", "-")
+        return OLDER.get(name, name) + equals + text
+    if word.startswith("-"):
+        with suppress(ValueError):
+            return f"{int(word)}" if word[1:].isdecimal() else f"{float(word)}"
+    return word
 
 
-def with_words(option: Option, texts: Sequence[str], before: Any) -> Any:
-    """Returns the value of an option; one that may be repeated is added to the value ``before``."""
-    values = [read(option, text) for text in texts]
-    if option.kind is bool:
-        return True
-    if option.kind is dict:
-        return {**(before or {}), **assigned(values, option.name)}
-    if option.kind is tuple:
-        return (*(before or ()), tuple(values)) if option.item is tuple else (*(before or ()), *values)
-    return values[0]
+def problem(error: argparse.ArgumentError, command: str, words: Sequence[str]) -> str:
+    """Returns the line about what ``argparse`` found wrong."""
+    text, name = error.message, error.argument_name
+    if name is None:
+        missing = text.partition(": ")[2].replace(", ", " and ")
+        return f"rejeu {command} needs {missing}; rejeu {command} --help shows what it takes"
+    if text.startswith("ignored explicit argument"):
+        return f"{name} takes no value, got {text.partition(' argument ')[2]}; leave it out or write {name} alone"
+    if not text.startswith("expected"):
+        return text
+    place = next((i for i, word in enumerate(words) if normalized(word) == name), len(words))
+    following = next(iter(words[place + 1 :]), "--")
+    if following.startswith("--"):
+        return f"{name} needs a value"
+    return DASHED.format(name=name, text=following)
+
+
+def reader(option: Option) -> Callable[[str], Any]:
+    """Returns the function that reads a word of an option; what it raises becomes the message as it is."""
+
+    def convert(text: str) -> Any:
+        try:
+            return read(option, text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return convert
 
 
 def read(option: Option, text: str) -> Any:
@@ -157,14 +188,11 @@ def read(option: Option, text: str) -> Any:
     Raises:
         ValueError: if it is of the wrong type or out of range.
     """
-    choices = get_args(option.kind) if get_origin(option.kind) is Literal else ()
-    if choices and text not in choices:
-        raise ValueError(f"{option.name} {text!r} must be one of {', '.join(choices)}")
+    if get_origin(option.kind) is Literal and text not in get_args(option.kind):
+        raise ValueError(f"{option.name} {text!r} must be one of {', '.join(get_args(option.kind))}")
     if option.item not in (int, float):
         if text.startswith("-"):
-            raise ValueError(
-                f"{option.name} needs a value, got {text!r}; a path that begins with a dash is written ./{text}"
-            )
+            raise ValueError(DASHED.format(name=option.name, text=text))
         return Path(text) if option.item is Path else text
     what = "whole number" if option.item is int else "number"
     try:
@@ -173,12 +201,16 @@ def read(option: Option, text: str) -> Any:
         raise ValueError(f"{option.name} {text!r} must be a {what}") from None
     if option.item is float:
         names = {"ge": "least", "gt": "above", "le": "most"}
-        return number(
-            option.name, float(value), **{names[key]: limit for key, limit in option.limits.items() if limit < MOST}
-        )
+        limits = {names[key]: limit for key, limit in option.limits.items() if limit < MOST}
+        return number(option.name, float(value), **limits)
     if value != value // 1:
         raise ValueError(f"{option.name} {text} must be a whole number")
     return whole(option.name, int(value), int(option.limits.get("ge", 0)), int(option.limits.get("le", 2**63 - 1)))
+
+
+def collected(option: Option, found: Any) -> Any:
+    """Returns the value of an option that was given: of one that may be repeated, that of all its words."""
+    return assigned(found, option.name) if option.kind is dict else tuple(found) if option.kind is tuple else found
 
 
 def replacement(name: str, command: str, known: Mapping[str, Any]) -> str:
@@ -197,61 +229,3 @@ def nearest(name: str, known: Mapping[str, Any]) -> str:
     """Returns the part of a message that names the nearest known name, or all of them."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     return f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-
-
-def options(kind: type) -> Iterator[Option]:
-    """Yields the options of a command from the dataclass of its arguments: flags, and fields with a :class:`Shown`."""
-    hints = get_type_hints(kind, include_extras=True)
-    for one in dataclasses.fields(kind):
-        hint, marks = unmarked(hints[one.name])
-        shown = Shown("") if hint is bool else next((mark for mark in marks if isinstance(mark, Shown)), None)
-        if shown is None:
-            continue
-        if get_origin(hint) in (Union, UnionType):
-            hint, inner = unmarked(get_args(hint)[0])  # None and others are no words
-            marks = [*marks, *inner]
-        kind_of = get_origin(hint) if get_origin(hint) in (tuple, dict) else hint
-        item = get_args(hint)[0] if kind_of is tuple else hint
-        numbers = [(key, getattr(mark, key)) for mark in marks if isinstance(mark, Meta) for key in ("ge", "gt", "le")]
-        is_required = one.default is dataclasses.MISSING and one.default_factory is dataclasses.MISSING
-        yield Option(
-            field=one.name,
-            name=shown.metavar if shown.is_positional else f"--{(shown.name or one.name).replace('_', '-')}",
-            shown=shown,
-            kind=kind_of,
-            item=tuple if get_origin(item) is tuple else unmarked(item)[0],
-            limits={key: limit for key, limit in numbers if limit is not None},
-            default=dataclasses.MISSING if is_required else None if one.default is dataclasses.MISSING else one.default,
-        )
-
-
-def unmarked(hint: Any) -> tuple[Any, list[Any]]:
-    """Returns a type without its annotations, and these."""
-    return (get_args(hint)[0], [*get_args(hint)[1:]]) if get_origin(hint) is Annotated else (hint, [])
-
-
-def print_help(program: str, about: str, known: Sequence[Option], docs: Mapping[str, str]) -> NoReturn:
-    """Prints the help of a program, with a text for each of its options or commands, and exits."""
-    import argparse
-
-    parser = argparse.ArgumentParser(
-        program, description=inspect.cleandoc(about), formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    for one in known:
-        default = one.shown.default
-        if not default and isinstance(one.default, str | int | float | Path) and one.kind is not bool:
-            default = f"(default: {one.default})"
-        text = f"{docs[one.name]} {default}".strip().replace("%", "%%")
-        if one.kind is bool:
-            parser.add_argument(one.name, action="store_true", help=text)
-        else:
-            metavar = one.shown.metavar.removesuffix(" ...")
-            many = {"nargs": "*" if one.shown.is_positional else "+"} if one.takes_many else {}
-            name = one.field if one.shown.is_positional else one.name
-            parser.add_argument(name, metavar=metavar, help=text, **many)  # type: ignore[arg-type]
-    if not known:
-        commands = parser.add_subparsers(metavar="COMMAND")
-        for name, text in docs.items():
-            commands.add_parser(name, help=text.replace("%", "%%"))
-    parser.print_help()
-    raise SystemExit(0)

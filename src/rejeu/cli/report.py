@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -20,8 +19,8 @@ from rejeu.validation import whole
 SUFFIXES = (".html", ".htm")
 
 
-def run(arguments: Report) -> int:
-    """Writes the page, or serves it until Ctrl-C, and returns the exit status.
+def run_report(arguments: Report) -> tuple[int, None]:
+    """Writes the page, or serves it until Ctrl-C.
 
     Raises:
         ValueError: for ``--out`` or ``--replay`` with ``--live``, or for a file that is no page.
@@ -31,7 +30,8 @@ def run(arguments: Report) -> int:
             raise ValueError("--live serves the page and writes no file; leave out --out, or --live")
         if arguments.replay is not None:
             raise ValueError("--replay plays the trained agent; leave out --replay, or --live")
-        return follow(arguments.runs, arguments.open)
+        follow(arguments)
+        return 0, None
     if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
     for path in arguments.runs if arguments.replay is not None else ():
@@ -40,7 +40,7 @@ def run(arguments: Report) -> int:
     print(path, flush=True)
     if arguments.open:
         webbrowser.open(path.absolute().as_uri())
-    return 0
+    return 0, None
 
 
 def replay(path: Path, arguments: Report) -> None:
@@ -65,12 +65,11 @@ def replay(path: Path, arguments: Report) -> None:
         file.write(("\n".join(rows) + "\n").encode())
 
 
-def follow(runs: Sequence[Path], in_browser: bool) -> int:
+def follow(arguments: Report) -> None:
     """Serves the page until Ctrl-C or SIGTERM ends the process."""
-    server, address = make_server(runs)
+    server, address = make_server(arguments.runs)
     print(f"{address} (Ctrl-C ends it)", flush=True)
-    if in_browser:
+    if arguments.open:
         webbrowser.open(address)
     with server, leaving("the page is no longer served"):
         server.serve_forever()
-    return 0

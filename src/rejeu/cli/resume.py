@@ -11,7 +11,7 @@ from typing import Any
 from rejeu import devices
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
-from rejeu.cli import environment as environments, jsonout, pbt, sweep, tune
+from rejeu.cli import environment as environments, sweep, tune
 from rejeu.cli.commands import Resume
 from rejeu.cli.output import Stopwatch, echo
 from rejeu.cli.session import Limits, Session, has_reached_goal, make_evaluation_env
@@ -28,21 +28,21 @@ from rejeu.runs.folder import RunFolder, read_config
 from rejeu.runs.values import merged, quoted
 
 
-def run(arguments: Resume) -> int:
-    """Trains and returns the exit status, as ``rejeu train``, ``rejeu sweep`` or ``rejeu tune`` does.
+def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Trains, as ``rejeu train``, ``rejeu sweep``, ``rejeu tune`` or ``rejeu pbt`` does.
 
     Raises:
         ValueError: for options of a sweep with the folder of a run.
     """
     if is_sweep(arguments.run):
-        return jsonout.run(sweep.resume, arguments)
+        return sweep.resume(arguments)
     if StudyFolder(arguments.run).plan.is_file():
-        return jsonout.run(tune.resume, arguments)
+        return tune.resume_study(arguments)
     if (arguments.run / FILE).is_file():
-        return jsonout.run(pbt.resume, arguments)
+        return tune.resume_population(arguments)
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
-    return jsonout.run(resume, arguments)
+    return resume(arguments)
 
 
 def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
@@ -56,7 +56,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     device = arguments.device or ("cpu" if config.device == "cpu" else "auto")  # a GPU may not be here
     devices.start_with("--device", device)
     kind = agent_of_file(config.algorithm, folder.config)
-    environment = environments.of_run(folder, config, arguments)
+    environment = environments.from_run(config, folder.path, arguments)
     ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
     workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=config.wait_for, ray=ray)
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:

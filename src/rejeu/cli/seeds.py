@@ -1,4 +1,4 @@
-"""``rejeu train ENV --seeds N``: several seeds in processes of their own, and the comparison of them."""
+"""``rejeu train ENV --seeds N``: several seeds, in processes of their own or in one program, and the comparison of them."""
 
 from __future__ import annotations
 
@@ -6,24 +6,34 @@ import dataclasses
 import os
 import re
 import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rejeu.cli import jsonout, sweep
+from rejeu import devices
+from rejeu.agents import training
+from rejeu.agents.device import reason_against, require_memory
+from rejeu.agents.together import learn_together, sibling, start_device
+from rejeu.cli import sweep
 from rejeu.cli.commands import Train
-from rejeu.experiments.folder import Sweep, open_folder
-from rejeu.experiments.jobs import Job
+from rejeu.cli.importing import find_id
+from rejeu.cli.output import Stopwatch, echo, header
+from rejeu.cli.session import Session, make_evaluation_env
+from rejeu.envs.functional.registry import is_functional
+from rejeu.experiments.folder import Sweep, SweepFolder, open_folder
+from rejeu.experiments.jobs import Job, again
 from rejeu.experiments.process import LocalLauncher, default_workers, threads_of
-from rejeu.experiments.table import echo
+from rejeu.interrupt import NAMES, Interrupt
+from rejeu.runs import config as configs
 from rejeu.runs.config import RunConfig
-from rejeu.runs.folder import check_free
+from rejeu.runs.folder import RunFolder, check_free
+from rejeu.runs.values import quoted
 
-
-def run(arguments: Train) -> int:
-    """Trains all seeds and compares them; returns 0, 2 if a seed failed, 130 after Ctrl-C and 143 after SIGTERM."""
-    return jsonout.run(train_all, arguments)
+Begin = Callable[[Train, int, ExitStack], Session]
+"""Makes the session of a seed; see :func:`rejeu.cli.train.begin`."""
 
 
 def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
@@ -41,14 +51,8 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
 
 
 def make_jobs(arguments: Train) -> tuple[Job, ...]:
-    """Returns one job for each seed.
-
-    Raises:
-        ValueError: for an invalid option.
-    """
+    """Returns one job for each seed."""
     assert arguments.seeds is not None
-    if arguments.pause is not None:
-        raise ValueError("--pause is for a single run; leave out --seeds, or --pause")
     first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
     if arguments.ray not in (None, "auto"):
@@ -70,3 +74,95 @@ def choose_folder(arguments: Train) -> Path:
     check_free(arguments.out)
     name = "-".join(filter(None, [arguments.env, arguments.algorithm, "seeds", time.strftime("%Y%m%d-%H%M%S")]))
     return arguments.out or Path("runs") / re.sub(r"[^\w.-]+", "-", name)
+
+
+def fit_together(arguments: Train) -> bool:
+    """Returns whether seeds are trained in one program: in a JAX environment without wrappers, and without ``--jobs``.
+
+    Imports the environment if it is one of the user's own.
+    """
+    return arguments.jobs is None and not arguments.wrappers and is_functional(find_id(arguments.env))
+
+
+def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
+    """Trains all seeds and compares them; returns the exit status and the result.
+
+    Settings that cannot be trained on the device are trained in processes.
+    """
+    stopwatch, jobs = Stopwatch(), make_jobs(arguments)
+    devices.start_with("--device", arguments.device)
+    path = choose_folder(arguments)
+    start_device(len(jobs))
+    with ExitStack() as stack:
+        first = begin(arguments, jobs[0].seed, stack)
+        if reason := reason_against(first.agent, ()):
+            echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
+            return train_all(arguments)
+        require_memory(first.agent, len(jobs))
+        folder = open_folder(path, Sweep(jobs=jobs, threads=threads_of(1)), None, arguments)
+        sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
+        sessions = [named(session, folder, job) for session, job in zip(sessions, jobs, strict=True)]
+        echo(
+            header(
+                first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)
+            )
+        )
+        for job in jobs:
+            claim = folder.claim(job)
+            assert claim is not None, "another process uses a new folder"
+            stack.callback(claim.release)
+        with Interrupt() as stop:
+            statuses = train(sessions, stop, stopwatch)
+        if stop.signal is None:
+            for job, status in zip(jobs, statuses, strict=True):
+                folder.write_exit(job, status)
+    comparison = sweep.summarize(path)
+    runs = [
+        {"seed": job.run.seed, "path": folder.run(job), "exit_status": status}
+        for job, status in zip(jobs, statuses, strict=True)
+    ]
+    result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
+    if stop.signal is not None:
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, arguments)} continues, each seed in a "
+            "process of its own"
+        )
+        return 128 + stop.signal, result
+    return max(statuses), result
+
+
+def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
+    """Returns the session of another seed, whose agent shares the compiled functions of the first; ``stack`` closes it."""
+    config = dataclasses.replace(first.config, seed=seed)
+    env = stack.enter_context(closing(first.environment.vector(config.n_envs, config.backend, seed)))
+    evaluation_env = stack.enter_context(closing(make_evaluation_env(config, first.environment)))
+    return first._replace(agent=sibling(first.agent, env, seed), config=config, evaluation_env=evaluation_env)
+
+
+def named(session: Session, folder: SweepFolder, job: Job) -> Session:
+    """Returns a session with its new run folder."""
+    path = folder.run(job)
+    path.mkdir(parents=True, exist_ok=True)
+    session = session._replace(folder=RunFolder(path), label=f"seed {job.run.seed}: ")
+    configs.write(session.folder.config, session.config)
+    return session
+
+
+def train(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatch) -> list[int]:
+    """Trains the runs together and finishes each; returns their exit statuses."""
+    agents = [session.agent for session in sessions]
+    with ExitStack() as stack:
+        learnings = [stack.enter_context(session.training(stop)) for session in sessions]
+        calls = [
+            training.start_call(one.agent, one.limits.steps, None, one.limits.minutes, one.log_interval, True)
+            for one in sessions
+        ]
+        learn_together(
+            agents,
+            calls,
+            [learning.callbacks for learning in learnings],
+            [learning.sinks for learning in learnings],
+            progress_bar=True,
+        )
+    finished = zip(sessions, learnings, strict=True)
+    return [session.finish(learning, stop, stopwatch)[0] for session, learning in finished]

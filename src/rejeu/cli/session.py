@@ -1,30 +1,38 @@
-"""What ``rejeu train`` and ``rejeu resume`` share: a session of training in a run folder."""
+"""What ``rejeu train`` and ``rejeu resume`` share: a session of training in a run folder, and the files that it leaves."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 
-from rejeu.agents import Agent
+from rejeu import errors
+from rejeu.agents import Agent, load
 from rejeu.agents.outputs import run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo, calling
-from rejeu.cli import results
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.envs.make import VectorEnv
 from rejeu.interrupt import Interrupt, leaving
 from rejeu.loops.run import Progress
+from rejeu.reporting import plots, report, video
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
 from rejeu.runs.config import DecidedRun
-from rejeu.runs.folder import RunFolder
+from rejeu.runs.folder import RunFolder, write_arrivals as write_order
 from rejeu.runs.values import quoted
+
+VIDEO_EPISODES = 3
+VIDEO_STEPS = 600
+"""Most steps of a video: a poor policy's episodes are long, and highway-env renders some 70 frames a second."""
 
 
 class Limits(NamedTuple):
@@ -117,12 +125,12 @@ class Session(NamedTuple):
             if is_complete:
                 with leaving(f"interrupted after training; the models are saved in {folder.path}"):
                     evaluate_now(evaluate, agent)
-                    results.plot_curve(agent, folder, environment, evaluate)
+                    plot_curve(agent, folder, environment, evaluate)
                     if self.has_video:
-                        results.record_video(agent, folder, environment, self.config.seed, learning.outputs)
+                        record_video(agent, folder, environment, self.config.seed, learning.outputs)
             else:
-                results.plot_curve(agent, folder, environment, evaluate)
-                again = f"rejeu record {quoted(folder.path)}{environment.options()}"
+                plot_curve(agent, folder, environment, evaluate)
+                again = f"rejeu record {quoted(folder.path)}{environment.run.again()}"
                 echo(f"no video of a run that was stopped; {again} makes one")
         except Exception:
             self.write_report()
@@ -130,11 +138,10 @@ class Session(NamedTuple):
         finally:
             learning.close()
         self.write_report()
-        seconds = stopwatch.seconds()
-        echo(summary(agent, folder, environment, evaluate, stop.signal, is_complete, *seconds))
+        result = as_dict(agent, folder, evaluate, stop.signal, is_complete, stopwatch)
+        echo(summary(result, agent, folder, environment, evaluate))
         if failed := agent.failed_writes.summary():
             print(f"warning: {failed}", file=sys.stderr)
-        result = as_dict(agent, folder, evaluate, stop.signal, is_complete, *seconds)
         if stop.signal is not None:
             return 128 + stop.signal, result
         return (0 if agent.failed_writes.complete else 2), result
@@ -158,7 +165,7 @@ class Session(NamedTuple):
         episodes = EpisodeTable(lambda: agent.history, folder.episodes)
         learning = Learning(evaluate, callbacks, outputs, [*outputs, RetryingSink(episodes, agent.failed_writes)])
         try:
-            with noted_in(folder.warnings), results.saved_at_exit(agent, folder, evaluate):
+            with noted_in(folder.warnings), saved_at_exit(agent, folder, evaluate):
                 yield learning
         except BaseException as error:
             if isinstance(error, Exception):
@@ -177,7 +184,7 @@ class Session(NamedTuple):
 
         def save(agent: Agent, turn: Progress) -> None:
             if has_reached_goal(agent):  # before the last evaluation, which may take longer than training
-                results.save(agent, folder.agent)
+                save_model(agent, folder.agent)
                 echo(f"{self.label}evaluating the final policy on {counted(episodes, 'episode')}; Ctrl-C ends it")
 
         def finish(agent: Agent, turn: Progress) -> bool:
@@ -188,7 +195,7 @@ class Session(NamedTuple):
         callbacks: list[Any] = [save, evaluate, finish]
         if config.video_every is not None:
             render = self.environment.rendering
-            callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=results.VIDEO_STEPS))
+            callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
         if config.checkpoint_minutes:
             callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
         return evaluate, callbacks
@@ -196,7 +203,7 @@ class Session(NamedTuple):
     def write_report(self) -> None:
         """Writes the page about the run, unless the run is to have none."""
         if self.has_report:
-            results.write_report(self.folder)
+            write_report(self.folder)
 
 
 def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:
@@ -227,3 +234,62 @@ def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:
         return by_steps or (until is not None and time.monotonic() >= until)
 
     return is_due
+
+
+@contextmanager
+def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterator[None]:
+    """Context at whose end models and tables are written, also after an error of the environment or of the numbers."""
+    try:
+        yield
+        save_model(agent, folder.agent)
+        if not evaluate.results:
+            save_model(agent, folder.best)
+    except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
+        save_model(agent, folder.agent)
+        raise
+    finally:
+        write_arrivals(agent, folder)
+        write = partial(agent.history.write_csv, folder.episodes)
+        agent.failed_writes.attempt(f"table {folder.episodes}", write)
+
+
+def write_arrivals(agent: Agent, folder: RunFolder) -> None:
+    """Writes the order in which the results of environments were taken, if they did not wait for each other."""
+    if agent.env is not None and (arrivals := agent.env.arrivals) is not None:
+        write = partial(write_order, folder, arrivals)
+        agent.failed_writes.attempt(f"order of arrival {folder.arrivals}", write)
+
+
+def save_model(agent: Agent, path: Path) -> None:
+    """Saves a model, or warns and tries again at the end of the command."""
+    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
+
+
+def plot_curve(agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate) -> None:
+    """Plots the learning curve, or prints why not."""
+    title = f"{environment.env_id}, {agent.name}"
+    try:
+        plots.learning_curve(agent.history, folder.curve, evaluations=evaluate.results, title=title)
+    except (ImportError, OSError) as error:
+        echo(f"no curve: {' '.join(str(error).split())}")
+
+
+def record_video(
+    agent: Agent, folder: RunFolder, environment: Environment, seed: int, outputs: Iterable[RetryingSink]
+) -> None:
+    """Records a video of the best model and adds it to the outputs, or prints why not."""
+    try:
+        video.record_video(load(folder.best), folder.video, environment.rendering, VIDEO_EPISODES, VIDEO_STEPS, seed)
+    except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
+        echo(f"no video: {' '.join(str(error).split())}")
+        return
+    for output in outputs:
+        output.write_video(agent.num_timesteps, folder.video)
+
+
+def write_report(folder: RunFolder) -> None:
+    """Writes the page about the run, or prints why not."""
+    try:
+        report.write_report(folder.path, folder.report)
+    except (ImportError, OSError) as error:
+        echo(f"no report: {' '.join(str(error).split())}")

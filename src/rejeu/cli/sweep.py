@@ -5,28 +5,29 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rejeu.cli import jsonout
 from rejeu.cli.commands import Resume, Sweep
 from rejeu.errors import MissingExtra
-from rejeu.experiments.coordinator import Coordinator, Outcome
 from rejeu.experiments.folder import SweepFolder, read_folder
 from rejeu.experiments.jobs import again
 from rejeu.experiments.scheduler import Launcher
-from rejeu.experiments.sweep import SweepResult, make_launcher, prepare
-from rejeu.experiments.table import closing_lines, echo, shown
+from rejeu.experiments.sweep import (
+    Coordinator,
+    Outcome,
+    SweepResult,
+    closing_lines,
+    echo,
+    make_launcher,
+    prepare,
+    shown,
+)
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.comparison import By, Comparison, compare
 from rejeu.runs.config import RunConfig
 from rejeu.runs.values import quoted
 
 
-def run(arguments: Sweep) -> int:
-    """Trains and returns the exit status: 0, 2 if a run failed, 130 after Ctrl-C and 143 after SIGTERM."""
-    return jsonout.run(begin, arguments)
-
-
-def begin(arguments: Sweep) -> tuple[int, dict[str, Any]]:
-    """Begins or joins a sweep; returns the exit status and the result."""
+def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
+    """Begins or joins a sweep; the exit status is 0, 2 if a run failed, 130 after Ctrl-C and 143 after SIGTERM."""
     typed = RunConfig(env="", imports=arguments.imports)
     folder = prepare(arguments.plan, arguments.out, arguments.workers, typed, arguments.ray)
     return complete(folder, typed, arguments.workers, arguments.ray, retry=False)

@@ -1,35 +1,46 @@
-"""``rejeu train``: from the id of an environment to a run folder with a trained agent, a learning curve and a video."""
+"""``rejeu train``: from the id of an environment to a run folder with a trained agent, a learning curve and a video.
+
+The command line decides, then the preset of the environment, then the defaults.
+"""
 
 from __future__ import annotations
 
+import warnings
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
-from rejeu import devices
-from rejeu.agents import AGENTS, find_agent
-from rejeu.cli import check, choices, environment, jsonout, seeds, together
+from rejeu import devices, presets, validation
+from rejeu.agents import AGENTS, agent_of_file, find_agent
+from rejeu.algorithms import config as configs
+from rejeu.cli import check, environment, seeds
 from rejeu.cli.commands import Train
+from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, echo, header
 from rejeu.cli.session import Limits, Session, make_evaluation_env
+from rejeu.envs.make import VectorEnv, WorkerOptions
+from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.interrupt import Interrupt
-from rejeu.runs import config as configs
-from rejeu.runs.folder import RunFolder, check_free, create
+from rejeu.io.records import shown
+from rejeu.presets import Preset
+from rejeu.reporting.logging import check_logs, require
+from rejeu.reporting.video_file import ffmpeg
+from rejeu.runs import config as runs
+from rejeu.runs.config import DecidedRun
+from rejeu.runs.folder import RunFolder, check_free, create, read_arrivals
+from rejeu.runs.values import merged
+
+MANY = 64
+"""Number of environments from which an algorithm's values for many environments are used."""
 
 
-def run(arguments: Train) -> int:
-    """Trains and returns the exit status: 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
-    if arguments.seeds is None:
-        return jsonout.run(train, arguments)
-    if together.is_possible(arguments):
-        return jsonout.run(lambda arguments: together.train_all(arguments, begin), arguments)
-    return seeds.run(arguments)
-
-
-def train(arguments: Train) -> tuple[int, dict[str, Any]]:
-    """Trains; returns the exit status and the result."""
+def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
+    """Trains; the exit status is 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
+    if arguments.seeds is not None:
+        return seeds.train_together(arguments, begin) if seeds.fit_together(arguments) else seeds.train_all(arguments)
     stopwatch = Stopwatch()
     devices.start_with("--device", arguments.device)
     check_free(arguments.out)
@@ -38,20 +49,20 @@ def train(arguments: Train) -> tuple[int, dict[str, Any]]:
         session, stop = begin(arguments, seed, stack), stack.enter_context(Interrupt())
         folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
         session = session._replace(folder=folder)
-        configs.write(folder.config, session.config)
+        runs.write(folder.config, session.config)
         echo(header(session.config, session.environment, session.backend, folder))
         return session.run(stop, stopwatch)
 
 
 def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
     """Returns the session of a new run, for which there is no folder yet; ``stack`` closes its environments."""
-    logs = choices.installed_logs(arguments)
+    logs = installed_logs(arguments)
     algorithm = None if arguments.algorithm is None else find_agent(arguments.algorithm).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
-    preset = choices.find_preset(arguments, made, algorithm)
-    env = stack.enter_context(closing(choices.make_env(arguments, made, preset, seed)))
-    algorithm = algorithm or choices.choose_algorithm(preset, env)
-    config = choices.make_config(arguments, made, preset, algorithm, env, seed, logs)
+    preset = find_preset(arguments, made, algorithm)
+    env = stack.enter_context(closing(make_env(arguments, made, preset, seed)))
+    algorithm = algorithm or choose_algorithm(preset, env)
+    config = make_config(arguments, made, preset, algorithm, env, seed, logs)
     general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
     if env.backend not in ("envpool", "jax"):
@@ -66,5 +77,129 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
         is_new=True,
         has_report=not arguments.no_report,
         has_video=not arguments.no_video,
-        backend=choices.describe_backend(env, made, preset),
+        backend=describe_backend(env, made, preset),
+    )
+
+
+def installed_logs(arguments: Train) -> tuple[str, ...]:
+    """Returns the logs of ``--log``.
+
+    Raises:
+        ValueError: for an unknown one.
+        MissingExtra: if what they or ``--video-every`` need is not installed, before anything is trained.
+    """
+    logs = check_logs("--log", arguments.log)
+    require(logs)
+    if arguments.video_every is not None:
+        ffmpeg()
+    return logs
+
+
+def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:
+    """Returns the preset of ``--preset``, else that of the environment, None if there is none.
+
+    Raises:
+        ValueError: if the file's preset is for another algorithm than ``--algo`` says, or one that is not known.
+    """
+    if arguments.preset is None:
+        return presets.find(made.env_id, algorithm)
+    preset = presets.read(Path(str(arguments.preset)))
+    agent_of_file(preset.algorithm, str(arguments.preset))
+    if algorithm not in (None, preset.algorithm):
+        raise ValueError(
+            f"--algo {algorithm} differs from the algorithm of --preset {arguments.preset}, which is {preset.algorithm}; "
+            "leave out one of them"
+        )
+    if preset.env_id != made.env_id:
+        warnings.warn(f"--preset {arguments.preset} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
+    return preset
+
+
+def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
+    """Returns the training environments."""
+    n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
+    backend = default_backend(made, preset)
+    if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
+        backend = "gymnasium"
+    backend = arguments.backend or backend
+    order = None if arguments.arrivals is None else read_arrivals(Path(arguments.arrivals))
+    ray = None
+    if backend == "ray" or arguments.ray is not None:
+        ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus}
+    workers = WorkerOptions(
+        restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order, ray=ray
+    )
+    return made.vector(n_envs, backend, seed, workers)
+
+
+def default_backend(made: Environment, preset: Preset | None) -> str:
+    """Returns the backend of a preset, and ``"auto"`` without one."""
+    return preset.backend if preset and made.is_plain else "auto"
+
+
+def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -> str:
+    """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
+    if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
+        return env.backend
+    return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
+
+
+def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
+    """Returns the preset's algorithm, or the default for the environment's action space.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if preset is not None:
+        return preset.algorithm
+    kind = type(env.action_space).__name__
+    if kind not in presets.ALGORITHM_FOR:
+        known = ", ".join(f"{name} takes {space}" for space, name in presets.ALGORITHM_FOR.items())
+        raise ValueError(f"{env.env_id} has the actions {env.action_space}, which no algorithm here takes; {known}")
+    return presets.ALGORITHM_FOR[kind]
+
+
+def make_config(
+    arguments: Train,
+    made: Environment,
+    preset: Preset | None,
+    algorithm: str,
+    env: VectorEnv,
+    seed: int,
+    logs: tuple[str, ...],
+) -> DecidedRun:
+    """Returns the configuration of the run: the arguments, then the preset, then the defaults.
+
+    Raises:
+        TypeError: for an unknown hyperparameter, with the nearest known one.
+        ValueError: for an invalid value.
+    """
+    for_many = AGENTS[algorithm].algorithm.Config.for_many if env.n_envs >= MANY else {}
+    base = presets.default(made.env_id, algorithm, for_many) if preset is None else preset
+    hyperparameters = merged(arguments.hyperparameters, base.hyperparameters)
+    config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
+    nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
+    return DecidedRun(
+        env=made.env_id,
+        env_argument=made.run.env,
+        env_kwargs=dict(made.kwargs),
+        wrappers=made.run.wrappers,
+        imports=made.run.imports,
+        algorithm=algorithm,
+        preset=preset is not None,
+        hyperparameters=configs.to_json(config),
+        policy="MultiInputPolicy" if nested else "MlpPolicy",
+        seed=seed,
+        n_envs=env.n_envs,
+        backend=env.backend,
+        wait_for=env.wait_for,
+        device=devices.named(arguments.device, "--device"),
+        steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
+        minutes=arguments.minutes,
+        success_threshold=arguments.success_threshold,
+        video_every=arguments.video_every,
+        evaluate_every=arguments.evaluate_every or base.evaluate_every,
+        evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
+        checkpoint_minutes=arguments.checkpoint_minutes or None,
+        log=logs,
     )

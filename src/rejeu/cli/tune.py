@@ -1,12 +1,14 @@
-"""``rejeu tune``: a search of hyperparameters in a study folder, and its continuation by ``rejeu resume``."""
+"""``rejeu tune`` and ``rejeu pbt``: searches of hyperparameters and populations, which ``rejeu resume`` continues."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
@@ -14,11 +16,13 @@ from rich.markup import escape
 from rejeu import presets
 from rejeu.agents import AGENTS, agent_of_file, find_agent, modules_of
 from rejeu.algorithms.search import Dimension
-from rejeu.cli import environment, jsonout
+from rejeu.cli import environment
 from rejeu.cli.commands import Pbt, Resume, Tune
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
-from rejeu.experiments import space, study as studies, study_plan as plans, tune as tuning
+from rejeu.experiments import population as populations, space, study as studies, study_plan as plans, tune as tuning
+from rejeu.experiments.population import Members
+from rejeu.experiments.process import default_workers
 from rejeu.experiments.search import Watch
 from rejeu.experiments.study import Outcome, Study, StudyFolder
 from rejeu.experiments.study_plan import Plan
@@ -29,26 +33,30 @@ from rejeu.reporting.formatting import counted, number
 from rejeu.reporting.report.sections import duration
 from rejeu.runs import values
 from rejeu.runs.config import RunConfig
+from rejeu.runs.folder import check_free
 from rejeu.runs.values import quoted
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
-def run(arguments: Tune) -> int:
-    """Searches and returns the exit status: 0, 2 if no trial is complete or a training of the comparison failed, 130, 143."""
-    return jsonout.run(tune, arguments)
+def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
+    """Searches; the exit status is 0, 2 if no trial is complete or a training of the comparison failed, 130, 143."""
+    made = usable_environment(arguments)
+    plan = plans.make(
+        made.env_id,
+        trials=arguments.trials,
+        steps=arguments.steps,
+        evaluate_every=arguments.evaluate_every,
+        trial_seeds=arguments.trial_seeds,
+        final_seeds=arguments.final_seeds,
+        pruner=arguments.pruner,
+        **shared(arguments, made),
+    )
+    return complete(tuning.open_study(plan, arguments.out), made, arguments.workers)
 
 
-def tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
-    """Searches; returns the exit status and the result."""
-    made = environment.from_arguments(arguments.env, arguments)
-    made.vector(1, arguments.backend or "auto", arguments.seed).close()
-    study = tuning.open_study(make_plan(arguments, made), arguments.out)
-    return complete(study, made, arguments.workers)
-
-
-def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
     """Continues the study of a folder; returns the exit status and the result.
 
     Raises:
@@ -59,27 +67,27 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
             f"{arguments.run} is a study of rejeu tune, whose trials have a length; leave out --steps and --minutes"
         )
     study = studies.join(StudyFolder(arguments.run))
-    plan = study.plan
-    made = environment.from_run(
-        plan.env_id, plan.env_argument, plan.env_kwargs, plan.wrappers, study.folder.path, arguments
-    )
+    return complete(study, environment_of(study.plan, "a study", arguments), arguments.workers)
+
+
+def usable_environment(arguments: Tune | Pbt) -> Environment:
+    """Returns the environment that the command line names, after one was made."""
+    made = environment.from_arguments(arguments.env, arguments)
+    made.vector(1, arguments.backend or "auto", arguments.seed).close()
+    return made
+
+
+def environment_of(plan: Plan, what: str, arguments: Resume) -> Environment:
+    """Returns the environment of a study or a population.
+
+    Raises:
+        CheckpointError: if the command line must name it again.
+        ValueError: if the command line names another.
+    """
+    made = environment.from_run(plan.run, arguments.run, arguments)
     if made.env_id != plan.env_id:
-        raise ValueError(f"{arguments.run} is a study of {plan.env_id}, not of {made.env_id}")
-    return complete(study, made, arguments.workers)
-
-
-def make_plan(arguments: Tune, made: Environment) -> Plan:
-    """Returns the plan of the study that the command line asks for."""
-    return plans.make(
-        made.env_id,
-        trials=arguments.trials,
-        steps=arguments.steps,
-        evaluate_every=arguments.evaluate_every,
-        trial_seeds=arguments.trial_seeds,
-        final_seeds=arguments.final_seeds,
-        pruner=arguments.pruner,
-        **shared(arguments, made),
-    )
+        raise ValueError(f"{arguments.run} is {what} of {plan.env_id}, not of {made.env_id}")
+    return made
 
 
 def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
@@ -87,13 +95,13 @@ def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
     preset = None if arguments.preset is None else presets.read(arguments.preset)
     return {
         "algorithm": arguments.algo,
-        "env_argument": made.typed,
+        "env_argument": made.run.env,
         "env_kwargs": made.kwargs,
-        "wrappers": made.wrapper_names,
+        "wrappers": made.run.wrappers,
         "preset": preset,
-        "fixed": values.apply(chain.from_iterable(arguments.assignments), {}),
-        "search": read_search(chain.from_iterable(arguments.search), algorithm_of(arguments, made, preset)),
-        "only": tuple(chain.from_iterable(arguments.only)),
+        "fixed": values.apply(arguments.assignments, {}),
+        "search": read_search(arguments.search, algorithm_of(arguments, made, preset)),
+        "only": arguments.only,
         "n_envs": arguments.envs,
         "backend": arguments.backend,
         "evaluate_episodes": arguments.evaluate_episodes,
@@ -127,7 +135,7 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
         result = tuning.run(study, common(made, study.plan.algorithm), workers, stop, watch, echo)
     echo()
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.options()} continues")
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.run.again()} continues")
     echo(str(result))
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()
@@ -136,8 +144,7 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
 
 def common(made: Environment, algorithm: str) -> RunConfig:
     """Returns what all trainings have in common: the environment and what they import, which the command line named."""
-    imports = tuple(modules_of(algorithm, made.modules))
-    return RunConfig(env=made.typed, env_kwargs=dict(made.kwargs), wrappers=made.wrapper_names, imports=imports)
+    return dataclasses.replace(made.run, imports=tuple(modules_of(algorithm, made.run.imports)))
 
 
 @contextmanager
@@ -213,3 +220,69 @@ def header(study: Study, made: Environment) -> list[str]:
         *([f"at the end    the best trial and the default: {tuning.announcement(plan)}"] if plan.final_seeds else []),
         f"study folder  {study.folder.path}",
     ]
+
+
+def run_pbt(arguments: Pbt) -> tuple[int, dict[str, Any]]:
+    """Trains a population; the exit status is 0, 130 after Ctrl-C, 143 after SIGTERM."""
+    check_free(arguments.out)
+    made = usable_environment(arguments)
+    population = populations.make(
+        arguments.rounds, arguments.round_steps, arguments.members, env_id=made.env_id, **shared(arguments, made)
+    )
+    name = re.sub(r"[^\w.-]+", "-", f"pbt-{made.env_id}-{population.plan.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}")
+    members = populations.create(arguments.out or Path("runs") / name, population)
+    return train(members, made, arguments.workers)
+
+
+def resume_population(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Continues the population of a folder; returns the exit status and the result.
+
+    Raises:
+        ValueError: for options of a run, or an environment that is not that of the population.
+    """
+    if arguments.steps is not None or arguments.minutes is not None or arguments.hyperparameters:
+        raise ValueError(f"{arguments.run} is a population of rejeu pbt; leave out --steps, --minutes and --set")
+    members = populations.read(arguments.run)
+    made = environment_of(members.population.plan, "a population", arguments)
+    return train(members, made, arguments.workers)
+
+
+def train(members: Members, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
+    """Trains a population to its end; returns the exit status and the result."""
+    population, plan = members.population, members.population.plan
+    at_once = min(workers or default_workers(), population.members)
+    echo(f"environment   {made}, {plan.n_envs} at once")
+    echo(f"algorithm     {plan.algorithm}, seed {plan.seed}")
+    echo(f"population    {population.members} members, {population.rounds} rounds of {plan.evaluate_every:,} steps")
+    for i, (name, dimension) in enumerate(plan.search_space.items()):
+        echo(f"{'changing' if i == 0 else '':<14}{name}: {dimension}")
+    echo(f"folder        {members.path}")
+    with members.lock(), Interrupt() as stop:
+        complete = populations.train(members, common(made, plan.algorithm), at_once, stop, echo)
+    result = as_dict(members, complete, stop.signal)
+    if stop.signal is not None:
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(members.path)}{made.run.again()} continues")
+        return 128 + stop.signal, result
+    echo(f"\nbest member   {result['best']['member']}: {plan.measure} {result['best']['score']:,.4g}")
+    echo(f"model         {members.path / 'best.safetensors'}")
+    echo(f"history       {members.path / 'history.csv'}")
+    return 0, result
+
+
+def as_dict(members: Members, complete: bool, signal: int | None) -> dict[str, Any]:
+    """Returns the result for ``--json``."""
+    plan, history = members.population.plan, members.history()
+    best = None
+    if complete:
+        member = members.best()
+        best = next(row for row in reversed(history) if row["member"] == member)
+    return {
+        "population": members.path,
+        "env_id": plan.env_id,
+        "algorithm": plan.algorithm,
+        "seed": plan.seed,
+        "complete": complete,
+        "signal": signal,
+        "best": best,
+        "history": history,
+    }

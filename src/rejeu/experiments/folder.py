@@ -34,8 +34,7 @@ from rejeu.io import atomic
 from rejeu.io.records import Malformed, convert, parse_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
-from rejeu.runs.config import RunConfig
-from rejeu.runs.task import Task
+from rejeu.runs.config import RunConfig, Task
 from rejeu.runs.values import quoted
 
 SWEEP, PLAN, HIDDEN = "sweep.json", "plan.toml", ".sweep"

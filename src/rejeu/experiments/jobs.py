@@ -13,9 +13,8 @@ from msgspec import Meta
 from rejeu.envs.registry import are_plain
 from rejeu.errors import CheckpointError
 from rejeu.io.records import Malformed
-from rejeu.runs.config import RENAMED, RunConfig
-from rejeu.runs.task import Task
-from rejeu.runs.values import quoted, written
+from rejeu.runs.config import RENAMED, RunConfig, Task
+from rejeu.runs.values import written
 from rejeu.validation import assign, coerce, number
 
 MAX_JOBS = 10_000
@@ -131,8 +130,7 @@ def again(jobs: Iterable[Job], typed: RunConfig) -> str:
     ' --env my_env.py'
     """
     run = next((job.run for job in jobs if job.run.names_code), RunConfig(env=""))
-    words = replace(run, imports=typed.imports).environment_words(option=True)
-    return "".join(f" {quoted(word)}" for word in words)
+    return replace(run, imports=typed.imports).again()
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

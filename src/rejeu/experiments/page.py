@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from rejeu.algorithms.search import Choice, Dimension, LogUniform, NearOne
-from rejeu.experiments.final import Final
+from rejeu.experiments.search import Final
 from rejeu.experiments.study import Outcome, Study, best_of
 from rejeu.io import atomic
 from rejeu.io.records import shown
-from rejeu.reporting.charts import GROUP_COLORS, group_chart
+from rejeu.reporting.charts import GROUP_COLORS, group_chart, plain
 from rejeu.reporting.comparison import table_html
 from rejeu.reporting.formatting import counted, number
 from rejeu.reporting.report import page
@@ -196,18 +196,13 @@ def dots(state: str, outcomes: Sequence[Outcome], place: Any = lambda one: one.i
         "color": COLORS[state],
         "x": x,
         "t": x,
-        "y": numbers([one.value for one in known]),
+        "y": plain([one.value for one in known]),
     }
 
 
 def line(name: str, color: str, x: Sequence[float], y: Sequence[float] | np.ndarray) -> dict[str, Any]:
     """Returns a line."""
-    return {"kind": "line", "name": name, "color": color, "x": list(x), "t": list(x), "y": numbers(y)}
-
-
-def numbers(values: Sequence[float] | np.ndarray) -> list[float | None]:
-    """Returns numbers for JSON with six digits; None for those that are not finite."""
-    return [float(f"{value:.6g}") if math.isfinite(value) else None for value in map(float, values)]
+    return {"kind": "line", "name": name, "color": color, "x": list(x), "t": list(x), "y": plain(y)}
 
 
 def room(values: Sequence[float]) -> list[float] | None:

@@ -24,6 +24,7 @@ from rejeu.experiments.jobs import FILES, MAX_JOBS, Job, Resources, flat, job_na
 from rejeu.io.records import convert, is_deep, shown
 from rejeu.reporting.logging import check_logs, require
 from rejeu.runs.config import RENAMED, RunConfig, options
+from rejeu.runs.values import merged
 from rejeu.validation import choice, flag, unknown_name, whole
 
 MAX_BYTES, MAX_LINES, MAX_LINE, MAX_DEPTH = 2**16, 1000, 5000, 12
@@ -31,7 +32,7 @@ MAX_BYTES, MAX_LINES, MAX_LINE, MAX_DEPTH = 2**16, 1000, 5000, 12
 OWN_OF_JOBS = ("env", "env_kwargs", "wrappers", "imports", "algorithm", "seed", "hyperparameters")
 """Fields of a run that a plan names in another way, or not at all."""
 OWN = ("environments", "algorithms", "settings", "seeds", "first_seed", "threads", "resources", "env_kwargs")
-OPTIONS = (*(shown_as.name or one.name for one, shown_as in options(RunConfig) if one.name not in OWN_OF_JOBS), *FILES)
+OPTIONS = (*(one.shown.name or one.field for one in options(RunConfig) if one.field not in OWN_OF_JOBS), *FILES)
 """Options of a plan, which are those of ``rejeu train``."""
 Place = tuple[str, ...]
 
@@ -396,7 +397,7 @@ def check_hyperparameters(
         source.check_names([key], names, places[key], algorithm)
     base = find_preset(environment, algorithm, source) or presets.default(environment.env_id, algorithm)
     try:
-        config = validation.build(kind.algorithm.Config, merged(base.hyperparameters, given))
+        config = validation.build(kind.algorithm.Config, merged(dict(flat(given)), base.hyperparameters))
     except (ValueError, TypeError) as error:
         words = re.findall(r"\w+", str(error))[:1]
         key = next((name for name, _ in flat(given) if name.split(".")[-1] in words), next(iter(given), ""))
@@ -412,17 +413,3 @@ def check_hyperparameters(
             spaces.check_goal_space(environment.observation)
 
     source.checked(next(iter(places.values()), environment.place), build)
-
-
-def merged(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns ``base`` with the given values; tables are merged.
-
-    >>> merged({"policy_kwargs": {"layer_norm": True}}, {"policy_kwargs": {"net_arch": [8]}})
-    {'policy_kwargs': {'layer_norm': True, 'net_arch': [8]}}
-    """
-    result = dict(base)
-    for key, value in given.items():
-        before = result.get(key)
-        both = isinstance(before, Mapping) and isinstance(value, Mapping) and value
-        result[key] = merged(before, value) if both else value  # type: ignore[arg-type]
-    return result

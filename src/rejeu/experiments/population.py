@@ -38,15 +38,14 @@ from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.experiments import space as spaces, study_plan as plans
 from rejeu.experiments.process import LocalLauncher, hold
 from rejeu.experiments.scheduler import Scheduler, Work
+from rejeu.experiments.search import begin_or_resume
 from rejeu.experiments.study_plan import Plan
-from rejeu.experiments.training import begin_or_resume
 from rejeu.interrupt import Interrupt
 from rejeu.io import atomic
 from rejeu.io.records import Count, Malformed, convert, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS
 from rejeu.reporting.tables import read_table
-from rejeu.runs.config import RunConfig
-from rejeu.runs.task import Task
+from rejeu.runs.config import RunConfig, Task
 
 FILE = "population.json"
 """File that makes a folder one of a population."""

@@ -25,8 +25,7 @@ from rejeu.agents.run_files import newest_step
 from rejeu.experiments.process import hold, last_line
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.runs import is_locked
-from rejeu.runs import task as tasks
-from rejeu.runs.task import Task
+from rejeu.runs.config import Task, write_task
 from rejeu.supervised import TAKEN
 
 POLL = 0.2
@@ -208,7 +207,7 @@ class Scheduler:
         try:
             first = newest_step(task.run / "checkpoints")
             file = task.lock.with_suffix(".task")
-            tasks.write(file, task.task())
+            write_task(file, task.task())
             handle = self.launcher.start(file, task.log, task.lock)
         except OSError as error:
             task.status = 2

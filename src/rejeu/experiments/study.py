@@ -35,6 +35,7 @@ from rejeu.experiments.scheduler import release
 from rejeu.experiments.study_plan import Plan
 from rejeu.io import atomic
 from rejeu.presets import Preset
+from rejeu.runs.folder import File
 
 if TYPE_CHECKING:
     import optuna
@@ -77,30 +78,16 @@ class StudyFolder:
 
     path: Path
 
-    @property
-    def plan(self) -> Path:
-        """The settings of the study."""
-        return self.path / "study.json"
-
-    @property
-    def journal(self) -> Path:
-        """Optuna's journal."""
-        return self.path / "journal.log"
-
-    @property
-    def preset(self) -> Path:
-        """The winner."""
-        return self.path / "preset.json"
-
-    @property
-    def page(self) -> Path:
-        """The page about the study."""
-        return self.path / "study.html"
-
-    @property
-    def final(self) -> Path:
-        """Folder of the final comparison."""
-        return self.path / "final"
+    plan = File("study.json")
+    """The settings of the study."""
+    journal = File("journal.log")
+    """Optuna's journal."""
+    preset = File("preset.json")
+    """The winner."""
+    page = File("study.html")
+    """The page about the study."""
+    final = File("final")
+    """Folder of the final comparison."""
 
     def trial(self, index: int) -> Path:
         """Returns the folder of a trial."""

@@ -21,6 +21,7 @@ from rejeu.experiments import space as spaces
 from rejeu.io import atomic
 from rejeu.io.records import EnvCount, Positive, Seed, convert, read_json, shown
 from rejeu.presets import Preset
+from rejeu.runs.config import RunConfig
 
 MAX_BYTES = 2**20
 """Upper limit on the size of a ``study.json``."""
@@ -73,6 +74,12 @@ class Plan:
     measure: Measure = "return"
     """What is maximized: the mean return of the last evaluation, or its success rate."""
     checkpoint_minutes: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
+
+    @property
+    def run(self) -> RunConfig:
+        """The environment of all trainings."""
+        kwargs, wrappers = self.env_kwargs, self.wrappers
+        return RunConfig(env=self.env_id, env_argument=self.env_argument, env_kwargs=kwargs, wrappers=wrappers)
 
     @property
     def search_space(self) -> dict[str, Dimension]:
@@ -135,22 +142,8 @@ def make(
 ) -> Plan:
     """Returns the plan of a study, completed by the preset or the defaults, after all checks that need no training.
 
-    Args:
-        env_id: of the environment.
-        algorithm: its name; None for that of the preset. This and what is not listed is as for :func:`rejeu.tune`.
-        env_argument: how the environment was named on the command line.
-        env_kwargs: keyword arguments of the environment.
-        wrappers: names of its wrappers.
-        preset: what trials start from and the winner is compared with; None: rejeu's own, else the algorithm's defaults.
-        fixed: hyperparameters that are set instead of searched.
-        search: dimensions that replace those of the algorithm, or are added to them.
-        only: names of the hyperparameters that are searched; empty for all of the space.
-        steps: environment steps of a trial; None for the preset's, else 100,000.
-        n_envs: environments stepped at once; None for the preset's, else 1.
-        backend: of the environments; None for the preset's, else ``"auto"``.
-        evaluate_every: environment steps between two evaluations; None for a tenth of ``steps``.
-        evaluate_episodes: episodes of each evaluation; None for the preset's, else 20.
-        others: further fields of the plan.
+    ``fixed`` are hyperparameters that are set instead of searched, and ``others`` are further fields of the plan. The rest is
+    as for :func:`rejeu.tune`, with None for what the preset or the default decides.
 
     Raises:
         ValueError: for an unknown algorithm, an empty space, or a value out of range.

@@ -1,21 +1,152 @@
-"""``rejeu.sweep``: from a plan to trained runs."""
+"""``rejeu.sweep``: from a plan to trained runs, with a table of their progress.
+
+Each job of the sweep is a task of the scheduler. On a terminal there are bars, and lines where there is none.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rejeu.experiments import table
-from rejeu.experiments.coordinator import Coordinator, Outcome, count
-from rejeu.experiments.folder import Sweep, SweepFolder, open_folder, read_folder
+from rejeu.agents import modules_of
+from rejeu.experiments.folder import JobProgress, State, Sweep, SweepFolder, open_folder, read_folder
+from rejeu.experiments.jobs import Job, again
 from rejeu.experiments.plan import read_plan
-from rejeu.experiments.process import LocalLauncher, default_workers, threads_of
-from rejeu.experiments.scheduler import Launcher
+from rejeu.experiments.process import LOST, LocalLauncher, default_workers, threads_of
+from rejeu.experiments.scheduler import Launcher, Scheduler, Work
 from rejeu.interrupt import Interrupt
-from rejeu.runs.config import RunConfig
+from rejeu.reporting import notebook
+from rejeu.reporting.formatting import counted
+from rejeu.runs.config import RunConfig, Task
+from rejeu.runs.values import quoted
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+STATES = ("running", "done", "failed", "stopped", "waiting")
+REFRESH, LINES = 2.0, 30.0
+"""Seconds between two readings of the tables of the runs: for bars on a terminal, and for lines elsewhere."""
+MAX_NAMED = 4
+"""Most runs that are named in a line."""
+
+echo = partial(print, flush=True)
+Watch = Callable[["Coordinator"], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of one job."""
+
+    job: Job
+    state: State
+    exit_status: int | None
+    path: Path
+    log: Path
+
+
+class JobWork(Work):
+    """A job of a sweep. Mutable."""
+
+    def __init__(self, folder: SweepFolder, job: Job, imports: tuple[str, ...], is_retried: bool) -> None:
+        self.folder, self.job, self.imports = folder, job, imports
+        self.is_retried = is_retried
+        """Whether it has failed before, and is to be tried again."""
+        self.name, self.run, self.log = job.name, folder.run(job), folder.log(job)
+        self.lock, self.claim = folder.hidden(job, "run"), folder.hidden(job, "claim")
+
+    def is_open(self) -> bool:
+        return self.is_retried or not (self.folder.is_done(self.job) or self.folder.exit_status(self.job))
+
+    def task(self) -> Task:
+        self.is_retried = False
+        self.folder.hidden(self.job, "exit").unlink(missing_ok=True)
+        return self.folder.task(self.job, self.imports)
+
+    def has_result(self) -> bool:
+        return (self.run / "agent.safetensors").is_file()
+
+    def ended(self) -> None:
+        """Writes that the job is done or has failed; without it the job is looked at again by the next process."""
+        if self.ending == "done":
+            self.folder.write_exit(self.job, 0)
+        elif self.ending == "failed":
+            self.folder.write_exit(self.job, self.status or LOST)
+
+
+class Coordinator:
+    """Works through the jobs of a folder until none is left that it may take. Mutable."""
+
+    def __init__(
+        self,
+        folder: SweepFolder,
+        launcher: Launcher,
+        stop: Interrupt,
+        typed: RunConfig,
+        retry: bool = False,
+        say: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        """Starts nothing yet.
+
+        Args:
+            folder: of the sweep.
+            launcher: what starts runs.
+            stop: a requested stop ends all runs, with checkpoints.
+            typed: what the command line named for import.
+            retry: whether jobs that have failed are tried again, once.
+            say: called with a line for each event.
+
+        Raises:
+            ValueError: if the processes of the runs could not find an algorithm.
+        """
+        algorithms = {job.run.algorithm: None for job in folder.jobs if job.run.algorithm is not None}
+        modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, typed.imports)}
+        self.folder, self.launcher = folder, launcher
+        self.typed = dataclasses.replace(typed, imports=tuple(modules) or typed.imports)
+        self.tasks = [
+            JobWork(folder, job, self.typed.imports, retry and bool(folder.exit_status(job))) for job in folder.jobs
+        ]
+        self.scheduler = Scheduler(launcher, stop, say)
+        self.scheduler.waiting.extend(task for task in self.tasks if task.is_open())
+
+    def run(self, watch: Callable[[Coordinator], None] = lambda coordinator: None) -> None:
+        """Works until nothing is left; ``watch`` is called several times a second."""
+        self.scheduler.run(lambda: watch(self))
+
+    def running(self) -> list[Job]:
+        """Returns the jobs that this process looks after and that train."""
+        attended = {attempt.task for attempt in self.scheduler.running}
+        return [task.job for task in self.tasks if task in attended]
+
+    def outcomes(self) -> list[Outcome]:
+        """Returns the state of every job."""
+        folder, running = self.folder, {job.name for job in self.running()}
+        return [
+            Outcome(
+                task.job,
+                "running" if task.name in running else folder.state(task.job),
+                folder.exit_status(task.job) if task.status is None else task.status,
+                task.run,
+                task.log,
+            )
+            for task in self.tasks
+        ]
+
+
+def count(states: Iterable[str]) -> dict[str, int]:
+    """Returns how often each state occurs.
+
+    >>> count(["done", "failed", "done"])
+    {'running': 0, 'done': 2, 'failed': 1, 'stopped': 0, 'waiting': 0}
+    """
+    return dict.fromkeys(STATES, 0) | Counter(states)
 
 
 @dataclass(frozen=True)
@@ -140,8 +271,97 @@ def sweep(
     is_folder = not isinstance(plan, Mapping) and Path(plan).is_dir()
     found = read_folder(Path(plan), typed) if is_folder else prepare(plan, folder, workers, typed, ray)  # type: ignore[arg-type]
     with Interrupt() as stop:
-        with table.shown(progress) as (watch, say):
+        with shown(progress) as (watch, say):
             coordinator = Coordinator(found, make_launcher(found, workers, ray), stop, typed, retry, say)
             coordinator.run(watch)
         stop.check()
     return SweepResult(found.path, tuple(coordinator.outcomes()))
+
+
+@contextmanager
+def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]]:
+    """Context in which progress is shown; returns a function to call often, and one to call with each event."""
+    console = notebook.console()
+    if not progress:
+        yield (lambda coordinator: None), (lambda text: None)
+    elif not console.is_terminal:
+        yield seldom(lambda coordinator: echo(line(coordinator)), LINES, time.monotonic() + LINES), echo
+    else:
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=console, speed_estimate_period=600) as bars:
+            bars.add_task("all steps", total=None, text="")
+            say = partial(console.print, highlight=False, markup=False)
+            yield seldom(partial(draw, bars), REFRESH), say
+
+
+def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
+    """Returns a function that calls another if the last call was so many seconds ago, and runs train."""
+    due = begin
+
+    def call(coordinator: Coordinator) -> None:
+        nonlocal due
+        if time.monotonic() >= due and coordinator.running():
+            due = time.monotonic() + seconds
+            function(coordinator)
+
+    return call
+
+
+def draw(bars: Progress, coordinator: Coordinator) -> None:
+    """Draws a bar for each run that trains, and one for all steps of the sweep, by which the remaining time is estimated."""
+    running = {job.name: job for job in coordinator.running()}
+    of_runs = {task.description: task.id for task in bars.tasks[1:]}
+    for name in of_runs.keys() - running.keys():
+        bars.remove_task(of_runs[name])
+    taken = 0
+    for name, job in running.items():
+        at = coordinator.folder.progress(job)
+        taken += at.step
+        task = of_runs[name] if name in of_runs else bars.add_task(name, text="")
+        bars.update(task, total=job.run.steps, completed=at.step, text=text_of(at, job.run.steps))
+    outcomes = coordinator.outcomes()
+    asked = [one.job.run.steps or 0 for one in outcomes if one.state != "failed"]
+    taken += sum(one.job.run.steps or 0 for one in outcomes if one.state == "done")
+    bars.update(bars.tasks[0].id, total=sum(asked) or None, completed=taken, text=states(coordinator))
+
+
+def line(coordinator: Coordinator) -> str:
+    """Returns one line: the steps and the return of the runs that train, and how many are in each state."""
+    jobs = coordinator.running()[:MAX_NAMED]
+    parts = [f"{job.name} {text_of(coordinator.folder.progress(job), job.run.steps)}" for job in jobs]
+    return "; ".join([*parts, states(coordinator)])
+
+
+def text_of(progress: JobProgress, steps: int | None) -> str:
+    """Returns how far a run is.
+
+    >>> text_of(JobProgress(1500, mean_return=12.5), 20000)
+    '1,500 of 20,000 steps, return 12.50'
+    """
+    asked = f" of {steps:,}" if steps else ""
+    values = {"return": progress.mean_return, "best evaluation": progress.best}
+    known = [f", {name} {value:,.2f}" for name, value in values.items() if math.isfinite(value)]
+    return f"{progress.step:,}{asked} steps{''.join(known)}"
+
+
+def states(coordinator: Coordinator) -> str:
+    """Returns how many runs are in each state, such as ``2 running, 3 done``."""
+    found = count(one.state for one in coordinator.outcomes())
+    return ", ".join(f"{number} {state}" for state, number in found.items() if number)
+
+
+def closing_lines(coordinator: Coordinator) -> list[str]:
+    """Returns the lines that are printed at the end: how many jobs are in each state, and how failed ones are repeated."""
+    folder, outcomes = coordinator.folder, coordinator.outcomes()
+    lines = [f"{counted(len(outcomes), 'run')}: {states(coordinator)}"]
+    if any(one.state == "failed" for one in outcomes) and not coordinator.running():
+        resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, coordinator.typed)}"
+        lines.append(f"{resume} tries failed runs again")
+    return lines

@@ -17,10 +17,9 @@ from rejeu import envs, presets
 from rejeu.agents import modules_of
 from rejeu.algorithms.search import SearchSpace
 from rejeu.errors import MissingExtra
-from rejeu.experiments import final, page, study as studies, study_plan as plans
-from rejeu.experiments.final import Final
+from rejeu.experiments import page, search as searches, study as studies, study_plan as plans
 from rejeu.experiments.process import default_workers
-from rejeu.experiments.search import Search, Watch
+from rejeu.experiments.search import Final, Search, Watch
 from rejeu.experiments.study import Outcome, Study, StudyFolder
 from rejeu.experiments.study_plan import Measure, Plan, Pruner
 from rejeu.interrupt import Interrupt
@@ -226,10 +225,10 @@ def run(
         presets.write(study.preset_of(best, source(study, best)), folder.preset)
     if best is not None and not stop.requested and plan.final_seeds:
         failed: list[str] = []
-        if not final.is_default(study, study.preset_of(best, "")):
+        if not searches.is_default(study, study.preset_of(best, "")):
             echo(f"comparing trial {best.index} with the default: {announcement(plan, outcomes, at_once)}")
-            failed = final.train(final.trainings(study, best, config), at_once, stop, echo)
-        compared = None if stop.requested else final.result(study, best, failed)
+            failed = searches.train_final(searches.final_trainings(study, best, config), at_once, stop, echo)
+        compared = None if stop.requested else searches.compared(study, best, failed)
     complete = study.is_searched() and not stop.requested and not (compared and compared.failed)
     notes = []
     try:

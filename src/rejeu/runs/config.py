@@ -1,7 +1,8 @@
 """The description of a run. The command line, ``config.json``, sweeps and processes read and write it.
 
 Each field is declared once: its type with its range, its default, and how the command line shows it. As asked for, None
-stands for what the preset or the environment decides; ``config.json`` has every field as it was decided.
+stands for what the preset or the environment decides; ``config.json`` has every field as it was decided. A :class:`Task` says
+what a process is to do with a run, ``rejeu --task FILE``, so that no value becomes a word of a command line.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from msgspec import Meta
 
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
 from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, read_json, shown
-from rejeu.runs.values import assignment_words
+from rejeu.runs.values import assignment_words, quoted
 
 R = TypeVar("R", bound="RunConfig")
 MAX_BYTES = 2**20
-"""Upper limit on the size of a ``config.json``."""
+"""Upper limit on the size of a ``config.json``, and of the file of a task."""
 LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
 """What the argument ``log`` takes."""
 MAX_EPISODES = 10_000
@@ -41,12 +43,36 @@ WORDS_OF_THEIR_OWN = ("env", "env_kwargs", "wrappers", "imports", "hyperparamete
 class Shown(NamedTuple):
     """How the command line shows a field."""
 
-    metavar: str
+    metavar: str = ""
+    """Empty for a flag."""
     name: str = ""
     """Without dashes; empty for the name of the field."""
-    default: str = ""
-    """What help says of the default, beside the description."""
+    help: str = ""
+    """Used where the field has no docstring."""
     is_positional: bool = False
+
+
+class Option(NamedTuple):
+    """A field of a dataclass as an option or a positional argument of the command line."""
+
+    field: str
+    name: str
+    """With its dashes; of a positional argument its metavar."""
+    shown: Shown
+    kind: Any
+    """The type of the value: ``bool``, ``int``, ``float``, ``str``, ``Path``, ``dict``, ``tuple`` or a ``Literal``."""
+    item: Any
+    """The type of one word: that of the value, or of an element of a tuple."""
+    limits: dict[str, float]
+    """Of a number: ``ge``, ``gt`` and ``le``."""
+    default: Any
+    """None where the value is made anew each time."""
+    is_required: bool
+
+    @property
+    def takes_many(self) -> bool:
+        """Whether it takes all words up to the next option; a positional argument, all further positional words."""
+        return self.shown.metavar.endswith("...")
 
 
 Name = Annotated[str, Meta(max_length=300)]
@@ -104,7 +130,7 @@ class RunConfig(EnvironmentOptions):
     """Return from which on an episode counts as a success; by default what the environment reports or declares."""
     video_every: Annotated[Positive | None, Shown("N")] = None
     """Environment steps between two videos of the policy, in the folder videos; by default none are recorded."""
-    checkpoint_minutes: Annotated[Annotated[float, Meta(ge=0)] | None, Shown("M", default="(default: 5)")] = 5.0
+    checkpoint_minutes: Annotated[Annotated[float, Meta(ge=0)] | None, Shown("M")] = 5.0
     """Minutes between two checkpoints, from which rejeu resume continues; 0 for none."""
     evaluate_every: Annotated[Positive | None, Shown("N")] = None
     """Environment steps between two evaluations; by default the preset's, else 5000."""
@@ -143,14 +169,20 @@ class RunConfig(EnvironmentOptions):
 
         >>> RunConfig(env="my_env.py", env_kwargs={"g": 9.8}).environment_words(option=True)
         ['--env', 'my_env.py', '--env-kwargs', 'g=9.8']
-        >>> RunConfig(env="CartPole-v1", imports=("my_algorithm.py",)).environment_words(option=True)
-        ['--import', 'my_algorithm.py']
         """
         named = ["--env", self.typed] if option else [self.typed]
         named += assignment_words("--env-kwargs", self.env_kwargs)
         named += chain.from_iterable(("--wrapper", name) for name in self.wrappers)
         imports = chain.from_iterable(("--import", name) for name in self.imports)
         return [*(named if self.names_code or not option else ()), *imports]
+
+    def again(self) -> str:
+        """Returns the options with which ``rejeu evaluate RUN`` and the like make the environment, a space before each.
+
+        >>> RunConfig(env="CartPole-v1", imports=("my_algorithm.py",)).again()
+        ' --import my_algorithm.py'
+        """
+        return "".join(f" {quoted(word)}" for word in self.environment_words(option=True))
 
     def words(self) -> list[str]:
         """Returns the words of the command line that begins this run: ``rejeu`` is followed by them.
@@ -159,11 +191,11 @@ class RunConfig(EnvironmentOptions):
         ['train', 'CartPole-v1', '--algo', 'PPO', '--envs', '8', '--set', 'gamma=0.9']
         """
         words = ["train", *self.environment_words()]
-        for one, shown_as in options(RunConfig):
-            value = getattr(self, one.name)
-            if one.name in WORDS_OF_THEIR_OWN or value == one.default or isinstance(value, bool):
+        for one in options(RunConfig):
+            value = getattr(self, one.field)
+            if one.field in WORDS_OF_THEIR_OWN or value == one.default or isinstance(value, bool):
                 continue
-            words.append(f"--{(shown_as.name or one.name).replace('_', '-')}")
+            words.append(one.name)
             words += value if isinstance(value, tuple) else [f"{value:g}" if isinstance(value, float) else str(value)]
         return [*words, *assignment_words("--set", self.hyperparameters)]
 
@@ -189,12 +221,52 @@ class DecidedRun(RunConfig):
     log: tuple[Annotated[str, Meta(pattern=f"^({'|'.join(LOGS)})$")], ...] = ()
 
 
-def options(kind: type) -> Iterator[tuple[dataclasses.Field[Any], Shown]]:
-    """Yields the fields of a class that the command line shows."""
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A run to begin, or to continue. Who writes its file answers for what it imports; see :attr:`RunConfig.names_code`."""
+
+    folder: str
+    """The run folder."""
+    run: RunConfig
+    resume: bool = False
+    """Whether it is continued from its newest checkpoint, or its files are completed; else it begins."""
+    changes: dict[Key, Any] = field(default_factory=dict)
+    """Hyperparameters to change where it is continued, by dotted name."""
+    pause: Positive | None = None
+    """Pause after so many environment steps."""
+    no_report: bool = False
+    no_video: bool = False
+
+
+def options(kind: type) -> Iterator[Option]:
+    """Yields the fields of a dataclass that the command line shows: flags, and those with a :class:`Shown`."""
     hints = get_type_hints(kind, include_extras=True)
     for one in dataclasses.fields(kind):
-        marks = getattr(hints[one.name], "__metadata__", ())
-        yield from ((one, mark) for mark in marks if isinstance(mark, Shown))
+        hint, marks = unmarked(hints[one.name])
+        shown_as = next((mark for mark in marks if isinstance(mark, Shown)), Shown() if hint is bool else None)
+        if shown_as is None:
+            continue
+        if get_origin(hint) in (Union, UnionType):
+            hint, inner = unmarked(get_args(hint)[0])  # None and others are no words
+            marks = [*marks, *inner]
+        kind_of = get_origin(hint) if get_origin(hint) in (tuple, dict) else hint
+        numbers = [(key, getattr(mark, key)) for mark in marks if isinstance(mark, Meta) for key in ("ge", "gt", "le")]
+        has_default = one.default is not dataclasses.MISSING
+        yield Option(
+            field=one.name,
+            name=shown_as.metavar if shown_as.is_positional else f"--{(shown_as.name or one.name).replace('_', '-')}",
+            shown=shown_as,
+            kind=kind_of,
+            item=unmarked(get_args(hint)[0])[0] if kind_of is tuple else hint,
+            limits={key: limit for key, limit in numbers if limit is not None},
+            default=one.default if has_default else None,
+            is_required=not has_default and one.default_factory is dataclasses.MISSING,
+        )
+
+
+def unmarked(hint: Any) -> tuple[Any, list[Any]]:
+    """Returns a type without its annotations, and these."""
+    return (get_args(hint)[0], [*get_args(hint)[1:]]) if get_origin(hint) is Annotated else (hint, [])
 
 
 def parse(content: Any, kind: type[R]) -> R:
@@ -226,6 +298,21 @@ def write(path: Path, config: DecidedRun) -> None:
     content = {**dataclasses.asdict(config), "versions": versions()}
     with atomic.replacing(path) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_task(path: Path, task: Task) -> None:
+    """Writes the file of a task."""
+    with atomic.replacing(path) as file:
+        file.write(json.dumps(dataclasses.asdict(task), allow_nan=False).encode())
+
+
+def read_task(path: Path) -> Task:
+    """Returns what :func:`write_task` wrote.
+
+    Raises:
+        CheckpointError, ValueError: if it is damaged.
+    """
+    return convert(read_json(path, MAX_BYTES), Task)
 
 
 def versions() -> dict[str, str | None]:

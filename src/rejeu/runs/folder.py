@@ -6,7 +6,7 @@ import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,82 +19,55 @@ from rejeu.runs.values import quoted
 
 
 @dataclass(frozen=True)
+class File:
+    """The path of a file or folder in a folder, as an attribute of the class of that folder."""
+
+    name: str
+
+    def __get__(self, folder: Any, kind: type) -> Path:
+        path: Path = folder.path
+        return path / self.name
+
+
+@dataclass(frozen=True)
 class RunFolder:
     """The files of one run."""
 
     path: Path
     """The folder."""
 
-    @property
-    def config(self) -> Path:
-        """Everything needed to repeat the run."""
-        return self.path / "config.json"
-
-    @property
-    def episodes(self) -> Path:
-        """One row an episode of training."""
-        return self.path / "episodes.csv"
-
-    @property
-    def metrics(self) -> Path:
-        """Means, losses and rates while training."""
-        return self.path / "metrics.csv"
-
-    @property
-    def evaluations(self) -> Path:
-        """One row an evaluation."""
-        return self.path / "evaluations.csv"
-
-    @property
-    def agent(self) -> Path:
-        """The last model."""
-        return self.path / "agent.safetensors"
-
-    @property
-    def best(self) -> Path:
-        """The model that evaluated best."""
-        return self.path / "best.safetensors"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of the checkpoints from which the run can be resumed."""
-        return self.path / "checkpoints"
-
-    @property
-    def arrivals(self) -> Path:
-        """In which order the results of environments were taken, of a run with ``wait_for``; see :func:`read_arrivals`."""
-        return self.path / "arrivals.npy"
-
-    @property
-    def curve(self) -> Path:
-        """The learning curve."""
-        return self.path / "curve.png"
-
-    @property
-    def replays(self) -> Path:
-        """Episodes of the trained agent, one row each; read by :mod:`rejeu.reporting.runs`."""
-        return self.path / "replays.csv"
-
-    @property
-    def report(self) -> Path:
-        """The page about the run."""
-        return self.path / "report.html"
-
-    @property
-    def warnings(self) -> Path:
-        """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.reporting.runs`."""
-        return self.path / "warnings.txt"
+    config = File("config.json")
+    """Everything needed to repeat the run."""
+    episodes = File("episodes.csv")
+    """One row an episode of training."""
+    metrics = File("metrics.csv")
+    """Means, losses and rates while training."""
+    evaluations = File("evaluations.csv")
+    """One row an evaluation."""
+    agent = File("agent.safetensors")
+    """The last model."""
+    best = File("best.safetensors")
+    """The model that evaluated best."""
+    checkpoints = File("checkpoints")
+    """Folder of the checkpoints from which the run can be resumed."""
+    arrivals = File("arrivals.npy")
+    """In which order the results of environments were taken, of a run with ``wait_for``; see :func:`read_arrivals`."""
+    curve = File("curve.png")
+    """The learning curve."""
+    replays = File("replays.csv")
+    """Episodes of the trained agent, one row each; read by :mod:`rejeu.reporting.runs`."""
+    report = File("report.html")
+    """The page about the run."""
+    warnings = File("warnings.txt")
+    """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.reporting.runs`."""
+    video = File("video.mp4")
+    """A few episodes of the best model."""
 
     @property
     def videos(self) -> Path:
         """Folder of videos of the policy during training; earlier versions called it ``films``."""
         videos, films = self.path / "videos", self.path / "films"
         return films if films.is_dir() and not videos.exists() else videos
-
-    @property
-    def video(self) -> Path:
-        """A few episodes of the best model."""
-        return self.path / "video.mp4"
 
 
 def read_config(folder: RunFolder) -> DecidedRun:

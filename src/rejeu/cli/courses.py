@@ -1,0 +1,80 @@
+"""``rejeu course`` writes the notebooks of the courses and grades notebooks; ``rejeu class`` writes a leaderboard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rejeu.cli import environment, jsonout
+from rejeu.cli.commands import Class, Course
+from rejeu.cli.output import echo
+from rejeu.courses import grading, leaderboard, write
+from rejeu.io import atomic
+from rejeu.validation import whole
+
+MAX_EPISODES = 1_000
+
+
+def run_course(arguments: Course) -> tuple[int, dict[str, Any]]:
+    """Writes or grades notebooks, and prints a line for each file."""
+    if arguments.language == "grade":
+        return grade(arguments)
+    if len(arguments.paths) != 1:
+        raise ValueError(f"rejeu course {arguments.language} needs one FOLDER, got {len(arguments.paths)}")
+    written: list[Path] = []
+    kept: list[Path] = []
+    for path, is_new in write(arguments.language, arguments.paths[0]):
+        (written if is_new else kept).append(path)
+        change = "" if is_new else " exists and was not changed; delete or rename it to get a new copy"
+        echo(f"{path}{change}")
+    return 0, {"written": written, "kept": kept}
+
+
+def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
+    """Prints which checks each notebook passes; the exit status is 2 if a file could not be graded."""
+    grades = []
+    for path in arguments.paths:
+        one = grading.grade(path)
+        grades.append(one)
+        echo(f"{path}: {one.error or f'{one.n_passed} of {len(one.found)} passed'}")
+        for name, found in one.found.items():
+            if found != "" and not one.error:
+                echo(f"  {name}: {found or 'its check did not run; is there an error in its cell?'}")
+    status = 2 if any(one.error for one in grades) else 0
+    return status, {"notebooks": [one._asdict() | {"passed": one.n_passed} for one in grades]}
+
+
+def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
+    """Evaluates the models in a folder, prints a line for each, and writes the leaderboard."""
+    episodes = whole("--episodes", arguments.episodes, 1, MAX_EPISODES)
+    formats = {".html": leaderboard.page, ".md": leaderboard.markdown, ".json": as_json}
+    out = arguments.out
+    if out.suffix not in formats:
+        raise ValueError(f"--out {out} must end in {', '.join(formats)}")
+    paths = leaderboard.models(arguments.folder)
+    if out.suffix == ".html":
+        leaderboard.template()  # a missing package is named before the evaluations
+    made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
+    echo(f"{made}, {episodes} episodes of each of {len(paths)} models")
+    board = leaderboard.build(
+        arguments.folder,
+        paths,
+        made.env_id,
+        lambda n: made.vector(n, "gymnasium", arguments.seed),
+        episodes,
+        arguments.seed,
+        60 * arguments.minutes,
+        arguments.success_threshold,
+        arguments.language,
+        echo,
+    )
+    text = formats[out.suffix](board)
+    with atomic.replacing(out) as file:
+        file.write(text.encode())
+    echo(out)
+    return 0, {**leaderboard.to_dict(board), "file": out}
+
+
+def as_json(board: leaderboard.Leaderboard) -> str:
+    """Returns a leaderboard as JSON text."""
+    return jsonout.dumps(leaderboard.to_dict(board)) + "\n"

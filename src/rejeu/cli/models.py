@@ -1,0 +1,127 @@
+"""``rejeu evaluate``, ``record``, ``watch`` and ``play``: a trained agent, or a person, plays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
+
+from rejeu import devices
+from rejeu.agents import load
+from rejeu.cli import environment
+from rejeu.cli.commands import Evaluate, Play, Record, Watch
+from rejeu.cli.output import echo
+from rejeu.reporting.formatting import counted
+from rejeu.reporting.video import record_video
+from rejeu.runs.folder import RunFolder, find_model
+from rejeu.runs.values import value
+
+if TYPE_CHECKING:
+    from rejeu.play import Game
+
+
+def run_evaluate(arguments: Evaluate) -> tuple[int, dict[str, Any]]:
+    """Evaluates an agent on whole episodes and prints the result."""
+    devices.start_with("--device", arguments.device)
+    episodes, minutes = arguments.episodes, arguments.minutes
+    if minutes is None and episodes is None:
+        episodes = 100
+    model = find_model(arguments.run, arguments.which)
+    made = environment.environment_of(model, arguments)
+    agent = load(model, device=arguments.device)
+    n_envs = 16 if episodes is None else min(episodes, 16)
+    with closing(made.vector(n_envs, arguments.backend, arguments.seed)) as env:
+        echo(f"{made} on {env.backend}, {model}")
+        found = agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold, minutes=minutes)
+        echo(found)
+        about = {"model": model, "env_id": made.env_id, "backend": env.backend}
+    each = {"returns": found.returns, "lengths": found.lengths, "successes": found.successes}
+    return 0, {**about, **found.to_dict(), **each}
+
+
+def run_record(arguments: Record) -> tuple[int, dict[str, Any]]:
+    """Records a video of an agent and prints its path."""
+    model = find_model(arguments.run, arguments.which)
+    default = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
+    out = default if arguments.out is None else arguments.out
+    made = environment.environment_of(model, arguments)
+    path = record_video(load(model), out, env=made.rendering, episodes=arguments.episodes, seed=arguments.seed)
+    echo(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {made}")
+    return 0, {"video": path, "episodes": arguments.episodes, "model": model, "env_id": made.env_id}
+
+
+def run_watch(arguments: Watch) -> tuple[int, dict[str, Any]]:
+    """Shows an agent in a window, and prints its scores."""
+    from rejeu.play import watch
+
+    model = find_model(arguments.run, arguments.which)
+    made = environment.environment_of(model, arguments)
+    game = watch(load(model), made.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
+    echo(scores(game))
+    return 0, as_dict(game)
+
+
+def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
+    """Lets a person play, alone or next to an agent, and prints the scores."""
+    from rejeu.play import play
+    from rejeu.play.known import full_name
+
+    made = environment.from_arguments(full_name(arguments.env), arguments)
+    agent = None
+    if arguments.against is not None:
+        model = find_model(arguments.against, arguments.which)
+        trained_on = environment.recorded_id(model)
+        if trained_on != made.env_id:
+            raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {made.env_id}")
+        agent = load(model)
+    game = play(
+        made.make,
+        keys=parse_keys(arguments.keys),
+        seed=arguments.seed,
+        fps=arguments.fps,
+        episodes=arguments.episodes,
+        record=arguments.record,
+        against=agent,
+    )
+    echo(scores(game))
+    if (recording := game.players[0].recording) is not None:
+        echo(recording)
+    return 0, as_dict(game)
+
+
+def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
+    """Returns the action of each combination of keys.
+
+    Raises:
+        ValueError: for an assignment without ``=``.
+
+    >>> parse_keys(["a=0", "a+w=[1,-0.5]", "none=wait"])
+    {'a': 0, 'a+w': [1, -0.5], 'none': 'wait'}
+    """
+    result = {}
+    for assignment in assignments:
+        keys, equals, text = assignment.rpartition("=")
+        if not equals or not keys:
+            raise ValueError(f"--keys {assignment!r} must be keys=action, such as a=0 or a+w=[1,-1]")
+        result[keys.strip()] = value(text)
+    return result
+
+
+def as_dict(game: Game) -> dict[str, Any]:
+    """Returns the players with their scores."""
+    return {
+        "players": [
+            {"name": one.name, "episodes": len(one.scores), "mean": one.mean, "best": one.best, "scores": one.scores}
+            for one in game.players
+        ]
+    }
+
+
+def scores(game: Game) -> str:
+    """Returns a line for each player: number of complete episodes, mean and best score."""
+    lines = []
+    for player in game.players:
+        n = len(player.scores)
+        episodes = counted(n, "episode")
+        lines.append(f"{player.name}: {episodes}" + (f", mean {player.mean:.2f}, best {player.best:.2f}" if n else ""))
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Sweeps, under the name of earlier versions; see :mod:`rejeu.experiments`."""
