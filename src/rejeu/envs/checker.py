@@ -215,30 +215,21 @@ def _reset(env: gym.Env, found: dict[str, Finding], seed: int | None = None) -> 
 
 def _check_step(answer: Any, space: gym.Space, found: dict[str, Finding]) -> bool:
     """Checks the values of a step, and returns whether training could go on after it."""
-    fault = validation.step_fault(answer, space)
+    faults = dict(validation.step_faults(answer, space, strict=True))
+    for kind, text in faults.items():
+        found.setdefault(kind, Finding("error", text))
     if not isinstance(answer, tuple) or len(answer) != 5:
-        found.setdefault("step", Finding("error", str(fault)))
         return False
-    obs, reward, terminated, truncated, info = answer
-    if (wrong := validation.observation_fault(space, obs)) is None:
+    obs, _, terminated, truncated, info = answer
+    if "step" not in faults:
         _check_observation(obs, space, found, "step")
-    else:
-        found.setdefault("step", Finding("error", f"step returned {wrong}"))
-    for kind, wrong in (
-        ("reward", validation.reward_fault(reward, strict=True)),
-        ("terminated", validation.flag_fault("terminated", terminated, strict=True)),
-        ("truncated", validation.flag_fault("truncated", truncated, strict=True)),
-        ("info", validation.info_fault(info)),
-    ):
-        if wrong is not None:
-            found.setdefault(kind, Finding("error", f"step returned {wrong}"))
     if isinstance(info, dict) and info.get("TimeLimit.truncated") and not truncated:
         text = (
             f"step returned info['TimeLimit.truncated']={info['TimeLimit.truncated']!r} with terminated={terminated} and "
             "truncated=False; return truncated=True where a time limit ended the episode"
         )
         found.setdefault("folded", Finding("error", text))
-    return fault is None
+    return validation.step_fault(answer, space) is None
 
 
 def _check_observation(obs: Any, space: gym.Space, found: dict[str, Finding], said: str) -> None:

@@ -8,7 +8,7 @@ MultiDiscrete space, one for each bit of a MultiBinary space that may be 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -102,15 +102,9 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
 snapshot.REMEMBERED[MaskInObservation] = {}
 
 
-@dataclass(frozen=True)
-class MaskedMaker:
-    """Makes an environment with its mask in the observation; can be pickled."""
-
-    make: Callable[[], gym.Env]
-
-    def __call__(self) -> gym.Env:
-        """Returns a new environment."""
-        return MaskInObservation(self.make())
+def with_mask(make: Callable[[], gym.Env]) -> gym.Env:
+    """Returns a new environment with its mask in the observation."""
+    return MaskInObservation(make())
 
 
 class MaskedVector(VectorEnv):
@@ -233,7 +227,7 @@ def make_masked(
         raise TypeError(f"env must be an id, an environment or a function that makes one, got {type(env).__name__}")
     chosen: Backend = "gymnasium" if backend in ("auto", "envpool") else backend
     vector = make_vector(
-        MaskedMaker(env), n_envs, chosen, seed, worker_timeout=worker_timeout, restart_workers=restart_workers
+        partial(with_mask, env), n_envs, chosen, seed, worker_timeout=worker_timeout, restart_workers=restart_workers
     )
     masked = MaskedVector(vector)
     masked.made_from = made_from

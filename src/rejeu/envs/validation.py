@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -260,19 +260,29 @@ def reset_fault(answer: Any, space: spaces.Space) -> str | None:
 
 def step_fault(answer: Any, space: spaces.Space) -> str | None:
     """Describes what is wrong with what ``step`` returned."""
+    return next((fault for _, fault in step_faults(answer, space)), None)
+
+
+def step_faults(answer: Any, space: spaces.Space, strict: bool = False) -> Iterator[tuple[str, str]]:
+    """Yields everything that is wrong with what ``step`` returned, after the name of the value that it is in.
+
+    ``step`` stands for the observation and for the whole. For ``strict`` see :func:`reward_fault` and :func:`flag_fault`.
+    """
     if not isinstance(answer, tuple) or len(answer) != 5:
         what = f"{len(answer)} values" if isinstance(answer, tuple) else describe_value(answer)
         old = " as in the old package gym" if isinstance(answer, tuple) and len(answer) == 4 else ""
-        return f"step returned {what}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
+        yield "step", f"step returned {what}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
+        return
     obs, reward, terminated, truncated, info = answer
-    fault = (
-        observation_fault(space, obs)
-        or reward_fault(reward)
-        or flag_fault("terminated", terminated)
-        or flag_fault("truncated", truncated)
-        or info_fault(info)
-    )
-    return None if fault is None else f"step returned {fault}"
+    for name, fault in (
+        ("step", observation_fault(space, obs)),
+        ("reward", reward_fault(reward, strict)),
+        ("terminated", flag_fault("terminated", terminated, strict)),
+        ("truncated", flag_fault("truncated", truncated, strict)),
+        ("info", info_fault(info)),
+    ):
+        if fault is not None:
+            yield name, f"step returned {fault}"
 
 
 def reward_fault(reward: Any, strict: bool = False) -> str | None:
