@@ -50,6 +50,8 @@ def test_a_population_from_the_command_line(pretend, tmp_path, capsys):
         (["--members", "1"], "--members=1 must be a whole number of at least 2"),
         (["--rounds", "0"], "--rounds=0 must be a whole number of at least 1"),
         (["--search", "gama=0.9..0.99"], "SAC has no setting 'gama'"),
+        (["--checkpoint-minutes", "0"], "checkpoint_minutes=0 must be above 0"),
+        (["--round-steps", "7", "--envs", "8"], "round_steps=7 must be at least the number of environments, 8"),
     ],
 )
 def test_mistakes_are_one_line_and_make_no_folder(tmp_path, monkeypatch, capsys, words, message):

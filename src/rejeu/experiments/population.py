@@ -114,6 +114,10 @@ def make(rounds: int, round_steps: int, members: int, **options: Any) -> Populat
         if is_fixed(name):
             raise ValueError(f"{name} cannot change while a run trains; leave it out, or set it for all members")
     plan = plans.make(trials=members, steps=rounds * round_steps, evaluate_every=round_steps, final_seeds=0, **options)
+    if plan.n_envs > round_steps:
+        raise ValueError(f"round_steps={round_steps} must be at least the number of environments, {plan.n_envs}")
+    if not plan.checkpoint_minutes:
+        raise ValueError("checkpoint_minutes=0 must be above 0: each round begins at the checkpoints of the one before")
     space = {name: one for name, one in plan.space.items() if not is_fixed(name)}
     if not space:
         raise ValueError(
