@@ -13,6 +13,7 @@ from rejeu.algorithms.search import Choice, Integers, LogUniform, NearOne, Unifo
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.experiments import population as populations, process
 from rejeu.experiments.population import Members
+from rejeu.experiments.space import encoded
 from rejeu.interrupt import Interrupt
 from rejeu.runs.config import RunConfig
 
@@ -246,6 +247,18 @@ def test_perturbed_values_stay_in_the_space_and_move(name):
         assert value != before
         seen.append(value)
     assert len({*seen}) > 2
+
+
+def test_equal_numbers_of_different_types_are_the_same_choice():
+    choice = Choice((1, 2, [3, 4]))
+    assert choice.contains(2.0)
+    assert not choice.contains(True)
+    assert populations.neighbor(choice, 1.0, up=True) == 2
+    assert populations.neighbor(choice, [3.0, 4], up=False) == 2
+    assert populations.perturbed(Choice((1, 2)), 2.0, np.random.default_rng(0)) == 1
+    with pytest.raises(ValueError, match="two or more different values"):
+        Choice((1, 1.0))
+    assert encoded({"a": choice}, {"a": [3.0, 4.0]}) == {"a": "[3, 4]"}
 
 
 def test_samples_lie_in_the_space():

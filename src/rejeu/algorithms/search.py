@@ -92,12 +92,16 @@ class Choice:
     values: tuple[Any, ...]
 
     def __post_init__(self) -> None:
-        if len({json.dumps(one, sort_keys=True) for one in self.values}) < max(len(self.values), 2):
+        if len({plain(one) for one in self.values}) < max(len(self.values), 2):
             raise ValueError(f"a choice needs two or more different values, got {list(self.values)}")
 
     def contains(self, value: Any) -> bool:
         """Returns whether a value is one of them."""
-        return plain(value) in [plain(one) for one in self.values]
+        return plain(value) in map(plain, self.values)
+
+    def index(self, value: Any) -> int:
+        """Returns the position of a value, which is one of them; 1 and 1.0 are the same."""
+        return [*map(plain, self.values)].index(plain(value))
 
     def ends(self) -> tuple[Any, ...]:
         """Returns all values."""
@@ -118,9 +122,13 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
-def plain(value: Any) -> Any:
-    """Returns a value as JSON gives it back."""
-    return json.loads(json.dumps(value))
+def plain(value: Any) -> str:
+    """Returns a value as JSON text, the same for equal numbers of different types.
+
+    >>> plain((1, True)) == plain([1.0, True])
+    True
+    """
+    return json.dumps(json.loads(json.dumps(value), parse_int=float), sort_keys=True)
 
 
 FIXED_AT_START = ("policy_kwargs", "replay_buffer_kwargs", "n_steps", "learning_starts")

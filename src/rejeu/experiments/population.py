@@ -33,7 +33,7 @@ from msgspec import Meta
 
 from rejeu import presets
 from rejeu.agents.run_files import copy_run, newest_step, run_files, step_of
-from rejeu.algorithms.search import FIXED_AT_START, Choice, Dimension, NearOne, SearchSpace, Uniform
+from rejeu.algorithms.search import FIXED_AT_START, Choice, Dimension, NearOne, SearchSpace, Uniform, plain
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.experiments import space as spaces, study_plan as plans
 from rejeu.experiments.process import LocalLauncher, hold
@@ -153,13 +153,13 @@ def perturbed(dimension: Dimension, value: Any, rng: np.random.Generator) -> Any
     """
     up = bool(rng.integers(2))
     moved = neighbor(dimension, value, up)
-    return neighbor(dimension, value, not up) if json.dumps(moved) == json.dumps(value) else moved
+    return neighbor(dimension, value, not up) if plain(moved) == plain(value) else moved
 
 
 def neighbor(dimension: Dimension, value: Any, up: bool) -> Any:
     """Returns the next value in a direction; ``value`` itself at the end of the range."""
     if isinstance(dimension, Choice):
-        place = [json.dumps(one) for one in dimension.values].index(json.dumps(value)) + (1 if up else -1)
+        place = dimension.index(value) + (1 if up else -1)
         return dimension.values[min(max(place, 0), len(dimension.values) - 1)]
     if isinstance(dimension, Uniform):
         return within(dimension, value + (SHIFT if up else -SHIFT) * (dimension.high - dimension.low))
@@ -395,7 +395,7 @@ def read(path: Path) -> Members:
 
 
 def train(members: Members, run: RunConfig, workers: int, stop: Interrupt, echo: Echo) -> bool:
-    """Trains until the last round or until ``stop`` is requested; returns whether the population is complete.
+    """Trains until the last round, unless ``stop`` is requested or a run cannot be started; returns whether all is trained.
 
     Raises:
         ValueError: if all members failed.

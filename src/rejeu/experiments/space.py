@@ -143,7 +143,7 @@ def encoded(space: SearchSpace, values: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(one, NearOne):
             params[COMPLEMENT + name] = min(max(1 - values[name], 1 - one.high), 1 - one.low)
         else:
-            params[name] = label(values[name]) if isinstance(one, Choice) else values[name]
+            params[name] = label(one.values[one.index(values[name])]) if isinstance(one, Choice) else values[name]
     return params
 
 
