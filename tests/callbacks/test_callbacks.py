@@ -81,6 +81,25 @@ def test_evaluate_saves_only_when_the_best_so_far_is_beaten(tmp_path):
     assert evaluate.best.step == 40
 
 
+def test_an_evaluation_of_nan_is_worse_than_any_other():
+    agent = scripted_agent([evaluation([math.nan]), evaluation([-5]), evaluation([math.nan]), evaluation([-6])])
+    evaluate = Evaluate("Pendulum-v1", 10, episodes=1, seed=0)
+    best = [evaluate.best.step for step in (10, 20, 30, 40) if evaluate.run(agent, step)]
+    evaluate.close()
+    assert best == [10, 20, 20, 20]
+
+
+def test_a_resumed_evaluation_knows_how_many_episodes_were_cut_off():
+    one, other = (Evaluate("Pendulum-v1", 10, episodes=1, seed=0) for _ in range(2))
+    one.run(scripted_agent([Evaluation(np.ones(2), np.ones(2, int), np.full(2, math.nan), cut=1)]), 10)
+    state = one.state_dict()
+    other.load_state_dict(state)
+    assert [result.evaluation.cut for result in other.results] == [1]
+    del state["cut"]  # as in files of earlier versions
+    other.load_state_dict(state)
+    assert [result.evaluation.cut for result in other.results] == [0]
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_evaluate_counts_environment_steps_whatever_the_number_of_environments(n_envs):
     evaluate = Evaluate("Pendulum-v1", every=10, episodes=1, seed=0)

@@ -123,6 +123,7 @@ class Evaluate(TrainingCallback):
         return {
             "steps": np.array([r.step for r in self.results], np.int64),
             "counts": np.array([len(part.returns) for part in parts], np.int64),
+            "cut": np.array([part.cut for part in parts], np.int64),
             **{key: np.concatenate([np.zeros(0), *arrays]) for key, arrays in columns.items()},
             "best": None if self.best is None else self.results.index(self.best),
             "due": self._is_due,
@@ -132,8 +133,10 @@ class Evaluate(TrainingCallback):
         """Restores what :meth:`state_dict` returned."""
         ends = np.cumsum(state["counts"])[:-1]
         returns, lengths, successes = (np.split(state[key], ends) for key in EVALUATED)
-        parts = zip(state["steps"].tolist(), returns, lengths, successes, strict=False)
-        self.results = [Evaluated(step, Evaluation(r, n.astype(int), s)) for step, r, n, s in parts]
+        steps = state["steps"]
+        cut = state.get("cut", np.zeros_like(steps))  # earlier versions did not save it
+        parts = zip(steps.tolist(), returns, lengths, successes, cut.tolist(), strict=False)
+        self.results = [Evaluated(step, Evaluation(r, n.astype(int), s, c)) for step, r, n, s, c in parts]
         self.best = None if state["best"] is None else self.results[state["best"]]
         self._is_due = state.get("due", False)
 
@@ -160,6 +163,6 @@ def better(evaluation: Evaluation, other: Evaluation) -> bool:
 
 
 def merit(evaluation: Evaluation) -> tuple[float, float]:
-    """Returns the success rate, -1 if it is unknown, and the mean return, by which evaluations are compared."""
-    rate = evaluation.success_rate
-    return (-1.0 if math.isnan(rate) else rate), evaluation.mean_return
+    """Returns what evaluations are compared by: success rate, -1 if it is unknown, and mean return, -inf if it is NaN."""
+    rate, value = evaluation.success_rate, evaluation.mean_return
+    return (-1.0 if math.isnan(rate) else rate), (-math.inf if math.isnan(value) else value)
