@@ -22,6 +22,10 @@ from rejeu.algorithms.config import OffPolicyConfig, to_json
 from rejeu.callbacks import Checkpoint
 from rejeu.core import TD_ERROR, Transition
 from rejeu.errors import CheckpointError
+from rejeu.experiments.folder import NOTHING, Sweep, open_folder
+from rejeu.experiments.jobs import Job
+from rejeu.experiments.plan import PlanError, read_plan
+from rejeu.experiments.sweep import Coordinator
 from rejeu.loops.learner import Learner
 from rejeu.reporting.runs import Run
 from rejeu.runs.config import RunConfig
@@ -66,7 +70,7 @@ def awac(site, monkeypatch):
     """The installed module, imported."""
     monkeypatch.syspath_prepend(site)
     yield importlib.import_module("awac")
-    del sys.modules["awac"]
+    sys.modules.pop("awac", None)
 
 
 def reach(n_envs=2):
@@ -133,9 +137,28 @@ def test_training_saving_and_exact_resume_with_hindsight_priorities_and_normaliz
 
 def test_a_file_imports_nothing_and_the_error_says_what_to_import(awac, tmp_path):
     path = awac.AWAC("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")
-    del rejeu.AGENTS["AWAC"]
+    del rejeu.AGENTS["AWAC"], sys.modules["awac"]
     with pytest.raises(CheckpointError, match=r"'AWAC', which is not registered; import awac \(--import awac\)"):
         rejeu.load(path)
+    assert "awac" not in sys.modules
+
+
+def test_plans_and_sweeps_import_no_installed_algorithm_that_they_name(site, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(site)
+    plan = {"environments": "Pendulum-v1", "algorithms": ["awac"]}
+    refused = r"not registered, and no file may name what is imported; import awac \(--import awac\)"
+    with pytest.raises(PlanError, match=refused):
+        read_plan(plan)
+    job = Job(name="a", run=RunConfig(env="Pendulum-v1", algorithm="AWAC", seed=0))
+    folder = open_folder(tmp_path / "sweep", Sweep(jobs=(job,), threads=1), None, NOTHING)
+    with pytest.raises(ValueError, match=refused):
+        Coordinator(folder, None, None, NOTHING)
+    assert "awac" not in sys.modules
+    importlib.import_module("awac")  # as --import does
+    del rejeu.AGENTS["AWAC"]  # a package that offers an entry point need not register it too
+    assert [job.run.algorithm for job in read_plan(plan)[0].jobs] == ["AWAC"]
+    assert Coordinator(folder, None, None, NOTHING).typed.imports == ("awac",)
+    del sys.modules["awac"]
 
 
 def test_help_lists_the_hyperparameters(awac):
@@ -178,6 +201,9 @@ def test_other_processes_are_told_what_to_import(awac):
     assert modules_of("SAC", ()) == modules_of("sac", ()) == ()
     assert modules_of("AWAC", ()) == ("awac",)  # its entry point
     assert modules_of("AWAC", ["my_awac.py"]) == ("my_awac.py",)
+    with pytest.raises(ValueError, match="no algorithm is called 'Own'"):
+        modules_of("Own", ())
+    rejeu.AGENTS["Own"] = awac.AWAC
     with pytest.raises(ValueError, match=r"Own is registered in this program only, .*--import my_algorithm\.py"):
         modules_of("Own", ())
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
+from rejeu.agents import AGENTS, SAC
 from rejeu.errors import CheckpointError
 from rejeu.experiments import scheduler
 from rejeu.experiments.folder import NOTHING, Sweep, open_folder, read_folder
@@ -80,8 +81,11 @@ def make_jobs(n=4, **more):
     return tuple(Job(name=f"job-{i}", run=RunConfig(env="CartPole-v1", seed=i, **more)) for i in range(n))
 
 
-def test_an_algorithm_that_no_other_process_knows_is_refused(tmp_path):
+def test_an_algorithm_that_no_other_process_knows_is_refused(tmp_path, monkeypatch):
     folder = open_folder(tmp_path / "sweep", Sweep(jobs=make_jobs(2, algorithm="Own"), threads=1), None, NOTHING)
+    with pytest.raises(ValueError, match="no algorithm is called 'Own'"):
+        Coordinator(folder, Launcher(), Interrupt(), NOTHING)
+    monkeypatch.setitem(AGENTS, "Own", type("Own", (SAC,), {}))
     with pytest.raises(ValueError, match=r"Own is registered in this program only.*imports=\['my_algorithm.py'\]"):
         Coordinator(folder, Launcher(), Interrupt(), NOTHING)
     typed = RunConfig(env="", imports=("own.py",))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -64,18 +66,24 @@ def register(agent: A, presets: Iterable[Preset] = ()) -> A:
     return agent
 
 
-def find_agent(name: str) -> type[Agent]:
-    """Returns the agent of a name that the user typed, in any case of letters.
+def find_agent(name: str, is_typed: bool = True) -> type[Agent]:
+    """Returns the agent of a name, in any case of letters.
 
     A name that is not registered is looked up among the entry points ``rejeu.algorithms`` of installed packages.
 
+    Args:
+        name: of the algorithm.
+        is_typed: whether the user typed it. A name in a file imports nothing: only what is imported already is found.
+
     Raises:
-        ValueError: if there is no such algorithm, with the nearest name.
+        ValueError: if there is no such algorithm, with the nearest name or what to import.
     """
     known = {key.lower(): key for key in AGENTS}
     if name.lower() in known:
         return AGENTS[known[name.lower()]]
     if (found := entry_point(name)) is not None:
+        if not (is_typed or found.module in sys.modules):
+            raise ValueError(f"{name} is not registered, and no file may name what is imported; {advice(found)}")
         agent = found.load()
         return agent if agent in AGENTS.values() else register(agent)
     near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
@@ -89,14 +97,20 @@ def agent_of_file(name: Any, path: str | Path) -> type[Agent]:
     Raises:
         CheckpointError: if it is not registered; the message says what to import.
     """
-    if isinstance(name, str) and name in AGENTS:
-        return AGENTS[name]
-    hint = "import the module that registers it (--import MODULE)"
-    if isinstance(name, str) and (found := entry_point(name)) is not None:
-        hint = f"import {found.module} (--import {found.module})"
+    if isinstance(name, str):
+        with suppress(ValueError):
+            return find_agent(name, is_typed=False)
+    hint = advice(entry_point(name) if isinstance(name, str) else None)
     raise CheckpointError(
         f"{path} contains an agent of {str(name)[:40]!r}, which is not registered; {hint}; there are {', '.join(AGENTS)}"
     )
+
+
+def advice(found: metadata.EntryPoint | None) -> str:
+    """Returns what to import for an algorithm that is not registered."""
+    if found is None:
+        return "import the module that registers it (--import MODULE)"
+    return f"import {found.module} (--import {found.module})"
 
 
 def entry_point(name: str) -> metadata.EntryPoint | None:
@@ -109,10 +123,10 @@ def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
     """Returns the modules that another process must import to know an algorithm: ``imports``, else that of its entry point.
 
     Raises:
-        ValueError: if only this process knows it, such as one of a notebook.
+        ValueError: if it is not registered, or in this process only, such as one of a notebook.
     """
     given = tuple(imports)
-    if given or algorithm.lower() in {name.lower() for name in BUILT_IN}:
+    if given or find_agent(algorithm, is_typed=False) in BUILT_IN.values():
         return given
     if (found := entry_point(algorithm)) is not None:
         return (found.module,)

@@ -283,7 +283,8 @@ def read_algorithms(value: Any, source: Source, place: Place) -> tuple[str | Non
     values = [value] if isinstance(value, str) else value
     if not isinstance(values, list | tuple) or not values or not all(isinstance(one, str) for one in values):
         raise source.error(place, f"algorithms={shown(value)} must be a list of names, such as ['SAC', 'TD3']")
-    names = tuple(source.checked(place, find_agent, one).algorithm.Config.name for one in values)
+    found = [source.checked(place, find_agent, one, is_typed=False) for one in values]
+    names = tuple(agent.algorithm.Config.name for agent in found)
     if len({*names}) < len(names):
         raise source.error(place, f"algorithms={shown(names)} names one twice")
     return names
