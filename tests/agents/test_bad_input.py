@@ -69,7 +69,7 @@ MISTAKES = {
         "batch_size=512 must not exceed buffer_size=100; try",
     ),
     "buffer larger than the memory": (
-        sac(Counter(), buffer_size=10**13),
+        sac(Counter(), buffer_size=10**12),
         MemoryError,
         r"buffer_size=10000000000000 takes .* GiB .* are free; try buffer_size=\d+",
     ),

@@ -101,6 +101,7 @@ MISTAKES = [
     ("evaluate_every = 500", "env_kwargs = {render_mode = 'human'}", 6, "render_mode=human"),
     ("evaluate_every = 500", "env_kwargs = {foo = 1}", 2, "unexpected keyword argument"),
     ("evaluate_every = 500", "threads = 0", 6, "threads=0 must be"),
+    ("train_freq = 8", "buffer_size = 1_000_000_000_000_000", 17, "at most 1000000000000"),
 ]
 
 

@@ -30,6 +30,9 @@ from rejeu.validation import C, assign, build, choice, coerce, flag, nested, num
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
 """The replay buffers by name, and the configuration of each."""
+MOST_ROWS = 10**12
+"""Upper limit on the size of a replay buffer and of its batches, beyond the memory of any machine. What fits is checked when
+a run begins, since it may be another machine than the one on which a plan is read."""
 OWN = "own"
 """Key of the name by which a file mentions an object of the user's own."""
 registered: dict[str, Any] = {}
@@ -135,7 +138,7 @@ class OffPolicyConfig(AlgorithmConfig):
 
     def __post_init__(self) -> None:
         AlgorithmConfig.__post_init__(self)
-        coerce(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1)
+        coerce(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1, most=MOST_ROWS)
         coerce(self, "frame_stack", whole, least=1, optional=True)
         coerce(self, "learning_starts", whole, least=0)
         coerce(self, "tau", number, above=0, most=1)
