@@ -155,6 +155,17 @@ def test_a_line_is_found_in_tables_and_across_lines():
     assert line_of(text, ()) == 1
 
 
+def test_a_line_that_is_not_certain_is_that_of_the_table():
+    text = (
+        '[a]\n# b = 1\n\'b = 2\' = 0\nb = 3\n"e\\tf" = 4\n["g\\t".h]\nc = 5\n[i . "j.k"]\nrows = [\n [1],\n]\nc = 6\n'
+    )
+    assert line_of(text, ("a", "b")) == 4  # neither the comment nor the key that contains a =
+    assert line_of(text, ("a", "e\tf")) == 1
+    assert line_of(text, ("a", "c")) == 1
+    assert line_of(text, ("i", "j.k", "rows")) == 9
+    assert line_of(text, ("i", "j.k", "c")) == 8
+
+
 def test_an_invalid_plan_starts_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PlanError):

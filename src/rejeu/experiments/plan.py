@@ -35,6 +35,10 @@ OWN = ("environments", "algorithms", "settings", "seeds", "first_seed", "threads
 OPTIONS = (*(one.shown.name or one.field for one in options(RunConfig) if one.field not in OWN_OF_JOBS), *FILES)
 """Options of a plan, which are those of ``rejeu train``."""
 Place = tuple[str, ...]
+KEY = re.compile(r"\"([^\"\\]*)\"|'([^']*)'|([\w-]+)")
+KEYS = rf"(?P<keys>(?:{KEY.pattern})(?:\s*[.]\s*(?:{KEY.pattern}))*)"
+NAMED = re.compile(rf"\s*(?P<header>\[+\s*)?{KEYS}\s*(?(header)\]+\s*(#|$)|=)")
+"""A line that names a table or a key, without escapes."""
 
 
 class PlanError(ValueError):
@@ -140,7 +144,7 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
 
 
 def line_of(text: str, place: Place) -> int:
-    r"""Returns the line that names most of a place: its key, or else the table around it.
+    r"""Returns the line that names most of a place: its key, or the table around it where that is not certain.
 
     >>> line_of("steps = 10\n[settings.fast]\n\ngamma = [\n0.9]", ("settings", "fast", "gamma"))
     4
@@ -148,13 +152,14 @@ def line_of(text: str, place: Place) -> int:
     found, most = 1, 0
     table: tuple[str, ...] = ()
     for number, line in enumerate(text.splitlines(), 1):
-        header = re.match(r"\s*\[\[?([^\[\]]+)\]", line)
-        name = header[1] if header else line.partition("=")[0] if "=" in line else ""
-        keys = tuple("".join(parts) for parts in re.findall(r"\"([^\"]*)\"|'([^']*)'|([\w-]+)", name))
-        table = keys if header else table
-        keys = keys if header else (*table, *keys)
+        named = NAMED.match(line)
+        keys = tuple("".join(parts) for parts in KEY.findall(named["keys"])) if named else ()
+        if line.lstrip().startswith("["):
+            table = keys or ("",)  # unknown: its name has escapes, or this is a row of a list
+        else:
+            keys = (*table, *keys)
         n = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(keys, place, strict=False)))
-        if name and n > most:
+        if named and n > most:
             found, most = number, n
     return found
 
