@@ -1,4 +1,4 @@
-"""The memory and the processor cores that this process may use.
+"""The memory and the processor cores that this process may use, and the folder that SDL asks for.
 
 On Linux both may be limited by control groups, as in containers and under schedulers of clusters. A group cannot use more
 than the groups that contain it, so the smallest limit counts.
@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -99,3 +101,9 @@ def _value(path: Path, name: str = "") -> int | None:
     """Returns the number after ``name`` at the beginning of a line; None if there is none, or no such file."""
     found = re.search(rf"^{name}\s*(\d+)", _text(path), re.MULTILINE)
     return int(found[1]) if found else None
+
+
+def quiet_sdl() -> None:
+    """Sets ``XDG_RUNTIME_DIR`` on Linux if it is missing, about which SDL would print a line for each screen."""
+    if sys.platform.startswith("linux"):
+        os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())

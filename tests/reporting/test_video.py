@@ -219,6 +219,7 @@ def test_environment_variables_are_put_back(setting, monkeypatch):
         monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     else:
         monkeypatch.setenv("SDL_VIDEODRIVER", setting)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "given")
     before = dict(os.environ)
     with suppress(KeyError), rendering.display_for_pygame():
         inside = os.environ.get("SDL_VIDEODRIVER")
@@ -230,8 +231,11 @@ def test_environment_variables_are_put_back(setting, monkeypatch):
 def test_driver_is_left_alone_where_there_is_a_display(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
     with rendering.display_for_pygame():
         assert "SDL_VIDEODRIVER" not in os.environ
+    assert Path(os.environ["XDG_RUNTIME_DIR"]).is_dir()  # SDL complains without it
 
 
 def test_an_error_leaves_the_older_file_and_nothing_half_written(lamp, tmp_path):

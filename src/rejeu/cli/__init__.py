@@ -12,7 +12,6 @@ import re
 import signal
 import sys
 import sysconfig
-import tempfile
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rejeu
-from rejeu import errors, interrupt, supervised
+from rejeu import errors, hardware, interrupt, supervised
 from rejeu.cli import parsing
 from rejeu.cli.commands import COMMANDS, MODULES, check_options, of_task
 from rejeu.runs.config import read_task
@@ -49,8 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):  # a pipe may have an encoding without ±
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
-        os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
+    hardware.quiet_sdl()
     with interrupt.leaving(), supervised.by_parent(), warnings.catch_warnings():
         warnings.showwarning = show_warning
         status = run_command(argv)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import tempfile
 from typing import Any
 
 from rejeu.courses.checks.base import SESSION
@@ -22,8 +19,6 @@ def by_hand(env: str, episodes: int, seed: int | None = None, against: Any = Non
     """
     from rejeu.play import play
 
-    if sys.platform.startswith("linux"):  # without it, SDL complains on every screen
-        os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     try:
         game = play(env, episodes=episodes, seed=seed, against=against)
     except (MissingExtra, OSError) as error:

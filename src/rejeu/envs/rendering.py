@@ -14,6 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from rejeu import hardware
+
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
 
@@ -94,6 +96,7 @@ def display_for_pygame() -> Iterator[None]:
     While ``SDL_VIDEODRIVER=dummy`` is set, highway-env renders black frames. Therefore the variable is set only while pygame's
     display is opened.
     """
+    hardware.quiet_sdl()
     name = "SDL_VIDEODRIVER"
     driver = os.environ.get(name, "dummy" if is_headless() else None)
     with environment_variable(name, driver):

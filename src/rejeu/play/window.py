@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from rejeu import hardware
 from rejeu.errors import MissingExtra
 from rejeu.play.game import Game, Player
 from rejeu.play.keys import KeyMap, equivalent_keys
@@ -66,6 +67,7 @@ class Window:
             raise MissingExtra("playing", "pygame-ce", "play") from None
         self.pygame: Any = pygame
         self.title = title
+        hardware.quiet_sdl()
         try:
             pygame.display.init()
             driver = pygame.display.get_driver()
