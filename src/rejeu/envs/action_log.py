@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from rejeu.spaces import action_scaler, check_env_actions, random_action
 from rejeu.validation import whole
@@ -144,6 +142,9 @@ def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[Operat
     Raises:
         ValueError: if the log is corrupted.
     """
+    from rich.console import Console  # not loaded with every model
+    from rich.progress import track
+
     n = whole("n_operations", saved["n_operations"], least=0, most=log.most_operations)
     console = Console(stderr=True)
     hidden = n < MANY_OPERATIONS or not (console.is_terminal or console.is_jupyter)
