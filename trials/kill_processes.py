@@ -305,13 +305,14 @@ def main() -> None:
         return
     from provenance import commit
 
+    tried = commit()  # at the start: the sources may change while it runs
     known = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.exists() else {}
     for name in arguments.only or CASES:
         result = try_case(name, arguments.kills, random.Random(f"{arguments.seed} {name}"))
         only = f' --only "{name}"'
         known[name] = {
             "command": f"python trials/kill_processes.py --kills {arguments.kills}{only}",
-            "commit": commit(),
+            "commit": tried,
         }
         known[name] |= {"date": time.strftime("%Y-%m-%d"), **result}
         print(json.dumps(known[name]), flush=True)

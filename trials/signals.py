@@ -135,6 +135,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the runs would inherit that it is ignored, as under nohup
+    from provenance import provenance, write
+
+    origin = provenance()  # at the start: the sources may change while it runs
     rng = random.Random(arguments.seed)
     lengths = []
     for number in range(2):  # the first run fills the compilation cache
@@ -153,10 +156,8 @@ def main() -> None:
             found.append(one)
             print(len(found), json.dumps(one), flush=True)
     counted = [one for one in found if one["phase"] != PHASES[0]]
-    from provenance import provenance, write
-
     result = {
-        **provenance(),
+        **origin,
         "seconds_of_a_run": round(lengths[-1], 1),
         "signals": len(found),
         "by_phase": {name: sum(one["phase"] == name for one in found) for name in PHASES},
