@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rejeu import xla
+from rejeu.loops.packing import Packing
 
 
 def test_what_runs_once_is_computed_also_where_xla_does_not_know_the_options(monkeypatch):
@@ -43,6 +44,19 @@ def test_a_function_apart_computes_the_same_and_takes_any_tree_and_setting(wrapp
 def test_a_function_apart_may_be_differentiated_and_batched(wrapped):
     cube = wrapped(lambda x: x**3)
     np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(cube)))(jnp.arange(4.0)), 3 * np.arange(4.0) ** 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n_runs", [1, 8])
+def test_a_packed_state_that_xla_splits_between_threads_is_compiled(n_runs):
+    leaves = [jnp.full((n_runs, 8192 // n_runs), i, jnp.float32) for i in range(12)]
+    packing = Packing([leaf[0] for leaf in leaves])
+
+    def doubled(leaves):
+        return xla.one_kernel(packing.pack, packing.longest)([2 * leaf for leaf in leaves])
+
+    packed = jax.vmap(xla.for_runs(doubled, n_runs))
+    (found,) = jax.jit(packed)(leaves)
+    assert found.reshape(n_runs, 12, -1)[:, :, 0].tolist() == [[2.0 * i for i in range(12)]] * n_runs
 
 
 def test_other_processors_are_told_nothing(monkeypatch):

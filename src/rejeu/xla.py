@@ -37,6 +37,12 @@ ONE_KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 SMALL = 2**19
 """Maximum number of input elements of such a call; one kernel runs in one thread."""
 
+SPLIT = 2**16
+"""Elements of a result from which on XLA splits an operation between threads. Inside of one kernel it cannot, and fails to
+compile a concatenation ("Invalid LLVM IR", jaxlib 0.10.2), unless the program is in the cache, whose keys have no threads."""
+
+_n_runs = 1
+"""How many runs the function that is traced computes at once."""
 _seconds = 0.0
 _listening = False
 _threads: int | None = None
@@ -132,23 +138,40 @@ def outlined(function: F) -> F:
     return _marked(function, OUTLINED, math.inf)
 
 
-def one_kernel(function: F) -> F:
+def one_kernel(function: F, concatenates: int = 0) -> F:
     """Returns ``function`` such that XLA on a CPU compiles each call of it to one kernel.
 
     For cheap functions of many small arrays, such as an optimizer's step, which would be one kernel for each array (see
-    :func:`outlined`). Matrix products are slow in it.
+    :func:`outlined`). Matrix products are slow in it. ``concatenates`` is the number of elements of the largest array that
+    the function makes of others.
     """
-    return _marked(function, ONE_KERNEL, SMALL)
+    return _marked(function, ONE_KERNEL, SMALL, concatenates)
 
 
-def _marked(function: F, marks: dict[str, str], most: float) -> F:
+def for_runs(function: Callable[..., Any], n: int) -> Callable[..., Any]:
+    """Returns ``function``, which ``jax.vmap`` is going to compute for ``n`` runs at once."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        global _n_runs
+        before, _n_runs = _n_runs, n
+        try:
+            return function(*arguments)
+        finally:
+            _n_runs = before
+
+    return call
+
+
+def _marked(function: F, marks: dict[str, str], most: float, concatenates: int = 0) -> F:
     """Returns ``function`` as a call with these attributes, if its inputs have at most ``most`` elements."""
 
     @functools.wraps(function)
     def call(*arguments: Any, **keywords: Any) -> Any:
         leaves, structure = jax.tree.flatten((arguments, keywords))
         where = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray)]
-        if platform() != "cpu" or sum(leaves[i].size for i in where) > most:
+        is_split = concatenates * _n_runs > SPLIT and threads() > 1
+        if platform() != "cpu" or is_split or sum(leaves[i].size for i in where) > most:
             return function(*arguments, **keywords)
 
         def of_arrays(*arrays: Array) -> Any:

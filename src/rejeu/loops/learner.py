@@ -85,7 +85,7 @@ class Learner:
         is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
         after, metrics = step(before, batches) if is_one else jax.lax.scan(step, before, batches)
         # Without the barrier XLA would compute the optimizer's step once more for the check.
-        state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack)(after))
+        state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack, self.packing.longest)(after))
         td_error = td_error_of(metrics, batches)
         metrics.pop(TD_ERROR, None)
         vectors = state[: len(self.packing.groups)]  # large arrays are checked by the monitor

@@ -41,6 +41,8 @@ class Packing:
         self.groups = list(small.values())
         """Indices of the leaves that share a vector, by vector."""
         self.large = [i for i, size in enumerate(self.sizes) if size > LARGE]
+        self.longest = max((sum(self.sizes[i] for i in group) for group in self.groups), default=0)
+        """Number of elements of the longest vector."""
 
     def pack(self, tree: PyTree, concatenate: Callable[..., Any] = jnp.concatenate) -> list[Any]:
         """Returns the vectors of ``tree`` and then its large leaves; with ``np.concatenate`` of NumPy arrays."""

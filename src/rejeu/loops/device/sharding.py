@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from rejeu.core import PyTree
+from rejeu.xla import for_runs
 
 T = TypeVar("T")
 RUNS = "runs"
@@ -78,7 +79,7 @@ def over_runs(
     """
     if n == 1:
         return function
-    mapped = jax.vmap(function, in_axes, out_axes)
+    mapped = jax.vmap(for_runs(function, n if mesh is None else n // mesh.size), in_axes, out_axes)
     if mesh is None:
         return mapped
     spec = lambda axis: PartitionSpec() if axis is None else PartitionSpec(RUNS)  # noqa: E731
