@@ -46,8 +46,14 @@ RUNS = {
         n_envs=8,
         seed=0,
         steps=10**12,
+        success_threshold=0.1234567890123,
         checkpoint_minutes=0.0,
-        hyperparameters={"gamma": 0.9, "policy_kwargs.net_arch": [8], "train_freq": [1, "episode"]},
+        hyperparameters={
+            "gamma": 0.9,
+            "learning_rate": 0.000123456789,
+            "policy_kwargs.net_arch": [8],
+            "train_freq": [1, "episode"],
+        },
         log=("json", "wandb"),
     ),
 }

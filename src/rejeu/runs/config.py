@@ -196,7 +196,8 @@ class RunConfig(EnvironmentOptions):
             if one.field in WORDS_OF_THEIR_OWN or value == one.default or isinstance(value, bool):
                 continue
             words.append(one.name)
-            words += value if isinstance(value, tuple) else [f"{value:g}" if isinstance(value, float) else str(value)]
+            text = repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
+            words += value if isinstance(value, tuple) else [text]
         return [*words, *assignment_words("--set", self.hyperparameters)]
 
 
