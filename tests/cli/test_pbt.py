@@ -61,6 +61,24 @@ def test_mistakes_are_one_line_and_make_no_folder(tmp_path, monkeypatch, capsys,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_population_of_which_a_run_cannot_be_started_decides_nothing_and_goes_on_later(
+    pretend, tmp_path, monkeypatch, capsys
+):
+    out, start = tmp_path / "population", process.LocalLauncher.start
+
+    def full(self, task, log, lock):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(process.LocalLauncher, "start", full)
+    assert cli.main(["pbt", "Pendulum-v1", *SMALL, "--out", str(out)]) == 1
+    printed = capsys.readouterr().out
+    assert "member 3 in round 0 could not be started: [Errno 28] No space left on device" in printed
+    assert f"not complete; rejeu resume {out} continues" in printed
+    monkeypatch.setattr(process.LocalLauncher, "start", start)
+    assert cli.main(["resume", str(out)]) == 0
+    assert "best member" in capsys.readouterr().out
+
+
 def test_a_population_takes_no_options_of_a_run(pretend, tmp_path, capsys):
     out = tmp_path / "population"
     assert cli.main(["pbt", "Pendulum-v1", *SMALL, "--rounds", "1", "--out", str(out)]) == 0

@@ -11,7 +11,7 @@ import pytest
 from rejeu import cli
 from rejeu.cli import seeds
 from rejeu.cli.commands import Train
-from rejeu.experiments import process
+from rejeu.experiments import process, scheduler
 from rejeu.runs.config import RunConfig
 from tests.reporting.test_comparison import write_run
 
@@ -92,6 +92,21 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
     assert not out.exists()
     assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--pause", "10"]) == 2
     assert "--pause is for a single run" in capsys.readouterr().err
+
+
+def test_a_seed_that_cannot_be_started_is_left_and_said(tmp_path, monkeypatch, other_program, capsys):
+    start = process.LocalLauncher.start
+
+    def full(self, task, log, lock):
+        if "seed_1" in log.name:
+            raise OSError(28, "No space left on device")
+        return start(self, task, log, lock)
+
+    monkeypatch.setattr(process.LocalLauncher, "start", full)
+    out = tmp_path / "out"
+    monkeypatch.setattr(scheduler, "POLL", 0.03)
+    assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--seed", "1", "--out", str(out)]) == 1
+    assert "seed 1 could not be started: [Errno 28] No space left on device" in capsys.readouterr().out
 
 
 def test_jobs_without_seeds(capsys):

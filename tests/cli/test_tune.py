@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -77,6 +78,26 @@ def test_a_study_without_a_complete_trial_exits_with_2(pretend, tmp_path, capsys
     assert "trials        2 failed" in printed
     assert "best trial    none: no trial is complete" in printed
     assert "the loss is NaN" in printed
+
+
+def test_a_study_of_which_a_trial_cannot_be_started_goes_on_later(pretend, tmp_path, monkeypatch, capsys):
+    words, start, n_started = ["--trials", "2", "--final-seeds", "0", "--workers", "1"], process.LocalLauncher.start, 0
+
+    def full(self, task, log, lock):
+        nonlocal n_started
+        n_started += 1
+        if n_started > 1:
+            raise OSError(28, "No space left on device")
+        return start(self, task, log, lock)
+
+    monkeypatch.setattr(process.LocalLauncher, "start", full)
+    assert tune(*words, out=tmp_path / "study") == 1
+    printed = capsys.readouterr().out
+    assert "trials        1 complete, 1 running" in printed
+    assert re.search(r"note +trial 0001, seed \d+ could not be started: \[Errno 28\] No space left on device", printed)
+    monkeypatch.setattr(process.LocalLauncher, "start", start)
+    assert tune(*words, out=tmp_path / "study") == 0
+    assert "trials        2 complete" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from rejeu.runs.values import quoted
 
 
 def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
-    """Begins or joins a sweep; the exit status is 0, 2 if a run failed, 130 after Ctrl-C and 143 after SIGTERM."""
+    """Begins or joins a sweep; the exit status is 0, 2 if a run failed, 1 if one was left, 130 or 143 after a signal."""
     typed = RunConfig(env="", imports=arguments.imports)
     folder = prepare(arguments.plan, arguments.out, arguments.workers, typed, arguments.ray)
     return complete(folder, typed, arguments.workers, arguments.ray, retry=False)
@@ -80,7 +80,8 @@ def train(
         echo(line)
     comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
     outcomes = coordinator.outcomes()
-    status = 2 if any(one.state == "failed" for one in outcomes) else 0
+    states = {one.state for one in outcomes}
+    status = 2 if "failed" in states else 1 if states & {"waiting", "stopped"} else 0
     if stop.signal is not None:
         echo(
             f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)} continues"

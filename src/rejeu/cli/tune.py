@@ -41,7 +41,10 @@ if TYPE_CHECKING:
 
 
 def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
-    """Searches; the exit status is 0, 2 if no trial is complete or a training of the comparison failed, 130, 143."""
+    """Searches; the exit status is 0, 1 if a trial could not be started, 130 after Ctrl-C, 143 after SIGTERM.
+
+    It is 2 if no trial is complete or a training of the comparison failed.
+    """
     made = usable_environment(arguments)
     plan = plans.make(
         made.env_id,
@@ -139,6 +142,8 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
     echo(str(result))
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()
+    if not study.is_searched():
+        return 1, result.to_dict()
     return (0 if result.complete and result.best is not None else 2), result.to_dict()
 
 
@@ -223,7 +228,7 @@ def header(study: Study, made: Environment) -> list[str]:
 
 
 def run_pbt(arguments: Pbt) -> tuple[int, dict[str, Any]]:
-    """Trains a population; the exit status is 0, 130 after Ctrl-C, 143 after SIGTERM."""
+    """Trains a population; the exit status is 0, 1 if a run could not be started, 130 after Ctrl-C, 143 after SIGTERM."""
     check_free(arguments.out)
     made = usable_environment(arguments)
     population = populations.make(
@@ -260,9 +265,10 @@ def train(members: Members, made: Environment, workers: int | None) -> tuple[int
     with members.lock(), Interrupt() as stop:
         complete = populations.train(members, common(made, plan.algorithm), at_once, stop, echo)
     result = as_dict(members, complete, stop.signal)
-    if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(members.path)}{made.run.again()} continues")
-        return 128 + stop.signal, result
+    if stop.signal is not None or not complete:
+        why = "not complete" if stop.signal is None else f"stopped by {NAMES[stop.signal]}"
+        echo(f"{why}; rejeu resume {quoted(members.path)}{made.run.again()} continues")
+        return 1 if stop.signal is None else 128 + stop.signal, result
     echo(f"\nbest member   {result['best']['member']}: {plan.measure} {result['best']['score']:,.4g}")
     echo(f"model         {members.path / 'best.safetensors'}")
     echo(f"history       {members.path / 'history.csv'}")

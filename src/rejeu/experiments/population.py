@@ -411,7 +411,7 @@ def train(members: Members, run: RunConfig, workers: int, stop: Interrupt, echo:
 
 
 def train_round(members: Members, number: int, run: RunConfig, workers: int, stop: Interrupt, echo: Echo) -> bool:
-    """Trains all members to the end of a round; returns False if it was stopped before."""
+    """Trains all members to the end of a round; returns False if it was stopped before, or one could not be started."""
     values = members.values(number)
     tasks = [MemberWork(members, member, number, values[member], run) for member in range(len(values))]
 
@@ -422,7 +422,7 @@ def train_round(members: Members, number: int, run: RunConfig, workers: int, sto
     scheduler = Scheduler(LocalLauncher(workers), stop, say)
     scheduler.waiting.extend(tasks)
     scheduler.run()
-    if any(task.ending == "stopped" for task in tasks):
+    if any(task.ending in ("stopped", "left") for task in tasks):
         return False
     for task in tasks:
         if task.ending != "failed" and not task.has_result():

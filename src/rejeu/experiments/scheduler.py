@@ -6,6 +6,7 @@ Sweeps, several seeds, studies, their final comparisons and populations give it 
 - A run that was lost (its process was killed, its machine is gone, it was stopped by somebody else) continues from its newest
   checkpoint. It has failed if it is lost ``MAX_LOST`` times in a row without a new checkpoint.
 - A run with another status has failed.
+- A run that cannot be started, as on a full disk, has not failed: it is left to a later process.
 - When this process is asked to stop, all runs stop with a checkpoint, and continue when they are scheduled again.
 """
 
@@ -37,7 +38,7 @@ MAX_LOST = 5
 STOPPED = (129, 130, 143)
 """Exit statuses of a run that a signal stopped; its checkpoint is saved."""
 
-Ending = Literal["done", "failed", "stopped"]
+Ending = Literal["done", "failed", "stopped", "left"]
 Say = Callable[[str], object]
 
 
@@ -83,7 +84,7 @@ class Work(ABC):
     status: int | None = None
     """Its last exit status."""
     reason: str = ""
-    """Why it failed."""
+    """Why it failed or was left."""
 
     @abstractmethod
     def task(self) -> Task:
@@ -131,6 +132,8 @@ class Scheduler:
         self.waiting: deque[Work] = deque()
         """Tasks that this process may still take."""
         self.running: list[Attempt] = []
+        self.left: list[str] = []
+        """The runs that could not be started, each with the reason."""
         self._lost: dict[Work, int] = {}
         """How often in a row a task was lost without a new checkpoint."""
         self._rescan_at = 0.0
@@ -185,7 +188,7 @@ class Scheduler:
             try:
                 claim, is_taken = claimed(task)
             except OSError as error:
-                self.say(f"{task.name} could not be started: {' '.join(str(error).split())}")
+                self._leave(task, error)
                 continue
             if is_taken:
                 held.append(task)
@@ -210,11 +213,16 @@ class Scheduler:
             write_task(file, task.task())
             handle = self.launcher.start(file, task.log, task.lock)
         except OSError as error:
-            task.status = 2
-            self._note(task, "failed", f"could not be started: {' '.join(str(error).split())}")
             release(claim)
+            self._leave(task, error)
             return
         self.running.append(Attempt(task, claim, handle, first))
+
+    def _leave(self, task: Work, error: OSError) -> None:
+        """Leaves a run that cannot be started to a later process, which may be one of another machine."""
+        task.ending, task.reason = "left", f"could not be started: {' '.join(str(error).split())}"
+        self.left.append(f"{task.name} {task.reason}")
+        self.say(self.left[-1])
 
     def _end(self, attempt: Attempt, status: int) -> None:
         """Applies the rule to a run whose process ended."""

@@ -151,14 +151,18 @@ class Search:
         self._next_look = 0.0
 
     def run(self, watch: Watch) -> None:
-        """Trains until the study is searched or a stop is requested; the next run continues interrupted trials."""
+        """Trains until the study is searched, a stop is requested or a training cannot be started.
+
+        The next run continues the trials that were interrupted or not started.
+        """
         try:
             while True:
-                has_news = not self.stop.requested and self.begin()
+                is_over = self.stop.requested or bool(self.scheduler.left)
+                has_news = not is_over and self.begin()
                 self.scheduler.turn()
                 if self.advance() or has_news:
                     watch(self.study.outcomes())
-                if not self.running and (self.stop.requested or self.study.is_searched()):
+                if not self.running and (is_over or self.study.is_searched()):
                     return
                 time.sleep(schedulers.POLL)
         finally:
@@ -190,7 +194,6 @@ class Search:
         has_news = False
         for one in list(self.running):
             has_ended = all(training.ending for training in one.trainings)  # before the evaluations are read
-            was_stopped = self.stop.requested and any(training.ending == "stopped" for training in one.trainings)
             has_news |= one.advance(self.study)
             if one.state is not None:
                 self.scheduler.ask_to_stop(*one.trainings)
@@ -198,7 +201,7 @@ class Search:
                 continue
             self.running.remove(one)
             has_news = True
-            if was_stopped and one.state is None:
+            if one.state is None and any(training.ending in ("stopped", "left") for training in one.trainings):
                 self.study.release(one.index)
             else:
                 one.finish(self.study)
@@ -271,7 +274,7 @@ def train_final(tasks: Sequence[Training], workers: int, stop: Interrupt, echo: 
     scheduler = Scheduler(LocalLauncher(workers), stop, say, waits=True)
     scheduler.waiting.extend(tasks)
     scheduler.run()
-    return [f"{task.name}: {task.reason}" for task in tasks if task.ending == "failed"]
+    return [f"{task.name}: {task.reason}" for task in tasks if task.ending in ("failed", "left")]
 
 
 def compared(study: Study, best: Outcome, failed: list[str]) -> Final:

@@ -50,7 +50,7 @@ class Result:
     signal: int | None
     """Number of the signal that stopped the study; None if none did."""
     notes: tuple[str, ...] = ()
-    """What could not be written."""
+    """What could not be started or written."""
 
     @property
     def preset(self) -> Preset | None:
@@ -217,7 +217,8 @@ def run(
     plan, folder = study.plan, study.folder
     at_once = workers or default_workers()
     config = dataclasses.replace(config, checkpoint_minutes=plan.checkpoint_minutes)
-    Search(study, config, at_once, stop).run(watch)
+    search = Search(study, config, at_once, stop)
+    search.run(watch)
     outcomes = study.outcomes()
     best = studies.best_of(outcomes)
     compared = None
@@ -230,7 +231,7 @@ def run(
             failed = searches.train_final(searches.final_trainings(study, best, config), at_once, stop, echo)
         compared = None if stop.requested else searches.compared(study, best, failed)
     complete = study.is_searched() and not stop.requested and not (compared and compared.failed)
-    notes = []
+    notes = [f"trial {text}" for text in search.scheduler.left]
     try:
         echo(f"page          {page.write(study, outcomes, compared)}")
     except (MissingExtra, OSError) as error:
