@@ -92,6 +92,16 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
     assert not out.exists()
     assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--pause", "10"]) == 2
     assert "--pause is for a single run" in capsys.readouterr().err
+    mistakes = {
+        "--backend": "--backend='typo' must be 'auto' or 'envpool'",
+        "--device": "--device='typo' must be",
+        "--log": "--log contains 'typo', expected",
+        "--algo": "no algorithm is called 'typo'",
+    }
+    for option, message in mistakes.items():
+        assert cli.main(["train", "CartPole-v1", "--seeds", "2", option, "typo", "--out", str(out)]) == 2
+        assert message in capsys.readouterr().err
+        assert not out.exists()
 
 
 def test_a_seed_that_cannot_be_started_is_left_and_said(tmp_path, monkeypatch, other_program, capsys):

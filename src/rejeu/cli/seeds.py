@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 
 from rejeu import devices
-from rejeu.agents import training
+from rejeu.agents import find_agent, training
 from rejeu.agents.device import reason_against, require_memory
 from rejeu.agents.together import learn_together, sibling, start_device
 from rejeu.cli import sweep
 from rejeu.cli.commands import Train
 from rejeu.cli.importing import find_id
 from rejeu.cli.output import Stopwatch, echo, header
-from rejeu.cli.session import Session, make_evaluation_env
+from rejeu.cli.session import Session, installed_logs, make_evaluation_env
 from rejeu.envs.functional.registry import is_functional
+from rejeu.envs.make import BACKENDS
 from rejeu.experiments.folder import Sweep, SweepFolder, open_folder
 from rejeu.experiments.jobs import Job, again
 from rejeu.experiments.process import LocalLauncher, default_workers, threads_of
@@ -31,6 +32,7 @@ from rejeu.runs import config as configs
 from rejeu.runs.config import RunConfig
 from rejeu.runs.folder import RunFolder, check_free
 from rejeu.runs.values import quoted
+from rejeu.validation import choice
 
 Begin = Callable[[Train, int, ExitStack], Session]
 """Makes the session of a seed; see :func:`rejeu.cli.train.begin`."""
@@ -51,10 +53,20 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
 
 
 def make_jobs(arguments: Train) -> tuple[Job, ...]:
-    """Returns one job for each seed."""
+    """Returns one job for each seed.
+
+    Raises:
+        ValueError: for an unknown algorithm, backend, device or log.
+        MissingExtra: if what ``--log`` or ``--video-every`` need is not installed.
+    """
     assert arguments.seeds is not None
     first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
+    installed_logs(arguments)
+    devices.named(arguments.device, "--device")
+    choice("--backend", arguments.backend or "auto", BACKENDS)
+    if arguments.algorithm is not None:
+        given["algorithm"] = find_agent(arguments.algorithm).algorithm.Config.name
     if arguments.ray not in (None, "auto"):
         os.environ["RAY_ADDRESS"] = arguments.ray  # no file may name an address
     run = RunConfig(**{**given, "ray": None if arguments.ray is None else "auto", "imports": ()})

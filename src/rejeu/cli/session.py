@@ -17,6 +17,7 @@ from rejeu import errors
 from rejeu.agents import Agent, load
 from rejeu.agents.outputs import run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo, calling
+from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.envs.make import VectorEnv
@@ -25,7 +26,8 @@ from rejeu.loops.run import Progress
 from rejeu.reporting import plots, report, video
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.history import EpisodeTable
-from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, guarded, open_log
+from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, check_logs, guarded, open_log, require
+from rejeu.reporting.video_file import ffmpeg
 from rejeu.runs.config import DecidedRun
 from rejeu.runs.folder import RunFolder, write_arrivals as write_order
 from rejeu.runs.values import quoted
@@ -33,6 +35,20 @@ from rejeu.runs.values import quoted
 VIDEO_EPISODES = 3
 VIDEO_STEPS = 600
 """Most steps of a video: a poor policy's episodes are long, and highway-env renders some 70 frames a second."""
+
+
+def installed_logs(arguments: Train) -> tuple[str, ...]:
+    """Returns the logs of ``--log``.
+
+    Raises:
+        ValueError: for an unknown one.
+        MissingExtra: if what they or ``--video-every`` need is not installed, before anything is trained.
+    """
+    logs = check_logs("--log", arguments.log)
+    require(logs)
+    if arguments.video_every is not None:
+        ffmpeg()
+    return logs
 
 
 class Limits(NamedTuple):

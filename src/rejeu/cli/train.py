@@ -20,14 +20,12 @@ from rejeu.cli import check, environment, seeds
 from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, echo, header
-from rejeu.cli.session import Limits, Session, make_evaluation_env
+from rejeu.cli.session import Limits, Session, installed_logs, make_evaluation_env
 from rejeu.envs.make import VectorEnv, WorkerOptions
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.interrupt import Interrupt
 from rejeu.io.records import shown
 from rejeu.presets import Preset
-from rejeu.reporting.logging import check_logs, require
-from rejeu.reporting.video_file import ffmpeg
 from rejeu.runs import config as runs
 from rejeu.runs.config import DecidedRun
 from rejeu.runs.folder import RunFolder, check_free, create, read_arrivals
@@ -79,20 +77,6 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
         has_video=not arguments.no_video,
         backend=describe_backend(env, made, preset),
     )
-
-
-def installed_logs(arguments: Train) -> tuple[str, ...]:
-    """Returns the logs of ``--log``.
-
-    Raises:
-        ValueError: for an unknown one.
-        MissingExtra: if what they or ``--video-every`` need is not installed, before anything is trained.
-    """
-    logs = check_logs("--log", arguments.log)
-    require(logs)
-    if arguments.video_every is not None:
-        ffmpeg()
-    return logs
 
 
 def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:
