@@ -26,7 +26,7 @@ def test_the_settings_of_rejeu_are_hyperparameters(name):
 
 def test_the_settings_of_rejax_have_groups():
     settings = device_peers.settings_of("ppo", "rejax")
-    assert settings["agent_kwargs"] == {"hidden_layer_sizes": [64, 64], "activation": "swish"}
+    assert settings["agent_kwargs"] == {"hidden_layer_sizes": [64, 64], "activation": "tanh"}
     assert settings["num_minibatches"] * settings_of_rejeu("ppo")["batch_size"] == 16 * settings["num_steps"]
 
 

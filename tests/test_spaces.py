@@ -224,6 +224,8 @@ def test_bounds_of_a_box_survive_exactly():
         {"Box": {"low": "x", "high": 1, "shape": [2], "dtype": "float32"}},
         {"Box": {"low": 0, "high": 1, "shape": [2], "dtype": "float32"}, "Discrete": {"n": 2, "start": 0}},
         {"Box": {"low": 0, "high": 1, "shape": [10**15], "dtype": "float32"}},
+        {"Tuple": [{"MultiBinary": {"shape": [2**19]}}] * 3},
+        {"MultiDiscrete": {"nvec": [2**62, 2**62], "start": [0, 0]}},
         {"Discrete": {"n": 0, "start": 0}},
         {"Discrete": {"n": 3}},
         {"Tuple": 3},

@@ -390,23 +390,26 @@ def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
 
     Args:
         description: JSON values.
-        largest: upper limit on the numbers and choices of each of its parts.
+        largest: upper limit on the numbers and choices of all its parts together.
 
     Raises:
         ValueError: if the description is not one that :func:`describe` writes, or is of a larger space.
     """
-    try:
+    left = largest
+
+    def build(description: Any) -> spaces.Space:
+        nonlocal left
         ((kind, body),) = description.items()
         if kind in ("Dict", "Tuple") and len(body) > MAX_LEAVES:
             raise ValueError(f"{len(body)} parts, expected {MAX_LEAVES} at most")
         if kind == "Dict":
-            return spaces.Dict({key: rebuild(part, largest) for key, part in body.items()})
+            return spaces.Dict({key: build(part) for key, part in body.items()})
         if kind == "Tuple":
-            return spaces.Tuple([rebuild(part, largest) for part in body])
+            return spaces.Tuple([build(part) for part in body])
         size = {"Discrete": "n", "MultiDiscrete": "nvec"}.get(kind)
-        numbers = int(np.sum(body[size])) if size else math.prod(body["shape"])
-        if numbers > largest:
-            raise ValueError(f"{numbers} numbers, expected {largest} at most")
+        left -= sum(np.ravel(body[size]).tolist()) if size else math.prod(body["shape"])
+        if left < 0:
+            raise ValueError(f"{largest - left} numbers, expected {largest} at most")
         if kind == "Box" and np.dtype(str(body["dtype"])).kind in "fiu":
             dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
             low, high = (np.broadcast_to(_bound(body[end], dtype), shape) for end in ("low", "high"))
@@ -418,6 +421,9 @@ def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
         if kind == "MultiBinary":
             return spaces.MultiBinary(body["shape"])
         raise ValueError(f"{str(kind)[:40]!r}")
+
+    try:
+        return build(description)
     except INVALID as error:
         raise ValueError(f"not the description of a space: {error}") from None
 

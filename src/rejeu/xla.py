@@ -38,8 +38,8 @@ SMALL = 2**19
 """Maximum number of input elements of such a call; one kernel runs in one thread."""
 
 SPLIT = 2**16
-"""Elements of a result from which on XLA splits an operation between threads. Inside of one kernel it cannot, and fails to
-compile a concatenation ("Invalid LLVM IR", jaxlib 0.10.2), unless the program is in the cache, whose keys have no threads."""
+"""Most elements of a result for which XLA does not split an operation between threads. Inside of one kernel it cannot, and
+fails to compile a concatenation ("Invalid LLVM IR", jaxlib 0.10.2); programs in the cache hide it."""
 
 _n_runs = 1
 """How many runs the function that is traced computes at once."""

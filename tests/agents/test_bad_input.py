@@ -71,7 +71,7 @@ MISTAKES = {
     "buffer larger than the memory": (
         sac(Counter(), buffer_size=10**12),
         MemoryError,
-        r"buffer_size=10000000000000 takes .* GiB .* are free; try buffer_size=\d+",
+        r"buffer_size=1000000000000 takes .* GiB .* are free; try buffer_size=\d+",
     ),
     "unknown environment": (
         sac("Pendulum-v9000x"),

@@ -37,7 +37,8 @@ from rejeu import supervised
 signal.signal(signal.SIGTERM, lambda *_: (print("stopping", flush=True), sys.exit(143)))
 with supervised.by_parent():
     print(repr(sys.stdin.read()), flush=True)
-    time.sleep(60)
+    for _ in range(600):  # Python handles a signal of another thread between two calls
+        time.sleep(0.1)
 """
 
 

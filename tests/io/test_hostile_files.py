@@ -210,6 +210,21 @@ def test_no_array_is_read_that_the_model_does_not_have(kind, loaders, tmp_path, 
     assert not names
 
 
+def test_a_hole_makes_no_room_for_a_space_or_a_network(tmp_path):
+    """A header may ask for as much as the file has bytes, and a hole has none."""
+    path = tmp_path / "sparse.safetensors"
+    large, many = hostile_files.LARGE_SPACES[0], 10**9
+    for change in (
+        lambda header, arrays: header.update(observation_space=large),
+        lambda header, arrays: header["config"].update(n_critics=many),
+    ):
+        one = next(hostile_files.sparse(hostile_files.changed(CONTENTS["agent"], change)))
+        path.write_bytes(one.content)
+        os.truncate(path, one.size)
+        with pytest.raises(CheckpointError, match=r"1000000000( numbers|, 4, 3\])"):
+            rejeu.load(path)
+
+
 @pytest.mark.parametrize("path", ["", ".", "..", "/", "a/..", Path()])
 def test_a_path_that_names_no_file_is_refused_on_one_line(path, tmp_path, monkeypatch):
     agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")

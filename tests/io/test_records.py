@@ -17,6 +17,7 @@ from rejeu.io.records import Count, EnvCount, Malformed, Seed, convert, parse_js
         ("[1e999]", "out of range"),
         ("9" * 5000, "out of range"),
         ("[" * 100_000, "nested too deeply"),
+        ("[" * 101 + "]" * 101, "nested too deeply"),
         ("[" * 100_000 + "]" * 100_000, "nested too deeply"),
         ("{", "not valid JSON"),
         (b"\xff", "not valid JSON"),

@@ -37,6 +37,7 @@ EARLIER = {
 
 RUNS = {
     "little": RunConfig(env="CartPole-v1"),
+    "negative": RunConfig(env="CartPole-v1", success_threshold=-1e-05),
     "much": RunConfig(
         env="my_env:Walk-v0",
         env_kwargs={"g": 9.8, "map.size": [1, 2]},

@@ -10,6 +10,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
@@ -138,10 +139,10 @@ def make_parser(command: str, kind: type, known: Iterable[Option], with_help: ob
 
 
 def normalized(word: str) -> str:
-    """Returns a word as ``argparse`` reads it: options by their present names, with dashes, and -1e3 as -1000.0.
+    """Returns a word as ``argparse`` reads it: options by their present names, with dashes, and numbers without exponents.
 
-    >>> [normalized(word) for word in ("--evaluate_every=5", "--film-every", "-1e3", "a_b")]
-    ['--evaluate-every=5', '--video-every', '-1000.0', 'a_b']
+    >>> [normalized(word) for word in ("--evaluate_every=5", "--film-every", "-1e3", "-1e-5", "a_b")]
+    ['--evaluate-every=5', '--video-every', '-1000.0', '-0.00001', 'a_b']
     """
     if word.startswith("--"):
         name, equals, text = word.partition("=")
@@ -149,7 +150,7 @@ def normalized(word: str) -> str:
         return OLDER.get(name, name) + equals + text
     if word.startswith("-"):
         with suppress(ValueError):
-            return f"{int(word)}" if word[1:].isdecimal() else f"{float(word)}"
+            return f"{int(word)}" if word[1:].isdecimal() else f"{Decimal(repr(float(word))):f}"
     return word
 
 

@@ -128,8 +128,10 @@ def again(jobs: Iterable[Job], typed: RunConfig) -> str:
 
     >>> again([Job(name="a", run=RunConfig(env="my_env.py", seed=0))], RunConfig(env="my_env.py"))
     ' --env my_env.py'
+    >>> again([Job(name="a", run=RunConfig(env="CartPole-v1", seed=0))], RunConfig(env="", imports=("a.py",)))
+    ' --import a.py'
     """
-    run = next((job.run for job in jobs if job.run.names_code), RunConfig(env=""))
+    run = next((job.run for job in jobs if job.run.names_code), RunConfig(env="plain"))
     return replace(run, imports=typed.imports).again()
 
 

@@ -104,8 +104,9 @@ class Contents:
 
     @property
     def room(self) -> int:
-        """Bytes of the file."""
-        return self.path.stat().st_size
+        """Bytes of the file; of a sparse file, without its holes."""
+        found = self.path.stat()
+        return min(found.st_size, 512 * getattr(found, "st_blocks", found.st_size))
 
     def read(self, prefix: str = "") -> dict[str, np.ndarray]:
         """Returns the arrays whose names begin with ``prefix``, by their full names.

@@ -19,6 +19,8 @@ Positive = Annotated[int, Meta(ge=1, le=2**62)]
 """An integer from 1."""
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 """The seed of a NumPy generator."""
+MAX_DEPTH = 100
+"""Upper limit on the levels of a JSON document; much deeper ones exceed Python's recursion limit where they are written."""
 MAX_ENVS = 4096
 """Upper limit on the environments that a file may ask for."""
 EnvCount = Annotated[int, Meta(ge=1, le=MAX_ENVS)]
@@ -47,7 +49,10 @@ def parse_json(text: str | bytes) -> Any:
     rejeu.io.records.Malformed: it is not valid JSON: JSON is malformed: invalid character (byte 6)
     """
     try:
-        return msgspec.json.decode(text)
+        value = msgspec.json.decode(text)
+        if is_deep(value, MAX_DEPTH):
+            raise RecursionError
+        return value
     except RecursionError:
         raise Malformed("it is nested too deeply") from None
     except ValueError as error:

@@ -135,8 +135,8 @@ class Run:
     def copy_replay(self) -> None:
         """Copies to ``buffer`` what a loop on the device has added to it there."""
         if self.fetch is not None:
-            fetch, self.fetch = self.fetch, None
-            fetch()
+            self.fetch()
+            self.fetch = None  # not before: a copy that was interrupted is made again
 
 
 def restart(run: Run) -> PyTree:

@@ -244,3 +244,8 @@ def step_and_reset(
     final = keep(obs)
     obs, reset_info = validation.reset_env(env)
     return encode(obs), reward, terminated, truncated, info, final, reset_info
+
+
+def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
+    """Calls a method, looked up through the wrappers, and returns its result."""
+    return env.get_wrapper_attr(name)(*arguments, **keywords)

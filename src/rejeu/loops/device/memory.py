@@ -62,10 +62,10 @@ def of_run(run: Run, learner: Learner, batch_size: int) -> int:
 def of_experience(buffer: Any) -> int:
     """Returns the bytes of a replay buffer or rollout buffer on the device."""
     if isinstance(buffer, RolloutBuffer):
-        return buffer.nbytes
+        return 2 * buffer.nbytes  # before a chunk and after it
     n = len(buffer.ring.kind)
     tables = 3 * 4 * n if buffer.ring.counters else 0  # instead of the counters: the tables of episodes
-    return buffer.ring.nbytes + tables + (0 if buffer.priorities is None else 4 * n)
+    return buffer.ring.nbytes + tables + (0 if buffer.priorities is None else 8 * n)  # and their copy before a chunk
 
 
 def unwritten(run: Run) -> int:

@@ -20,6 +20,7 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.envs.rendering import check_renders, rgb_frame
+from rejeu.envs.workers.process import call_method
 from rejeu.errors import MissingExtra
 from rejeu.reporting.formatting import counted
 
@@ -354,11 +355,6 @@ def unwrap_wrapper(env: gym.Env, wrapper_class: type[G]) -> G | None:
 def is_wrapped(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> bool:
     """Returns whether an environment is wrapped in that class."""
     return unwrap_wrapper(env, wrapper_class) is not None
-
-
-def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
-    """Calls a method, looked up through the wrappers, and returns its result."""
-    return env.get_wrapper_attr(name)(*arguments, **keywords)
 
 
 def tile_images(images: Sequence[np.ndarray]) -> np.ndarray:
