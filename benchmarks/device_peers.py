@@ -119,8 +119,8 @@ DIFFERENCES = {
     "all": [
         "Rejax treats time limits as terminations; rejeu and Stable-Baselines3 bootstrap from the true final observation.",
         "Rejax's evaluations, by default 200 episodes every 4,096 steps, are left out.",
-        "Every chunk of rejeu returns the episodes, the metrics and the new rows of the replay buffer to the host, and is "
-        "checked for NaN. Rejax returns the final state.",
+        "Every chunk of rejeu returns the episodes and the metrics to the host, and is checked for NaN. Rejax returns the "
+        "final state.",
     ],
     "ppo": [
         "Rejax takes the larger of two value losses where rejeu and Stable-Baselines3 clip the value.",
