@@ -5,11 +5,10 @@ Requires atheris, which is not a dependency of rejeu (Linux and macOS)::
     pip install atheris
     python trials/fuzz.py --seconds 300 --target all
 
-Each target runs in its own process. Its seeds are the recorded files of ``tests/golden``, or checkpoints of runs that
-it creates first (``run`` and ``rows``; see ``fuzz_runs.py``). Inputs are mutated as bytes, as JSON, as arrays and as
-tables. Most of the time checksums and lengths are corrected afterwards, so that the code behind these checks is
-reached. A finding is any exception other than ``CheckpointError``, any input that exceeds its time limit, and any file
-that loads but cannot be used. Findings are saved in ``trials/results/findings``, and counts in
+Each target runs in its own process. Its seeds are the recorded files of ``tests/golden``. Inputs are mutated as bytes, as
+JSON, as arrays and as tables. Most of the time checksums and lengths are corrected afterwards, so that the code behind
+these checks is reached. A finding is any exception other than ``CheckpointError``, any input that exceeds its time limit,
+and any file that loads but cannot be used. Findings are saved in ``trials/results/findings``, and counts in
 ``trials/results/fuzz.json``.
 """
 
@@ -17,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import random
@@ -35,7 +35,7 @@ from provenance import provenance
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 RESULTS = ROOT / "trials" / "results"
-SECONDS = {"agent": 20.0, "run": 20.0, "rows": 20.0}
+SECONDS = {"agent": 20.0}
 """Maximum processor time per input in seconds; two by default. Creating networks includes their compilation."""
 SEEDS = {
     "table": ("sac", "td3", "dqn", "ppo", "replay", "vec_normalize"),
@@ -43,13 +43,8 @@ SEEDS = {
     "agent": ("sac", "td3", "dqn", "ppo"),
     "replay": ("replay",),
     "vec_normalize": ("vec_normalize",),
-    "run": (),
-    "rows": (),
 }
-"""The targets and their seed files from ``tests/golden``. ``fuzz_runs.py`` creates the seeds of the last two."""
-AFRESH = {"run": 0.7, "rows": 0.7}
-"""Probability that a seed file is mutated instead of an input that increased coverage. Most such inputs are
-rejected, and so are their mutations. For these targets the code that runs after reading is equally important."""
+"""The targets and their seed files from ``tests/golden``."""
 VALUES: tuple[Any, ...] = (None, True, False, 0, -1, 1, 2, 3, 0.5, 1e-9, 1e300, -1e300, 2**31, 2**63, 2**127, 10**15)
 VALUES += ([], {}, [[]], [1], [0.0], [3, 3], {"float": "nan"}, {"float": "inf"}, {"tuple": []}, {"dict": {}})
 VALUES += ("", "a", "inf", "-inf", "auto", "normal", "linear", "relu", "simba", "gru", "os.system", "float64")
@@ -116,11 +111,7 @@ def fuzz(target: str, seconds: int) -> None:
         seeds.append(path.read_bytes())
         (corpus / f"{path.parent.name}-{path.stem}").write_bytes(seeds[-1])
     watched = Watched(target, folder)
-    for i, content in enumerate(watched.seeds):
-        seeds.append(content)
-        (corpus / f"{target}-{i}").write_bytes(content)
-    afresh = AFRESH.get(target, 0.0)
-    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size), afresh)  # fuzzing replaces Mutate
+    mutate = mutator(seeds, lambda data, size: atheris.Mutate(data, size))  # fuzzing replaces Mutate
     flags = [f"-max_total_time={seconds}", "-max_len=60000", "-rss_limit_mb=8000", "-timeout=3600", "-len_control=0"]
     flags.append(f"-artifact_prefix={folder}{os.sep}")
     atheris.Setup([sys.argv[0], str(corpus), *flags], watched, custom_mutator=mutate)
@@ -133,19 +124,10 @@ class Watched:
     def __init__(self, target: str, folder: Path) -> None:
         self.target, self.folder = target, folder
         self.path = folder / "input.safetensors"
-        self.seeds: list[bytes] = []
-        """Seeds of the target in addition to recorded files."""
-        self.read = READERS[target](self.path) if target in READERS else self.whole_runs()
+        self.read = READERS[target](self.path)
         self.counts = {"executions": 0, "refused": 0, "read": 0, "findings": 0}
         self.seen: set[str] = set()
         self.written = 0.0
-
-    def whole_runs(self) -> Callable[[], None]:
-        """Creates runs, and returns a function that resumes one of them with a file replaced by the input."""
-        import fuzz_runs
-
-        self.seeds, read = fuzz_runs.reader(self.target, self.folder)
-        return lambda: read(self.path)
 
     def __call__(self, data: bytes) -> None:
         """Reads one input."""
@@ -185,16 +167,12 @@ class Watched:
         (target / f"{name}.txt").write_text(what, encoding="utf-8", errors="replace")
 
 
-def mutator(
-    seeds: list[bytes], mutate: Callable[[bytes, int], bytes], afresh: float = 0.0
-) -> Callable[[bytes, int, int], bytes]:
-    """Returns a function that mutates an input or, with probability ``afresh``, one of the seeds."""
+def mutator(seeds: list[bytes], mutate: Callable[[bytes, int], bytes]) -> Callable[[bytes, int, int], bytes]:
+    """Returns a function that mutates an input, or one of the seeds where the input is no file."""
     from tests import hostile_files
 
     def mutated(data: bytes, max_size: int, seed: int) -> bytes:
         draw = random.Random(seed)
-        if draw.random() < afresh:
-            data = draw.choice(seeds)
         try:
             parts = hostile_files.take_apart(data)
         except Exception:
@@ -314,14 +292,19 @@ def header_reader(path: Path) -> Callable[[], None]:
 
 def agent_reader(path: Path) -> Callable[[], None]:
     """Returns a function that loads models. Models with equal configurations share compiled functions, to save time."""
-    import fuzz_runs
+    import jax
 
     import rejeu
+    from tests import sharing
 
-    fuzz_runs.share_compiled()
+    numbers = itertools.count(1)
 
     def read() -> None:
-        rejeu.load(path)
+        if next(numbers) % 200 == 0:
+            sharing.forget_learners()
+            jax.clear_caches()
+        with sharing.shared_learners():
+            rejeu.load(path)
 
     return read
 

@@ -2,18 +2,16 @@
 
 This is the larger version of ``tests/io/test_hostile_files.py``. It truncates every kind of file, in both schemas, at
 every
-byte and flips every bit. It also reads the corpus of ``tests/hostile_files.py``::
+byte and flips every bit. It also reads the corpus of ``tests/hostile_files.py``, and files in which a pickle that creates
+a file when it is loaded stands in the place of every string::
 
-    python trials/hostile.py --sb3-python path/to/python/with/stable-baselines3
+    python trials/hostile.py
 
-The last argument adds an attempt to execute code. One object of a Stable-Baselines3 model file is replaced by a pickle
-that creates an empty file when it is loaded. Stable-Baselines3 loads this file. The same bytes are inserted at every
-string of a rejeu file, which rejeu loads. Results are written to ``trials/results/hostile.json``.
+Results are written to ``trials/results/hostile.json``.
 """
 
 from __future__ import annotations
 
-import argparse
 import base64
 import collections
 import json
@@ -21,7 +19,6 @@ import os
 import pickle
 import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -53,10 +50,7 @@ SPECIAL = {
 
 def main() -> None:
     """Creates and reads the files, and writes the results."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--sb3-python", type=Path, help="Python of an environment that has stable-baselines3")
-    arguments = parser.parse_args()
-    result: dict[str, Any] = {**provenance({str(arguments.sb3_python): "PATH"})}
+    result: dict[str, Any] = {**provenance()}
     before = peak_memory()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "file.safetensors"
@@ -80,8 +74,6 @@ def main() -> None:
             print(kind, json.dumps(parts), flush=True)
         result["megabytes that reading all of them took"] = round((peak_memory() - before) / 2**20)
         result["code in a rejeu file"] = code_in_ours(Path(folder))
-        if arguments.sb3_python is not None:
-            result["code in a Stable-Baselines3 file"] = code_in_theirs(arguments.sb3_python, Path(folder))
     write(ROOT / "trials" / "results" / "hostile.json", result)
     print(json.dumps({key: value for key, value in result.items() if key.startswith(("code", "mega"))}, indent=1))
 
@@ -227,39 +219,6 @@ def texts(tree: Any) -> list[tuple[Any, Any]]:
     """Returns the paths of all values of a header."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     return [place for key, value in items for place in [(tree, key), *texts(value)]]
-
-
-THEIRS = """
-import io, json, sys, zipfile
-import stable_baselines3
-from stable_baselines3 import SAC
-
-source, target, payload = sys.argv[1:]
-SAC("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[4]), buffer_size=10).save(source)
-with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
-    for item in old.namelist():
-        content = old.read(item)
-        if item == "data":
-            data = json.loads(content)
-            data["lr_schedule"][":serialized:"] = payload
-            content = json.dumps(data).encode()
-        new.writestr(item, content)
-try:
-    SAC.load(target)
-    print("loaded", stable_baselines3.__version__)
-except Exception as error:
-    print(type(error).__name__, stable_baselines3.__version__)
-"""
-
-
-def code_in_theirs(python: Path, folder: Path) -> dict[str, Any]:
-    """Loads a Stable-Baselines3 model in which one object is a pickle that executes code; returns the outcome."""
-    marker = folder / "theirs-was-run"
-    payload = base64.b64encode(pickle.dumps(Payload(marker))).decode()
-    command = [str(python), "-c", THEIRS, str(folder / "good.zip"), str(folder / "evil.zip"), payload]
-    result = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": ""})
-    outcome, version = result.stdout.split()[-2:]
-    return {"version": version, "outcome": outcome, "ran the code": marker.exists()}
 
 
 if __name__ == "__main__":

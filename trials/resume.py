@@ -1,28 +1,26 @@
 """Interrupts and resumes runs of every algorithm and environment, and compares them with uninterrupted runs.
 
-    python trials/resume.py --sb3-python PATH
+    python trials/resume.py
 
 Each case has three runs: one without interruption, one that a callback stops at a random step with a checkpoint, and
 one that resumes from the checkpoint. Parameters, replay buffer or rollout, episodes, counters and rows of statistics
 must be equal, bit for bit, if the state of the environment can be saved. Otherwise weights and buffer must equal those
-at the interruption. With ``--sb3-python`` (an interpreter with Stable-Baselines3 2.9.2), the same is done with
-Stable-Baselines3: model and replay buffer are saved and loaded, and training continues with new episodes.
+at the interruption.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import copy
 import json
 import random
-import shlex
-import subprocess
+import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from provenance import provenance, write
 
@@ -97,31 +95,14 @@ def vector(env_id: str, n_envs: int, backend: str) -> Any:
     return rejeu.make_vector(env_id, n_envs, backend, seed=3)
 
 
-@contextlib.contextmanager
-def compiled_once() -> Iterator[None]:
-    """Context in which equal agents share compiled functions (they have no state), to save compilation time."""
-    from unittest import mock
-
-    import rejeu
-    from rejeu.loops.learner import Learner
-
-    made: list[Any] = []
-
-    def make(*arguments: Any) -> Any:
-        made.extend([] if made else [Learner(*arguments)])
-        return copy.copy(made[0])
-
-    with mock.patch.object(rejeu.agents.base, "Learner", make):
-        yield
-
-
 def try_case(algorithm: str, env_id: str, n_envs: int, backend: str, cut: int) -> dict[str, Any]:
     import rejeu
     from rejeu.callbacks import Checkpoint
+    from tests.sharing import shared_learners
 
     made = make(algorithm, env_id, n_envs, backend)
     whole_rows, first, second = Rows(), Rows(), Rows()
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), compiled_once():
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), shared_learners():
         warnings.simplefilter("ignore", UserWarning)
         stop = lambda agent, turn: turn.step < cut  # noqa: E731
         broken = made().learn(STEPS, [stop, Checkpoint(folder, every=300)], log_interval=1, sinks=[first])
@@ -153,63 +134,11 @@ def cases() -> list[tuple[str, str, int, str]]:
     return found + [(algorithm, env_id, 1, backend) for env_id, (algorithm, backend) in NOT_CARRIED.items()]
 
 
-def sb3(seed: int) -> None:
-    """Prints the difference of parameters between interrupted and uninterrupted runs of Stable-Baselines3."""
-    import numpy as np
-    import stable_baselines3
-
-    results = []
-    for algorithm, env_id in (
-        ("SAC", "Pendulum-v1"),
-        ("TD3", "Pendulum-v1"),
-        ("DQN", "CartPole-v1"),
-        ("PPO", "CartPole-v1"),
-    ):
-        cut = random.Random(seed).randrange(STEPS // 4, 3 * STEPS // 4)
-        kind = getattr(stable_baselines3, algorithm)
-        settings = {"n_steps": 64} if algorithm == "PPO" else OFF_POLICY
-        make = lambda kind=kind, env_id=env_id, settings=settings: kind(  # noqa: E731
-            "MlpPolicy", env_id, seed=5, **settings, policy_kwargs={"net_arch": [32, 32]}
-        )
-        if algorithm == "PPO":
-            cut -= cut % 64  # it can only stop between rollouts
-        whole = make().learn(STEPS)
-        again_whole = make().learn(STEPS)
-        with tempfile.TemporaryDirectory() as folder:
-            first = make().learn(cut)
-            first.save(f"{folder}/model")
-            model = kind.load(f"{folder}/model", env=first.get_env())
-            if algorithm != "PPO":
-                first.save_replay_buffer(f"{folder}/replay")
-                model.load_replay_buffer(f"{folder}/replay")
-            model.learn(STEPS - cut, reset_num_timesteps=False)
-
-        def apart(one: Any, two: Any) -> float:
-            pairs = zip(one.policy.state_dict().values(), two.policy.state_dict().values(), strict=True)
-            return max(float(np.abs(np.asarray(a) - np.asarray(b)).max()) for a, b in pairs)
-
-        results.append(
-            {
-                "algorithm": algorithm,
-                "env": env_id,
-                "cut": cut,
-                "difference_of_two_unbroken_runs": apart(whole, again_whole),
-                "difference_of_the_resumed_run": apart(whole, model),
-            }
-        )
-    print(json.dumps(results))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sb3-python")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", help="algorithms to try, instead of all")
-    parser.add_argument("--sb3", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.sb3:
-        sb3(arguments.seed)
-        return
     rng = random.Random(arguments.seed)
     results = []
     for case in cases():
@@ -218,15 +147,7 @@ def main() -> None:
             continue
         results.append(try_case(*case, cut))
         print(json.dumps(results[-1]), flush=True)
-    content: dict[str, Any] = {**provenance({str(arguments.sb3_python): "PATH"}), "steps": STEPS, "cases": results}
-    if arguments.sb3_python:
-        done = subprocess.run(
-            [arguments.sb3_python, __file__, "--sb3", "--seed", str(arguments.seed)],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        if done.returncode:
-            raise SystemExit(f"{shlex.join(done.args)} failed:\n{done.stderr[-2000:]}")
-        content["stable_baselines3"] = json.loads(done.stdout.strip().splitlines()[-1])
+    content: dict[str, Any] = {**provenance(), "steps": STEPS, "cases": results}
     write(RESULT, content, rows="cases")
     print(
         f"{sum(r.get('equal_at_the_end', r['equal_at_the_break']) for r in results)} of {len(results)} are as they must be"

@@ -1,11 +1,14 @@
-"""Measures steps per second of the environments in JAX, next to Gymnasium's and EnvPool's, with random actions.
+"""Measures steps per second of the environments with random actions, resets included.
 
-    python benchmarks/functional.py [--rounds 5]
+    python benchmarks/environments.py functional --rounds 5
+    python benchmarks/environments.py backends --rounds 7
 
-``program`` is a loop compiled as one program, with random actions and resets in it, as in training on the device; its
-compilation is reported apart. ``vector`` is the same environments behind ``rejeu.make_vector``, one call for each step. The
-result is the median of the rounds, in which all are measured in turn. It is written to
-``benchmarks/results/functional.json``.
+``functional`` compares the environments in JAX with Gymnasium's and EnvPool's. There ``program`` is a loop compiled as one
+program, with random actions and resets in it, as in training on the device; its compilation is reported apart. ``vector``
+is the same environments behind ``rejeu.make_vector``, one call for each step. ``backends`` compares the backends for the
+environments with presets and for LunarLander; worker processes only where a step takes a millisecond or more in this
+process. The results are medians of the rounds, in which all are measured in turn. They are written to
+``benchmarks/results/functional.json`` or ``backends.json``.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -32,8 +36,8 @@ from rejeu.runs.config import versions
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import machine, provenance, write
 
-RESULT = Path(__file__).parent / "results" / "functional.json"
-CASES = {
+RESULTS = Path(__file__).parent / "results"
+PEERS = {
     "jax/CartPole-v1": "CartPole-v1",
     "jax/Pendulum-v1": "Pendulum-v1",
     "jax/Acrobot-v1": "Acrobot-v1",
@@ -44,6 +48,19 @@ CASES = {
 NUMBERS = (1, 64, 2048)
 MOST_GYMNASIUM = 64
 """Largest number of environments that are stepped one after the other in this process, or made by EnvPool."""
+BACKENDS = {
+    "CartPole-v1": (1, 4, 16),
+    "Pendulum-v1": (1, 4, 16),
+    "MountainCar-v0": (1, 16),
+    "LunarLander-v3": (1, 16),
+    "LunarLanderContinuous-v3": (1, 16),
+    "FetchReach-v4": (1, 4),
+    "parking-v0": (1, 16),
+    "rejeu/Ball-v0": (8,),
+}
+"""Environments whose backends are measured, and their numbers."""
+SLOW_STEP = 1e-3
+"""Minimum duration of a step in this process, in seconds, for worker processes to be measured."""
 ROUND_SECONDS = 0.3
 """Duration of one measurement, in seconds."""
 N_TURNS = {1: 5_000, 64: 1_000, 2048: 50}
@@ -99,10 +116,16 @@ def rate_of_vector(env_id: str, n: int, backend: str) -> float:
         return n_steps * n / (time.perf_counter() - began)
 
 
-def measure(env_id: str, peer: str, n: int, rounds: int) -> dict[str, Any]:
-    """Returns the medians of the rounds, and the time of compilation in seconds."""
-    env = make(env_id)
-    compiled, state, seconds = program(env, n)
+def medians(contenders: dict[str, Callable[[], float]], rounds: int) -> dict[str, int]:
+    """Returns the median rate of each contender; in each round all are measured in turn."""
+    found = [{name: rate() for name, rate in contenders.items()} for _ in range(rounds)]
+    return {name: round(median(one[name] for one in found)) for name in contenders}
+
+
+def functional(env_id: str, n: int, rounds: int) -> dict[str, Any]:
+    """Returns the rates of an environment in JAX and of its peer, and the time of compilation in seconds."""
+    peer = PEERS[env_id]
+    compiled, state, seconds = program(make(env_id), n)
     contenders = {
         "program": lambda: rate_of_program(compiled, state, n),
         "vector": lambda: rate_of_vector(env_id, n, "jax"),
@@ -111,24 +134,34 @@ def measure(env_id: str, peer: str, n: int, rounds: int) -> dict[str, Any]:
         contenders["gymnasium"] = lambda: rate_of_vector(peer, n, "gymnasium")
     if n <= MOST_GYMNASIUM and envpool_knows(peer):
         contenders["envpool"] = lambda: rate_of_vector(peer, n, "envpool")
-    found = [{name: rate() for name, rate in contenders.items()} for _ in range(rounds)]
-    rates = {name: round(median(one[name] for one in found)) for name in contenders}
-    return {"env": env_id, "n_envs": n, "compile_seconds": round(seconds, 2), "steps_per_second": rates}
+    return {"compile_seconds": round(seconds, 2), "steps_per_second": medians(contenders, rounds)}
+
+
+def backends(env_id: str, n: int, rounds: int) -> dict[str, Any]:
+    """Returns the rates of the backends that an environment has."""
+    names = ("envpool", "gymnasium") if envpool_knows(env_id) else ("gymnasium",)
+    rates = medians({name: partial(rate_of_vector, env_id, n, name) for name in names}, rounds)
+    if n > 1 and rates["gymnasium"] * SLOW_STEP < 1.0:
+        rates |= medians({"gymnasium-async": partial(rate_of_vector, env_id, n, "gymnasium-async")}, rounds)
+    return {"steps_per_second": rates}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=["functional", "backends"])
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", nargs="*", default=[*CASES])
-    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--only", nargs="*", help="environments to measure, instead of all")
+    parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    rows = []
-    for env_id in given.only:
-        for n in NUMBERS:
-            rows.append(measure(env_id, CASES[env_id], n, given.rounds))
+    cases = dict.fromkeys(PEERS, NUMBERS) if given.what == "functional" else BACKENDS
+    measure, rows = {"functional": functional, "backends": backends}[given.what], []
+    for env_id in given.only or cases:
+        for n in cases[env_id]:
+            rows.append({"env": env_id, "n_envs": n, **measure(env_id, n, given.rounds)})
             print(rows[-1], flush=True)
     here = {**machine(), "device": jax.devices()[0].device_kind}
-    write(given.out, {**provenance(), "machine": here, "versions": versions(), "results": rows})
+    out = given.out or RESULTS / f"{given.what}.json"
+    write(out, {**provenance(), "machine": here, "versions": versions(), "results": rows})
 
 
 if __name__ == "__main__":
