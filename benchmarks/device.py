@@ -6,7 +6,7 @@ Every measurement is a process of its own, so that compilation and the memory of
 are those of whole chunks or turns in the time ``--seconds`` after the program is compiled and the replay buffer is used;
 the time before is reported as ``compile_seconds`` (tracing and compiling) and ``startup_seconds``. Peers are measured in the
 same run, in turn with the device. The results are written to ``benchmarks/results/device.json`` with the command, commit and
-device, and printed as tables. JAX chooses the device; ``JAX_PLATFORMS=cpu`` forces a CPU.
+device. JAX chooses the device; ``JAX_PLATFORMS=cpu`` forces a CPU.
 """
 
 from __future__ import annotations
@@ -153,24 +153,6 @@ def plan(cases: list[str], seeds: list[int], envs: list[int]) -> list[tuple[str,
     return found
 
 
-def table(results: list[dict[str, Any]]) -> str:
-    """Returns the medians as a table in Markdown."""
-    lines = [
-        "| case | loop | envs | seeds | steps/s | to the host's loop | compiling, s |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for one in results:
-        same = [r for r in results if r["case"] == one["case"] and r["n_seeds"] == 1 and "error" not in r]
-        base = next((r for r in same if r["kind"] == "host"), None)
-        if "error" in one:
-            cells = ["-", "-", one["error"][:60]]
-        else:
-            ratio = "-" if base is None else f"{one['steps_per_second'] / base['steps_per_second']:.2f}"
-            cells = [f"{one['steps_per_second']:,.0f}", ratio, f"{one['compile_seconds']:.1f}"]
-        lines.append(f"| {one['case']} | {one['kind']} | {one['n_envs']} | {one['n_seeds']} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def combined(rounds: list[dict[str, Any]]) -> dict[str, Any]:
     """Returns the medians of measurements of the same kind."""
     good = [one for one in rounds if "error" not in one]
@@ -209,7 +191,6 @@ def main() -> None:
         "results": results,
     }
     write(arguments.out, content)
-    print(table(results))
 
 
 if __name__ == "__main__":

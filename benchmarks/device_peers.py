@@ -5,7 +5,7 @@
 
 PPO and DQN are trained on CartPole-v1 and SAC on Pendulum-v1, with Rejax's default settings of DQN and SAC, and rollouts of
 8 and 16 environments and 128 steps, four epochs and four minibatches for PPO.
-``SETTINGS`` has each setting under its name in each library, and ``DIFFERENCES`` what
+``SETTINGS`` has each setting under its name in each library; ``measurements.md`` says what
 remains different. rejeu and Rejax train in environments in JAX, Stable-Baselines3 in Gymnasium's.
 
 Every measurement is a process of its own, and the libraries take turns. Steps per second are those after compilation, with a
@@ -115,29 +115,6 @@ SETTINGS: dict[str, tuple[Names, ...]] = {
     ),
 }
 """The settings of the cases by name. Networks of actor and critic are separate everywhere."""
-DIFFERENCES = {
-    "all": [
-        "Rejax treats time limits as terminations; rejeu and Stable-Baselines3 bootstrap from the true final observation.",
-        "Rejax's evaluations, by default 200 episodes every 4,096 steps, are left out.",
-        "Every chunk of rejeu returns the episodes and the metrics to the host, and is checked for NaN. Rejax returns the "
-        "final state.",
-    ],
-    "ppo": [
-        "Rejax takes the larger of two value losses where rejeu and Stable-Baselines3 clip the value.",
-        "Rejax limits each element of a gradient where rejeu and Stable-Baselines3 limit its norm.",
-        "rejeu computes log-probabilities and values at the end of the rollout, and those of all true successors.",
-    ],
-    "ppo8": ["See ppo."],
-    "dqn": [
-        "Stable-Baselines3 has no double Q-learning, which is one network pass less, and the Huber loss.",
-        "rejeu's squared loss is twice Rejax's.",
-    ],
-    "sac": [
-        "Until learning starts, rejeu and Stable-Baselines3 take random actions, Rejax those of its policy. It is not timed.",
-        "Rejax updates the actor before the critics.",
-    ],
-}
-"""What the libraries do differently with these settings."""
 
 
 class Case(NamedTuple):
@@ -316,21 +293,6 @@ def summary(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Returns the summary as a table in Markdown."""
-    lines = ["| case | library | steps/s | least to most | rejeu to this | compiling, s |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        ratio = f"{row['rejeu_to_this']:.2f}" if "rejeu_to_this" in row else ""
-        cells = [
-            row["case"],
-            " ".join(filter(None, (row["library"], row["threads"]))),
-            f"{row['steps_per_second']:,.0f}",
-        ]
-        cells += [f"{row['least']:,.0f} to {row['most']:,.0f}", ratio, f"{row['compile_seconds']:.1f}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     """Measures, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -357,12 +319,11 @@ def main() -> None:
         "versions": {one["library"]: one["versions"] for one in found if "versions" in one},
         "seconds": arguments.seconds,
         "settings": {name: [[*row] for row in SETTINGS[name]] for name in arguments.cases},
-        "differences": DIFFERENCES,
         "results": rows,
         "measurements": [{key: value for key, value in one.items() if key != "versions"} for one in found],
     }
     write(arguments.out, content)
-    print(table(rows))
+    print(json.dumps(rows, indent=1))
 
 
 if __name__ == "__main__":

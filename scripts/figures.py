@@ -164,10 +164,10 @@ def hyperparameters(algorithm: str) -> str:
 
 
 def shared_hyperparameters(kind: str) -> str:
-    """The hyperparameters that all off-policy or all on-policy algorithms have."""
-    config = {"off-policy": OffPolicyConfig, "on-policy": OnPolicyConfig}[kind]
-    docs = validation.field_docs(config)
-    return meanings(list(docs), docs, None)
+    """The hyperparameters that all off-policy or all on-policy algorithms have; the latter without those of both kinds."""
+    docs, others = (validation.field_docs(config) for config in (OnPolicyConfig, OffPolicyConfig))
+    own = {name: text for name, text in docs.items() if others.get(name) != text}
+    return meanings(list(others), others, None) if kind == "off-policy" else meanings(list(own), own, None)
 
 
 def meanings(names: list[str], docs: dict[str, str], defaults: dict[str, Any] | None) -> str:
@@ -252,18 +252,6 @@ def training_times() -> str:
     return table(("environment", "algorithm", "steps of the preset", "result", "time for each seed"), rows)
 
 
-def bit_flipping() -> str:
-    """Success rates of DQN with and without HER, by the number of bits."""
-    data = load("bit_flipping.json")
-    rates = data["success_rate"]
-    rows = [
-        (name, *(f"{100 * sum(values) / len(values):.0f} %" for values in by_bits.values()))
-        for name, by_bits in rates.items()
-    ]
-    header = f"success rate, mean of {len(data['seeds'])} seeds"
-    return table((header, *(f"{n} bits" for n in next(iter(rates.values())))), rows)
-
-
 def time_of(result: Result) -> str:
     """Returns the range of the training times over the seeds of a result."""
     low, high = (round(seconds) for seconds in result.seconds)
@@ -319,48 +307,6 @@ def speed() -> str:
         parking_row("SAC with HER, parking-v0; rejeu on EnvPool, 8 environments", "EnvPool, 8 environments"),
     ]
     return table(("training steps per second", "vs. Stable-Baselines3", "vs. SBX"), rows)
-
-
-def mountain_car() -> str:
-    """The exercise on MountainCar, one row for each seed."""
-    rows = [
-        (
-            str(run["seed"]),
-            f"{run['seconds']:.1f}",
-            f"{100 * run['reached']:.1f} %",
-            f"{100 * run['reached_in_last_100']:.0f} %",
-            f"{run['greedy_return']:.1f}",
-        )
-        for run in load("mountain_car_document.json")["runs"]
-    ]
-    header = (
-        "seed",
-        "seconds",
-        "training episodes that reach the flag",
-        "of the last 100",
-        "greedy return, 50 episodes",
-    )
-    return table(header, rows)
-
-
-def lunar_lander() -> str:
-    """Ten iterations on LunarLander, one row for each set of hyperparameters, means over the seeds."""
-    rows = []
-    for name, runs in load("lunar_lander_document.json")["runs"].items():
-        keys = ("steps", "seconds", "last_training_return", "mean_return", "success_rate")
-        steps, seconds, training, deterministic, success = (sum(run[key] for run in runs) / len(runs) for key in keys)
-        cells = (f"{steps:,.0f}", f"{seconds:.1f}", f"{training:.0f}", f"{deterministic:.0f}", f"{100 * success:.0f} %")
-        rows.append((name, str(len(runs)), *cells))
-    header = (
-        "hyperparameters",
-        "seeds",
-        "steps",
-        "seconds",
-        "last training return",
-        "deterministic return",
-        "success rate",
-    )
-    return table(header, rows)
 
 
 def data(path: str, key: str, *columns: str) -> str:
@@ -431,12 +377,9 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "shared-hyperparameters": shared_hyperparameters,
     "supported": supported,
     "presets": training_times,
-    "bit-flipping": bit_flipping,
     "ball": ball,
     "parking": parking,
     "speed": speed,
-    "mountain-car": mountain_car,
-    "lunar-lander": lunar_lander,
 }
 
 

@@ -131,14 +131,6 @@ def test_the_page_has_medians_spreads_ratios_of_rounds_and_limits(results, tmp_p
     assert "nan" not in text
 
 
-def test_the_page_of_some_cases_alone_leaves_the_others_out(results, tmp_path):
-    results["samples"] = [s for s in results["samples"] if s["case"] == "steps" and s["library"] == "rejeu"]
-    report.write(results, tmp_path / "page.md")
-    text = (tmp_path / "page.md").read_text(encoding="utf-8")
-    assert row_of(text, "SAC")[1:4] == ["0.15 (0.1 to 0.2)", "", ""]
-    assert "## Parking" not in text
-
-
 @exhaustive
 def test_the_page_names_what_failed_and_what_was_disturbed(results, tmp_path):
     results["samples"][0]["others_busy"] = 1.5
@@ -151,31 +143,10 @@ def test_the_page_names_what_failed_and_what_was_disturbed(results, tmp_path):
     assert "cores before 1 of the measurements" in text
 
 
-@exhaustive
-def test_a_smoke_run_says_on_its_page_that_it_means_nothing(results, tmp_path):
-    results["settings"]["quick"] = True
-    report.write(results, tmp_path / "page.md")
-    assert "its figures have no meaning" in (tmp_path / "page.md").read_text(encoding="utf-8")
-
-
 def test_later_rounds_measure_the_variant_that_was_the_fastest_in_the_first(results):
     of = {(s["round"], s["variant"]) for s in results["samples"] if s["key"] == "steps/TD3/sb3"}
     assert of == {(0, plan.ONE), (0, plan.ALL), (1, plan.ONE), (2, plan.ONE)}
     assert [s["variant"] for s in summary.best(results["samples"], "steps", "TD3", "sb3")] == [plan.ONE] * 3
-
-
-def test_no_library_compiles_its_sources_anew_in_each_process(monkeypatch, tmp_path):
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
-    for measurement in plan.everything():
-        environment = runner.child_environment(measurement, measurement.variants[0], tmp_path)
-        assert "PYTHONDONTWRITEBYTECODE" not in environment
-        assert environment["JAX_PLATFORMS"] == "cpu"
-
-
-def test_every_measurement_has_a_name_of_its_own():
-    keys = [measurement.key for measurement in plan.everything()]
-    assert len(keys) == len(set(keys))
-    assert {measurement.key for measurement in plan.everything(quick=True)} < set(keys)
 
 
 @exhaustive
@@ -195,29 +166,10 @@ def test_samples_are_kept_at_once_and_resumed_and_errors_tried_again(tmp_path):
     assert not again.has(bad.key, "", 0)
 
 
-def test_a_run_with_other_settings_is_not_resumed(tmp_path):
-    path = tmp_path / "samples.jsonl"
-    runner.Samples(path, {"settings": {"rounds": 1}, "versions": {}}, resume=False)
-    with pytest.raises(SystemExit, match="other settings"):
-        runner.Samples(path, {"settings": {"rounds": 3}, "versions": {}}, resume=True)
-
-
 def test_a_busy_machine_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(machine, "others_busy", lambda seconds: 1.7)
     assert command.main(["--cases", "memory", "--libraries", "rejeu"]) == 2
     assert "other programs use 1.70" in capsys.readouterr().err
-
-
-def test_a_quiet_machine_is_not_called_busy(monkeypatch):
-    monkeypatch.setattr(machine, "others_busy", lambda seconds: 0.02)
-    monkeypatch.setattr(machine, "load", lambda: 1.5)  # of what ended just now
-    assert machine.why_busy() is None
-
-
-def test_the_load_average_counts_where_nothing_better_is_known(monkeypatch):
-    monkeypatch.setattr(machine, "others_busy", lambda seconds: None)
-    monkeypatch.setattr(machine, "load", lambda: 1.5)
-    assert "load average of the last minute is 1.50" in machine.why_busy()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, special, stats
+from scipy import special, stats
 
 from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, log_tanh_slope
 
@@ -35,29 +35,6 @@ def test_normal_entropy_equals_scipy():
     np.testing.assert_allclose(Normal(jnp.zeros((1, 3)), jnp.float32(log_std)).entropy(), expected, rtol=1e-6)
 
 
-def test_normal_entropy_counts_every_dimension_of_a_shared_log_std():
-    shared = Normal(jnp.zeros((5, 3)), jnp.full((1, 1), 0.7, jnp.float32)).entropy()
-    np.testing.assert_allclose(shared, np.full(5, 3 * stats.norm.entropy(0.0, np.exp(0.7))), rtol=1e-6)
-
-
-def test_normal_samples_have_the_mean_and_deviation():
-    n = 20_000
-    normal = Normal(jnp.broadcast_to(jnp.array([1.0, -2.0]), (n, 2)), jnp.log(jnp.array([[0.5, 3.0]])))
-    sample = np.asarray(normal.sample(jax.random.PRNGKey(0)))
-    # Standard errors are sigma / sqrt(n) and about sigma / sqrt(2 n); five of them are allowed.
-    sigma = np.array([0.5, 3.0])
-    assert (np.abs(sample.mean(axis=0) - [1.0, -2.0]) < 5 * sigma / np.sqrt(n)).all()
-    assert (np.abs(sample.std(axis=0) - sigma) < 5 * sigma / np.sqrt(2 * n)).all()
-
-
-def test_mode_maximises_the_density():
-    mean, log_std = jnp.array([[0.3, -1.2]]), jnp.array([[-0.5, 0.2]])
-    normal = Normal(mean, log_std)
-    at_mode = float(normal.log_prob(normal.mode())[0])
-    for shift in ([0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]):
-        assert float(normal.log_prob(normal.mode() + jnp.array([shift]))[0]) < at_mode
-
-
 def test_tanh_mode_is_the_squashed_mean():
     mean = np.array([[0.3, -4.0]])
     np.testing.assert_allclose(TanhNormal(jnp.float32(mean), jnp.zeros((1, 2))).mode(), np.tanh(mean), rtol=1e-6)
@@ -81,19 +58,6 @@ def test_tanh_normal_log_prob_equals_float64(mean):
     expected = (stats.norm.logpdf(noise) - log_std - logistic_form(u)).sum(axis=1)
     np.testing.assert_allclose(log_prob, expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(action, np.tanh(u), rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (1.0, -0.5), (-2.0, 0.3)])
-def test_tanh_normal_density_integrates_to_one(mean, log_std):
-    """The density of a = tanh(u) is N(u) / (1 - a^2); it is integrated over a, as a density of actions must be."""
-
-    u = np.linspace(-12.0, 12.0, 4001)
-    action = np.tanh(u)
-    normal = Normal(jnp.full((len(u), 1), mean, jnp.float32), jnp.full((1, 1), log_std, jnp.float32))
-    value = jnp.array(u[:, None], jnp.float32)
-    density = np.exp(np.asarray(normal.log_prob(value) - jnp.sum(log_tanh_slope(value), axis=-1), np.float64))
-    total = integrate.trapezoid(density, action)
-    assert total == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("u", [20.0, -20.0, 0.0])
@@ -144,16 +108,6 @@ def test_the_log_prob_of_a_squashed_action_equals_float64(mean, log_std):
     given = TanhNormal(jnp.full((13, 2), mean), jnp.array([[log_std, 0.3]])).log_prob(jnp.array(action))
     expected = tanh_log_density(action, mean, np.exp([log_std, 0.3])).sum(axis=1)
     np.testing.assert_allclose(given, expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (1.0, -0.5), (-1.5, 0.4)])
-def test_the_density_of_squashed_actions_integrates_to_the_normals_distribution_function(mean, log_std):
-    """P(a < tanh(c)) = P(u < c): the density is integrated over actions, from one edge to every point."""
-    action = np.tanh(np.linspace(-7.0, 7.0, 4001)).astype(np.float32)
-    log_prob = TanhNormal(jnp.full((4001, 1), mean), jnp.full((1, 1), log_std)).log_prob(jnp.array(action)[:, None])
-    mass = integrate.cumulative_trapezoid(np.exp(np.float64(log_prob)), np.float64(action), initial=0.0)
-    expected = stats.norm.cdf(np.arctanh(np.float64(action)), mean, np.exp(log_std))
-    np.testing.assert_allclose(mass, expected, atol=1e-3)
 
 
 def test_squashed_samples_follow_their_density():

@@ -194,16 +194,6 @@ def test_stored_transitions_are_consecutive_moments_of_one_episode(n_envs):
     np.testing.assert_array_equal(batch.reward, 100 * batch.obs[:, 0] + batch.obs[:, 1])
 
 
-def test_transitions_stay_consecutive_over_calls_of_learn_that_do_not_divide():
-    agent = small_sac(counters(3, (4,)), learning_starts=NEVER)
-    for total in (1, 2, 5, 7, 3):
-        agent.learn(total)
-    assert agent.replay_buffer.size() == 18
-    batch = agent.replay_buffer.sample(np.random.default_rng(0), (500,))
-    np.testing.assert_array_equal(batch.next_obs[:, 1], batch.obs[:, 1] + 1)
-    np.testing.assert_array_equal(batch.next_obs[:, 2], batch.obs[:, 2])
-
-
 # Episodes.
 
 

@@ -180,20 +180,6 @@ def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
         assert names[optimizer] == moments | {"count"}
 
 
-@pytest.mark.parametrize("name", ["SAC", "TQC", "DQN", "QRDQN"])
-def test_settings_are_the_same_after_any_number_of_savings(name, tmp_path):
-    kind = KINDS[name]
-    make = lambda n: InProcess([env_of(kind) for _ in range(n)])  # noqa: E731
-    agent = small(kind, make(3), target_update_interval=12, train_freq=6)
-    path, config = agent.save(tmp_path / "model"), agent.config
-    for n_envs in (3, 1, 8):
-        with shared_learners():
-            loaded = rejeu.load(path, env=make(n_envs))
-        assert loaded.config == config
-        assert loaded.config.target_update_interval == 12
-        path = loaded.save(tmp_path / f"model {n_envs}")
-
-
 # Numbers of environments.
 
 
@@ -382,17 +368,6 @@ def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
     agent.learn(12)
     assert agent.num_timesteps == 12
     assert len(agent.history) == 2
-
-
-def test_updates_are_counted_where_a_callback_stops():
-    """After 8 steps without updates there is one a step, until the 13th says that it is enough."""
-    agent = small_sac(Counter((5,)))
-    calls = count_updates(agent)
-    agent.learn(40, callback=lambda agent, progress: progress.step < 13)
-    assert agent.n_updates == sum(calls) == 5
-    assert agent.statistics()["train/n_updates"] == 5
-    agent.learn(4, reset_num_timesteps=False)
-    assert agent.n_updates == sum(calls) == 9
 
 
 # Exploration.

@@ -71,14 +71,3 @@ def test_three_updates_equal_numpy(name):
         kept = by_hand.Network(state.optimizer.nu)
         expected = kept.pi + kept.log_std + kept.vf if "two" in name else kept.everything
         assert_equal_layers(expected, seconds, "means of squares", atol=1e-5)
-
-
-def test_padding_leaks_into_no_update():
-    _, algorithm = make("box", normalize_advantage=True)
-    state, update = begin(algorithm), jax.jit(algorithm.update)
-    rollout = random_rollout(ACTIONS["box"][0], valid=LAST_STEP_MISSING)
-    spoil = lambda a: np.where(rollout.valid.reshape(*rollout.valid.shape, *[1] * (a.ndim - 2)), a, 50.0)  # noqa: E731
-    names = ("obs", "action", "reward", "next_obs")
-    spoilt = rollout._replace(**{name: spoil(getattr(rollout, name)).astype(np.float32) for name in names})
-    for one, two in zip(*(jax.tree.leaves(update(state, r, CLOCK)) for r in (rollout, spoilt)), strict=True):
-        np.testing.assert_array_equal(one, two)

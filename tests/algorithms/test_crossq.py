@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import jax
@@ -10,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rejeu
 from rejeu.algorithms import crossq
 from rejeu.core import TD_ERROR
 from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
-from tests.algorithms.test_tqc import Halfway
 from tests.networks.test_batch_renorm import NumpyRenorm, numpy_torso
 from tests.numpy_networks import squashed_sample
 
@@ -218,14 +215,6 @@ def test_a_skipped_actor_step_is_a_branch_that_is_not_taken():
     assert max(products[0]) >= 2 * (3 + 3)
 
 
-def test_there_is_no_target_network_and_no_tau():
-    names = [field.name for field in dataclasses.fields(crossq.State)]
-    assert not [name for name in names if "target" in name]
-    assert "tau" not in [field.name for field in dataclasses.fields(crossq.Config)]
-    with pytest.raises(TypeError, match="CrossQ has no setting 'tau'"):
-        rejeu.CrossQ("MlpPolicy", "Pendulum-v1", tau=0.01)
-
-
 def test_a_policy_acts_on_each_observation_by_itself():
     _, state = make()
     algorithm = crossq.make(crossq.Config(**SMALL), OBS_SPACE, ACTION_SPACE)
@@ -233,39 +222,3 @@ def test_a_policy_acts_on_each_observation_by_itself():
     np.testing.assert_allclose(
         algorithm.exploit(state.actor, obs)[:1], algorithm.exploit(state.actor, obs[:1]), atol=1e-6
     )
-
-
-def test_it_finds_the_best_action_of_a_probe_and_its_values_and_a_file_keeps_them(tmp_path):
-    """At the end the best action is 1/2 and worth 1; a step earlier everything is worth gamma times that."""
-    agent = rejeu.CrossQ(
-        "MlpPolicy",
-        Halfway(),
-        seed=0,
-        learning_rate=rejeu.Linear(1e-2, 0.0),
-        learning_starts=100,
-        batch_size=64,
-        policy_delay=2,
-        gamma=0.8,
-        ent_coef=0.001,
-        policy_kwargs={"net_arch": [32, 32]},
-    ).learn(2_000)
-    obs, best = np.array([[0.0], [1.0]], np.float32), jnp.array([[0.0], [0.5]])
-    action, _ = agent.predict(obs, deterministic=True)
-    assert abs(float(action[1, 0]) - 0.5) < 0.15
-    values = jax.vmap(lambda critic: critic(obs, best)[:, 0])(agent.state.critics)
-    np.testing.assert_allclose(np.mean(values, axis=0), [0.8, 1.0], atol=0.15)
-
-    loaded = rejeu.load(agent.save(tmp_path / "agent"))
-    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], action)
-    for norm, kept in zip(agent.state.actor.torso.norms, loaded.state.actor.torso.norms, strict=True):
-        assert float(norm.n_batches) == 950
-        jax.tree.map(np.testing.assert_array_equal, norm, kept)
-
-
-@pytest.mark.slow
-def test_it_learns_pendulum_in_5_000_steps():
-    """A random policy gets about -1,200; swinging up and holding about -150."""
-    agent = rejeu.CrossQ(
-        "MlpPolicy", "Pendulum-v1", seed=0, batch_size=64, policy_delay=2, policy_kwargs={"net_arch": [64, 64]}
-    ).learn(5_000)
-    assert agent.evaluate(20, seed=1).mean_return > -250

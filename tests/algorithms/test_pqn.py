@@ -233,16 +233,6 @@ def orders_of(state, valid, config):
     return [index[np.argsort(np.asarray(row)[index], kind="stable")] for row in drawn]
 
 
-def test_padding_leaks_into_no_update():
-    _, algorithm, state = make(batch_size=4)
-    update, rollout = jax.jit(algorithm.update), random_rollout(ACTIONS, valid=LAST_STEP_MISSING)
-    spoil = lambda a: np.where(rollout.valid.reshape(*rollout.valid.shape, *[1] * (a.ndim - 2)), a, 50)  # noqa: E731
-    names = ("obs", "reward", "next_obs")
-    spoilt = rollout._replace(**{name: spoil(getattr(rollout, name)).astype(np.float32) for name in names})
-    for one, two in zip(*(jax.tree.leaves(update(state, r, CLOCK)) for r in (rollout, spoilt)), strict=True):
-        np.testing.assert_array_equal(one, two)
-
-
 # Exploration.
 
 

@@ -16,17 +16,14 @@ from rejeu.algorithms import qrdqn
 from rejeu.core import TD_ERROR, Clock, Transition
 from tests.algorithms.test_dqn import (
     BATCH,
-    BIT_FLIPPING,
     CLOCK,
     N_ACTIONS,
     OBS_SPACE,
-    Bandit,
     Chain,
     forward,
     learn_chain,
     random_batch,
 )
-from tests.bit_flipping import BitFlipping
 
 ACTION_SPACE = gym.spaces.Discrete(N_ACTIONS)
 N_QUANTILES = 3
@@ -73,14 +70,6 @@ def test_td_target_moves_the_quantiles_of_the_action_with_the_highest_mean():
         batch.reward[i] + batch.discount[i] * following[i, following[i].mean(axis=1).argmax()] for i in range(BATCH)
     ]
     np.testing.assert_allclose(given, expected, atol=1e-5)
-
-
-@pytest.mark.usefixtures("strict_dtypes")
-def test_td_target_is_the_reward_alone_where_the_mdp_terminated():
-    _, state = make()
-    batch = random_batch()._replace(discount=np.zeros(BATCH, np.float32))
-    given = qrdqn.td_target(state.network, batch)
-    np.testing.assert_array_equal(given, np.repeat(batch.reward[:, None], N_QUANTILES, axis=1))
 
 
 @pytest.mark.usefixtures("strict_dtypes")
@@ -157,19 +146,3 @@ def test_quantiles_of_a_coin_are_learnt():
     state, _ = jax.jit(lambda s: jax.lax.scan(update, s, jnp.linspace(0.0, 1.0, 2_000)))(state)
     quantiles = state.network.quantiles(obs[:1])[0, 0]
     np.testing.assert_allclose(quantiles, [-10 + 1 / 3, 10 - 1 / 3], atol=0.02)
-
-
-@pytest.mark.parametrize("n_envs", [1, 3, 8])
-def test_discrete_actions_of_any_start_are_learnt(n_envs):
-    settings = {"gamma": 0.0, "learning_rate": 1e-2, "train_freq": 2, "learning_starts": 50, "n_quantiles": 5}
-    settings |= {"exploration_fraction": 0.5, "policy_kwargs": {"net_arch": [8]}}
-    agent = rejeu.QRDQN("MlpPolicy", rejeu.make_vector(Bandit, n_envs), seed=0, **settings).learn(400)
-    action, _ = agent.predict(np.zeros(1, np.float32), deterministic=True)
-    assert action == 6
-
-
-def test_hindsight_replay_and_n_step_returns_compose():
-    settings = {**BIT_FLIPPING, "replay_buffer_class": "HerReplayBuffer", "n_steps": 2, "n_quantiles": 5}
-    env = rejeu.make_vector(lambda: BitFlipping(4), 2, seed=0)
-    agent = rejeu.QRDQN("MultiInputPolicy", env, seed=0, **{**settings, "batch_size": 64}).learn(600)
-    assert np.mean(list(agent.ep_success_buffer)[-40:]) > 0.9

@@ -202,20 +202,6 @@ def test_what_is_learnt_from_is_what_the_memory_of_each_episode_says(kind, share
     assert np.array_equal(started[1:], rollout.ended[:-1])
 
 
-@KINDS
-def test_unrolling_over_the_start_of_an_episode_is_unrolling_both_by_themselves(kind):
-    _, _, state = made(kind)
-    rollout = drawn_rollout(n_envs=1, network=state.network)
-    started = np.zeros((6, 1), bool)
-    started[4] = True
-    whole = state.network.unroll(rollout.carry, rollout.obs, started)
-    never = np.zeros((4, 1), bool)
-    first = state.network.unroll(rollout.carry, rollout.obs[:4], never)
-    second = state.network.unroll(state.network.empty(1), rollout.obs[4:], never[:2])
-    for one, a, b in zip(*map(jax.tree.leaves, (whole, first, second)), strict=True):
-        np.testing.assert_allclose(one, np.concatenate([a, b]), atol=1e-6)
-
-
 class Spy(Counter):
     """A counter whose episodes last 4, 3 and 9 steps, by turns."""
 

@@ -199,6 +199,7 @@ def test_an_action_space_that_does_not_fit_is_refused_in_one_line(name, space, m
         ("DDPG", "policy_delay", "DDPG has no setting 'policy_delay'"),
         ("DDPG", "learning_rte", "DDPG has no setting 'learning_rte'; did you mean learning_rate"),
         ("PPO", "n_epoch", "n_epoch.*n_epochs"),
+        ("CrossQ", "tau", "CrossQ has no setting 'tau'"),
         *(("PQN", key, f"PQN has no setting '{key}'") for key in ("gae_lambda", "ent_coef", "use_sde", "tau")),
     ],
 )

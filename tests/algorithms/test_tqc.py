@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rejeu
 from rejeu.algorithms import tqc
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from tests.algorithms.references import quantile_huber
@@ -24,12 +22,6 @@ def test_quantile_huber_loss_equals_loops_over_all_pairs(kappa):
     given = quantile_huber_loss(jnp.array(quantiles, jnp.float32), jnp.array(targets, jnp.float32), kappa)
     expected = [[quantile_huber(quantiles[n, b], targets[b], kappa) for b in range(BATCH)] for n in range(N_CRITICS)]
     np.testing.assert_allclose(given, expected, atol=1e-5)
-
-
-def test_quantile_huber_loss_needs_no_axis_of_critics():
-    quantiles, targets = jnp.array([[0.0, 1.0], [2.0, 0.5]]), jnp.array([[0.3, -4.0, 1.0], [0.0, 0.0, 9.0]])
-    expected = [quantile_huber(*pair) for pair in zip(quantiles.tolist(), targets.tolist(), strict=True)]
-    np.testing.assert_allclose(quantile_huber_loss(quantiles, targets), expected, atol=1e-6)
 
 
 def test_the_gradient_of_the_quantile_huber_loss_equals_finite_differences_and_the_targets_get_none():
@@ -66,49 +58,3 @@ def test_truncation_is_of_all_quantiles_together_not_of_each_critic():
     """The second critic says nothing below 10: one quantile dropped per critic, and both of its own go."""
     quantiles = jnp.array([[[3.0, 1.0]], [[20.0, 10.0]]])
     np.testing.assert_array_equal(tqc.truncate(quantiles, 2), [[1.0, 3.0]])
-
-
-class Halfway(gym.Env):
-    """Probe: two steps, the observation says which. The first gives nothing, the second 1 - 4 (a - 1/2)^2."""
-
-    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.time += 1
-        reward = 1.0 - 4 * (float(action[0]) - 0.5) ** 2 if self.time == 2 else 0.0
-        return np.full(1, self.time % 2, np.float32), reward, self.time == 2, False, {}
-
-
-def test_it_finds_the_best_action_of_a_probe_and_its_values_before_and_at_the_end():
-    """At the end the best action is 1/2 and worth 1; a step earlier everything is worth gamma times that."""
-    agent = rejeu.TQC(
-        "MlpPolicy",
-        Halfway(),
-        seed=0,
-        learning_rate=1e-2,
-        learning_starts=100,
-        batch_size=64,
-        gamma=0.8,
-        tau=0.05,
-        ent_coef=0.001,
-        policy_kwargs={"net_arch": [32, 32]},
-    ).learn(700)
-    action, _ = agent.predict(np.ones((1, 1), np.float32), deterministic=True)
-    assert abs(float(action[0, 0]) - 0.5) < 0.15
-    values = tqc.action_quantiles(agent.state.critics, jnp.array([[0.0], [1.0]]), jnp.array([[0.0], [0.5]]))
-    np.testing.assert_allclose(np.mean(values, axis=(0, 2)), [0.8, 1.0], atol=0.1)
-
-
-@pytest.mark.slow
-def test_it_learns_pendulum_in_5_000_steps():
-    """A random policy gets about -1,200; swinging up and holding about -150."""
-    agent = rejeu.TQC(
-        "MlpPolicy", "Pendulum-v1", seed=0, learning_rate=1e-3, batch_size=64, policy_kwargs={"net_arch": [64, 64]}
-    ).learn(5_000)
-    assert agent.evaluate(20, seed=1).mean_return > -250

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import rliable_statistics
 from rejeu.reporting import statistics
 
-RECORDED = json.loads(rliable_statistics.RESULTS.read_text(encoding="utf-8"))
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "rliable_statistics.json"
+RECORDED = json.loads(RESULTS.read_text(encoding="utf-8"))
 
 
 def trimmed_mean(values):
@@ -62,10 +62,10 @@ def test_recorded_differences_from_rliable_are_below_a_millionth(row):
 
 
 def test_equal_to_rliable_on_the_same_draws():
-    name, shape = next(iter(rliable_statistics.SHAPES.items()))
-    scores = [rliable_statistics.scores(shape, 0)[:, 0]]
-    samples = statistics.resampled(scores, rliable_statistics.draws(shape)[0])
-    found = [statistics.iqm(scores), *statistics.interval(statistics.iqm(samples))]
-    recorded = next(row["rliable"] for row in RECORDED["rows"] if row["statistic"] == f"iqm, {name}")
+    """Five runs: scores with ties, and the draws of NumPy's legacy generator, which rliable uses."""
+    scores = np.round(np.random.default_rng([RECORDED["seed"], 0, 5, 1]).normal(0.0, 1.0, (5, 1)), 1)[:, 0]
+    np.random.seed(RECORDED["seed"])  # noqa: NPY002 - as rliable
+    draws = np.stack([np.random.choice(5, (5, 1))[:, 0] for _ in range(RECORDED["samples"])])  # noqa: NPY002
+    found = [statistics.iqm([scores]), *statistics.interval(statistics.iqm(statistics.resampled([scores], [draws])))]
+    recorded = next(row["rliable"] for row in RECORDED["rows"] if row["statistic"] == "iqm, 5 runs, 1 environment")
     np.testing.assert_allclose(found, np.ravel(recorded), rtol=0, atol=1e-6)
-    assert Path(rliable_statistics.__file__).name in RECORDED["command"]

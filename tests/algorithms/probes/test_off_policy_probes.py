@@ -1,7 +1,4 @@
-"""Every off-policy algorithm solves the probe environments on each kind of action that it takes.
-
-SAC on continuous actions does so in ``test_sac_probes``.
-"""
+"""Every off-policy algorithm solves the probe environments on each kind of action that it takes."""
 
 from __future__ import annotations
 
@@ -10,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rejeu
 from tests.algorithms.probes.environments import ByAction, BySight, BySightAndAction, Constant, Endless, Later
 from tests.every_agent import KINDS, env_of, small
 from tests.tiers import only
 
 GAMMA = 0.5
-NAMES = [name for name in KINDS if name != "SAC"]
-every_algorithm = pytest.mark.parametrize("name", NAMES)
-some_algorithms = pytest.mark.parametrize("name", only(["TD3", "DQN"], NAMES))
+every_algorithm = pytest.mark.parametrize("name", KINDS)
+some_algorithms = pytest.mark.parametrize("name", only(["SAC", "TD3", "DQN"], KINDS))
 
 
 def solve(name, probe):
@@ -81,3 +78,14 @@ def test_the_best_action_is_found(name):
 def test_the_best_action_depends_on_the_observation(name):
     action = best_actions(solve(name, BySightAndAction), [-1.0, 1.0])
     assert action == pytest.approx([0.5, 1.5], abs=tolerances(name)[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "settings"), [("TQC", {"learning_rate": 1e-3}), ("CrossQ", {"policy_delay": 2})], ids=["TQC", "CrossQ"]
+)
+def test_pendulum_is_learned_in_5_000_steps(name, settings):
+    """A random policy gets about -1,200; swinging up and holding about -150."""
+    settings = {**settings, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
+    agent = rejeu.AGENTS[name]("MlpPolicy", "Pendulum-v1", seed=0, **settings).learn(5_000)
+    assert agent.evaluate(20, seed=1).mean_return > -250
