@@ -80,7 +80,7 @@ def forget_registered() -> Iterator[None]:
     from rejeu import presets
     from rejeu.buffers.strategies import STRATEGIES
     from rejeu.envs.functional.registry import REGISTRY
-    from rejeu.networks.own import ENCODERS
+    from rejeu.networks.layers import ENCODERS
 
     registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered, REGISTRY, STRATEGIES, ENCODERS)
     before = [dict(registry) for registry in registries]

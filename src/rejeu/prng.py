@@ -25,6 +25,21 @@ def nth(key: Array, n: Any) -> Array:
     return jax.random.fold_in(jax.random.wrap_key_data(key, impl=IMPLEMENTATION), n)
 
 
+def below(bits: Array, n: Array) -> Array:
+    """Returns ``floor(n * bits / 2^32)``, ``int32``: a whole number in [0, n) from random bits ``uint32``.
+
+    It equals ``int(u * n)`` of the 64-bit number ``u = bits / 2^32``, as the replay buffers of the host draw.
+
+    >>> below(jnp.uint32(2**31), jnp.int32(7)).tolist()
+    3
+    """
+    n = jnp.asarray(n).astype(jnp.uint32)
+    low, high, n_low, n_high = bits & 0xFFFF, bits >> 16, n & 0xFFFF, n >> 16
+    low_high, high_low = low * n_high, high * n_low
+    middle = ((low * n_low) >> 16) + (low_high & 0xFFFF) + (high_low & 0xFFFF)
+    return (high * n_high + (low_high >> 16) + (high_low >> 16) + (middle >> 16)).astype(jnp.int32)
+
+
 @jax.jit
 def threefry(key: Array, low: Array) -> tuple[Array, Array]:
     """Returns the hash of the numbers ``(0, low)``, 32 bits each, under ``key``, ``uint32[2]``: 20 rounds."""

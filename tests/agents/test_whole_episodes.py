@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.algorithms.actor_critic import samples
+from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.envs.make import InProcess, make_vector
 from tests.environments import Counter
 

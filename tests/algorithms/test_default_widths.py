@@ -9,7 +9,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import config as configs, crossq, ppo
-from rejeu.algorithms.actor_critic import ActorCritic
+from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.callbacks import Checkpoint
 from rejeu.io import checkpoint
 from rejeu.spaces import leaves

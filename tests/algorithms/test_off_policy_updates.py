@@ -136,12 +136,12 @@ def test_the_target_is_the_reward_where_the_mdp_terminated_and_dtypes_are_not_mi
         state, key, alpha = state_of(case.make()[0]), jax.random.PRNGKey(0), jnp.float32(0.3)
     batch = jax.tree.map(jnp.asarray, case.batch(0)._replace(discount=np.zeros(BATCH, np.float32)))
     calls = {
-        "DDPG": lambda: ddpg.td_target(state.target_actor, state.target_critic, batch),
+        "DDPG": lambda: ddpg.continuous.td_target(state.target_actor, state.target_critic, batch),
         "DDPG, Discrete": lambda: ddpg_discrete.td_target(state.target_actor, state.target_critic, batch),
         "TD3": lambda: td3.td_target(
             state.target_critics, batch, td3.smoothed_action(state.target_actor, batch.next_obs, key, 0.6, 0.5)
         ),
-        "SAC": lambda: sac.td_target(state.actor, state.target_critics, alpha, batch, key),
+        "SAC": lambda: sac.continuous.td_target(state.actor, state.target_critics, alpha, batch, key),
         "SAC, Discrete": lambda: sac_discrete.td_target(state.actor, state.target_critics, alpha, batch),
         "TQC": lambda: tqc.td_target(state.actor, state.target_critics, alpha, batch, key, 4).T,
     }
@@ -150,8 +150,8 @@ def test_the_target_is_the_reward_where_the_mdp_terminated_and_dtypes_are_not_mi
     target = batch.reward if name != "TQC" else jnp.tile(batch.reward[:, None], 4)
     losses = {
         "DDPG": lambda: (
-            ddpg.critic_loss(state.critic, batch, target),
-            ddpg.actor_loss(state.actor, state.critic, batch.obs),
+            ddpg.continuous.critic_loss(state.critic, batch, target),
+            ddpg.continuous.actor_loss(state.actor, state.critic, batch.obs),
         ),
         "DDPG, Discrete": lambda: (
             ddpg_discrete.critic_loss(state.critic, batch, target),
@@ -159,8 +159,8 @@ def test_the_target_is_the_reward_where_the_mdp_terminated_and_dtypes_are_not_mi
         ),
         "TD3": lambda: td3.critics_loss(state.critics, batch, target),
         "SAC": lambda: (
-            sac.critics_loss(state.critics, batch, target),
-            sac.actor_loss(state.actor, state.critics, alpha, batch.obs, key),
+            sac.continuous.critics_loss(state.critics, batch, target),
+            sac.continuous.actor_loss(state.actor, state.critics, alpha, batch.obs, key),
         ),
         "SAC, Discrete": lambda: sac_discrete.critics_loss(state.critics, batch, target),
         "TQC": lambda: (
@@ -196,7 +196,7 @@ def test_log_std_is_clipped_to_its_range():
     state = state_of(CASES["SAC"].make()[0])
     head, bias = state.actor.head, jnp.array([0.0, 0.0, 100.0, -100.0])
     actor = eqx.tree_at(lambda a: (a.head.weight, a.head.bias), state.actor, (head.weight * 0, bias))
-    np.testing.assert_array_equal(sac.policy(actor, jnp.zeros((1, OBS_DIM))).log_std, [[2.0, -20.0]])
+    np.testing.assert_array_equal(sac.continuous.policy(actor, jnp.zeros((1, OBS_DIM))).log_std, [[2.0, -20.0]])
 
 
 @pytest.mark.parametrize(("ent_coef", "alpha"), [("auto", 1.0), ("auto_0.1", 0.1), (0.25, 0.25)])

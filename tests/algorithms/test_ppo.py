@@ -13,16 +13,9 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import ppo
-from rejeu.algorithms.actor_critic import (
-    ActorCritic,
-    ActorCriticConfig,
-    Samples,
-    action_kind,
-    explained_variance,
-    is_value,
-    shuffled,
-    standardized,
-)
+from rejeu.algorithms.actor_critic.config import ActorCriticConfig
+from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, is_value
+from rejeu.algorithms.actor_critic.steps import Samples, explained_variance, shuffled, standardized
 from rejeu.core import Clock, Rollout
 from rejeu.distributions import Normal
 from rejeu.prng import nth

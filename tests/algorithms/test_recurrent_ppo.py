@@ -15,7 +15,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import recurrent_ppo
-from rejeu.algorithms.actor_critic import action_kind
+from rejeu.algorithms.actor_critic.network import action_kind
 from rejeu.algorithms.recurrent_ppo import Cell, Config, RecurrentActorCritic, RecurrentConfig
 from rejeu.core import Clock, Rollout
 from rejeu.envs.make import InProcess

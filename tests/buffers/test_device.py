@@ -12,13 +12,14 @@ import pytest
 
 from rejeu import spaces
 from rejeu.buffers import device_priorities
-from rejeu.buffers.device import DeviceReplay, below, download, uploaded
+from rejeu.buffers.device import DeviceReplay, download, uploaded
 from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.functional.vector import goal_functions
 from rejeu.loops.device.off_policy import draws
+from rejeu.prng import below
 from rejeu.schedules import Linear
 from tests.buffers.test_hindsight import closest
 from tests.jax_environments import Reach

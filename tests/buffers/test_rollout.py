@@ -11,7 +11,9 @@ import pytest
 
 import rejeu
 from rejeu import spaces
-from rejeu.algorithms import actor_critic
+from rejeu.algorithms.actor_critic.config import ActorCriticConfig
+from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind
+from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import Rollout
 from rejeu.envs.make import InProcess
@@ -24,13 +26,13 @@ GAMMA = 0.9
 # Samples: a rollout with its values and log-probabilities.
 
 OBS_LEAVES = spaces.leaves(gym.spaces.Box(-5.0, 5.0, (2,), np.float32))
-SHAPE = actor_critic.ActorCriticConfig(net_arch=[4])
+SHAPE = ActorCriticConfig(net_arch=[4])
 
 
 @pytest.fixture(scope="module")
 def network():
-    kind = actor_critic.action_kind(gym.spaces.Discrete(3))
-    return actor_critic.ActorCritic(jax.random.PRNGKey(0), OBS_LEAVES, kind, SHAPE)
+    kind = action_kind(gym.spaces.Discrete(3))
+    return ActorCritic(jax.random.PRNGKey(0), OBS_LEAVES, kind, SHAPE)
 
 
 def value_by_hand(network, obs):
@@ -50,7 +52,7 @@ def random_rollout(n_steps, n_envs, valid, seed=0):
 
 def test_samples_hold_values_advantages_and_targets_of_every_step(network):
     rollout = random_rollout(5, 3, np.ones((5, 3), bool))
-    data = actor_critic.samples(network, rollout, 0.8)
+    data = samples(network, rollout, 0.8)
     value, next_value = value_by_hand(network, rollout.obs), value_by_hand(network, rollout.next_obs)
     expected = by_definition(rollout.reward, value, next_value, rollout.discount, rollout.ended, 0.8)
     np.testing.assert_allclose(data.advantage, expected.ravel(), atol=1e-5)
@@ -65,8 +67,8 @@ def test_padding_leaks_into_no_sample(network):
     valid = np.arange(5)[:, None] < [5, 3, 0]
     rollout = random_rollout(5, 3, valid)
     spoilt = [np.where(valid.reshape(5, 3, *[1] * (a.ndim - 2)), a, 1e4).astype(a.dtype) for a in rollout[:5]]
-    clean = actor_critic.samples(network, rollout, 0.8)
-    given = actor_critic.samples(network, rollout._replace(**dict(zip(Rollout._fields, spoilt, strict=False))), 0.8)
+    clean = samples(network, rollout, 0.8)
+    given = samples(network, rollout._replace(**dict(zip(Rollout._fields, spoilt, strict=False))), 0.8)
     keep = valid.ravel()
     for name in ("value", "advantage", "target"):
         np.testing.assert_array_equal(getattr(given, name)[keep], getattr(clean, name)[keep], err_msg=name)

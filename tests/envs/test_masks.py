@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 import rejeu
 from rejeu.algorithms import ppo
-from rejeu.algorithms.actor_critic import samples
+from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.core import Clock, Masked
 from rejeu.envs.make import InProcess, make_vector
 from rejeu.envs.masks import make_masked

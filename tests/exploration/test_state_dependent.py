@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.algorithms.actor_critic import ActorCritic, ActorCriticConfig, action_kind, sde_explorer
+from rejeu.algorithms.actor_critic.config import ActorCriticConfig
+from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, sde_explorer
 from rejeu.core import Clock
 from rejeu.envs.make import InProcess
 from rejeu.spaces import leaves

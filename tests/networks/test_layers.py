@@ -11,7 +11,8 @@ import pytest
 from scipy import special
 
 from rejeu.core import ensemble
-from rejeu.networks import ACTIVATIONS, Linear, PolicyConfig, product
+from rejeu.networks import ACTIVATIONS, Linear, PolicyConfig
+from rejeu.networks.layers import product
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 KEY = jax.random.PRNGKey(0)

@@ -19,10 +19,7 @@ from rejeu.algorithms import config as configs, sac
 from rejeu.core import ensemble
 from rejeu.errors import CheckpointError
 from rejeu.networks import (
-    CNN,
     ENCODERS,
-    NATURE,
-    SMALL,
     Convolution,
     Encoder,
     Linear,
@@ -30,11 +27,10 @@ from rejeu.networks import (
     PolicyConfig,
     QNetwork,
     action_values,
-    channels_last,
     convolutions,
     encoder,
-    image_shape,
 )
+from rejeu.networks.encoder import CNN, NATURE, SMALL, channels_last, image_shape
 from rejeu.spaces import leaves
 from tests.tiers import exhaustive
 

@@ -25,15 +25,13 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
-from rejeu.algorithms.actor_critic import (
-    ActorCritic,
-    OnPolicyConfig,
+from rejeu.algorithms.actor_critic.config import OnPolicyConfig
+from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of
+from rejeu.algorithms.actor_critic.steps import (
     Samples,
-    checked,
     clip_and_descend,
     entropy_of,
     explained_variance,
-    explorer_of,
     masked_mean,
     samples,
     standardized,

@@ -34,15 +34,13 @@ from jax import Array
 
 from rejeu import schedules
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.actor_critic import (
-    ActorCritic,
-    OnPolicyConfig,
+from rejeu.algorithms.actor_critic.config import OnPolicyConfig
+from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of
+from rejeu.algorithms.actor_critic.steps import (
     Samples,
-    checked,
     clip_and_descend,
     entropy_of,
     explained_variance,
-    explorer_of,
     masked_mean,
     minibatches,
     samples,

@@ -30,7 +30,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.actor_critic import flat, masked_mean, minibatches
+from rejeu.algorithms.actor_critic.steps import flat, masked_mean, minibatches
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy_algorithm, epsilon_schedule, metrics_of, taken
 from rejeu.algorithms.rollout_config import RolloutConfig

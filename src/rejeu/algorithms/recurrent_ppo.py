@@ -24,20 +24,17 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, ppo, search
-from rejeu.algorithms.actor_critic import (
+from rejeu.algorithms.actor_critic.config import ActorCriticConfig
+from rejeu.algorithms.actor_critic.network import (
     HIDDEN_GAIN,
     ActionKind,
     ActorCritic,
-    ActorCriticConfig,
     Distribution,
-    Samples,
     checked,
-    flat,
     orthogonal,
-    shuffled,
     unmasked,
-    with_advantages,
 )
+from rejeu.algorithms.actor_critic.steps import Samples, flat, shuffled, with_advantages
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout

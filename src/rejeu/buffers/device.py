@@ -30,6 +30,7 @@ from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.buffers.strategies import BUILT_IN, GoalStrategy, HindsightSteps
 from rejeu.buffers.uniform import bootstrap_discount
 from rejeu.core import PyTree, Transition, copy
+from rejeu.prng import below
 
 RUNNING = np.iinfo(np.int32).max
 """The end of an episode that has not ended."""
@@ -345,21 +346,6 @@ def put(store: Array, index: Array, values: Array) -> Array:
     before = jax.lax.dynamic_slice_in_dim(store, place, 1)
     row = jnp.where(index[0] < len(store), values, before)
     return jax.lax.dynamic_update_slice_in_dim(store, row, place, 0)
-
-
-def below(bits: Array, n: Array) -> Array:
-    """Returns ``floor(n * bits / 2^32)``, ``int32``: a whole number in [0, n) from random bits ``uint32``.
-
-    It equals ``int(u * n)`` of the 64-bit number ``u = bits / 2^32``, as the replay buffers of the host draw.
-
-    >>> below(jnp.uint32(2**31), jnp.int32(7)).tolist()
-    3
-    """
-    n = jnp.asarray(n).astype(jnp.uint32)
-    low, high, n_low, n_high = bits & 0xFFFF, bits >> 16, n & 0xFFFF, n >> 16
-    low_high, high_low = low * n_high, high * n_low
-    middle = ((low * n_low) >> 16) + (low_high & 0xFFFF) + (high_low & 0xFFFF)
-    return (high * n_high + (low_high >> 16) + (high_low >> 16) + (middle >> 16)).astype(jnp.int32)
 
 
 def uploaded(replay: DeviceReplay, ring: Ring) -> DeviceRing:

@@ -6,31 +6,30 @@ fields (names, shapes of observations) are hashable. Inputs have one batch axis.
 """
 
 from rejeu.networks.encoder import (
-    CNN,
-    NATURE,
-    SMALL,
     Convolution,
     Encoder,
-    channels_last,
     convolutions,
-    image_shape,
     make_encoder,
     reads_image,
 )
-from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, product
-from rejeu.networks.network import Network, QNetwork, action_values, values_by_critics
-from rejeu.networks.own import ENCODERS, register_encoder
-from rejeu.networks.shape import BRANCHES, PolicyConfig, Widths, settled, split_net_arch
-from rejeu.networks.torsos import Branches, SimBa, Torso, make_head, make_torso
+from rejeu.networks.layers import ACTIVATIONS, ENCODERS, MLP, LayerNorm, Linear, register_encoder
+from rejeu.networks.network import (
+    Branches,
+    Network,
+    QNetwork,
+    SimBa,
+    Torso,
+    action_values,
+    make_head,
+    make_torso,
+    values_by_critics,
+)
+from rejeu.networks.shape import PolicyConfig, Widths, settled, split_net_arch
 
 __all__ = [
     "ACTIVATIONS",
-    "BRANCHES",
-    "CNN",
     "ENCODERS",
     "MLP",
-    "NATURE",
-    "SMALL",
     "Branches",
     "Convolution",
     "Encoder",
@@ -43,13 +42,10 @@ __all__ = [
     "Torso",
     "Widths",
     "action_values",
-    "channels_last",
     "convolutions",
-    "image_shape",
     "make_encoder",
     "make_head",
     "make_torso",
-    "product",
     "reads_image",
     "register_encoder",
     "settled",

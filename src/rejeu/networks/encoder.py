@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.core import PyTree
-from rejeu.networks.layers import LayerNorm, Linear
-from rejeu.networks.own import find_encoder, own_module
+from rejeu.networks.layers import LayerNorm, Linear, find_encoder, own_module
 from rejeu.networks.shape import PolicyConfig
 from rejeu.spaces import Leaf
 

@@ -8,8 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from jax import Array
 
-from rejeu.networks.layers import ACTIVATIONS
-from rejeu.networks.own import find_encoder
+from rejeu.networks.layers import ACTIVATIONS, find_encoder
 from rejeu.spaces import Leaf
 from rejeu.validation import assign, choice, coerce, flag, whole
 

@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 
 from rejeu import normalization
-from rejeu.algorithms.actor_critic import ActorCritic
+from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
 from rejeu.core import averaged_fields
 from rejeu.networks import MLP, Branches, Linear, Network, QNetwork, SimBa, convolutions

@@ -11,8 +11,8 @@ import numpy as np
 from rejeu.buffers.device_priorities import order
 from rejeu.buffers.hindsight import HerReplayBuffer
 from rejeu.buffers.prioritized import Draw
-from rejeu.loops.device.actions import random_action
 from rejeu.loops.device.off_policy import draws
+from rejeu.loops.device.program import random_action
 from rejeu.loops.run import Run
 
 

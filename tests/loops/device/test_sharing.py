@@ -9,7 +9,7 @@ import sys
 import jax
 import pytest
 
-from rejeu.loops.device.sharding import filled, group_size, mesh_of
+from rejeu.loops.device.trainer import filled, group_size, mesh_of
 from tests.loops.device.two_devices import CASES
 
 TWO = "--xla_force_host_platform_device_count=2"

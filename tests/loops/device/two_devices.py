@@ -13,7 +13,7 @@ import numpy as np
 import rejeu
 from rejeu import devices
 from rejeu.callbacks import Checkpoint
-from rejeu.loops.device import sharding
+from rejeu.loops.device import trainer as device_trainer
 from rejeu.loops.device.trainer import DeviceTrainer, Group
 from tests.agents.test_together import ON_POLICY, SMALL, assert_same_runs
 
@@ -26,7 +26,7 @@ CASES: dict[str, Any] = {
 def share(name: str) -> None:
     """Compares runs that stop at different steps with single ones, and resumes one of them."""
     kind, env, settings = CASES[name]
-    sharding.MOST_ON_CPU = 1  # so that there are two groups of runs
+    device_trainer.MOST_ON_CPU = 1  # so that there are two groups of runs
     used: list[int] = []
     start = DeviceTrainer.start
 

@@ -3,29 +3,10 @@
 from gymnasium import spaces
 
 from rejeu.algorithms.ddpg import continuous, discrete
-from rejeu.algorithms.ddpg.continuous import (
-    HIDDEN_LAYERS,
-    Config,
-    State,
-    action_value,
-    actor_loss,
-    critic_loss,
-    policy,
-    td_target,
-)
+from rejeu.algorithms.ddpg.continuous import Config, State
 from rejeu.core import Algorithm
 
-__all__ = [
-    "HIDDEN_LAYERS",
-    "Config",
-    "State",
-    "action_value",
-    "actor_loss",
-    "critic_loss",
-    "make",
-    "policy",
-    "td_target",
-]
+__all__ = ["Config", "State", "make"]
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:

@@ -3,31 +3,10 @@
 from gymnasium import spaces
 
 from rejeu.algorithms.sac import continuous, discrete
-from rejeu.algorithms.sac.continuous import (
-    LOG_STD_RANGE,
-    Config,
-    State,
-    actor_loss,
-    critics_loss,
-    initial_temperature,
-    policy,
-    td_target,
-    temperature_loss,
-)
+from rejeu.algorithms.sac.continuous import Config, State
 from rejeu.core import Algorithm
 
-__all__ = [
-    "LOG_STD_RANGE",
-    "Config",
-    "State",
-    "actor_loss",
-    "critics_loss",
-    "initial_temperature",
-    "make",
-    "policy",
-    "td_target",
-    "temperature_loss",
-]
+__all__ = ["Config", "State", "make"]
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:

@@ -13,11 +13,10 @@ import numpy as np
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.loops.checks import check_state
-from rejeu.loops.device.off_policy import OffPolicyTrainer
-from rejeu.loops.device.on_policy import OnPolicyTrainer
-from rejeu.loops.device.program import NO_LIMIT, Limits
-from rejeu.loops.device.sharding import group_size
-from rejeu.loops.device.trainer import MAX_TURNS, DeviceTrainer, Remake
+from rejeu.loops.device.off_policy import OffPolicyProgram
+from rejeu.loops.device.on_policy import OnPolicyProgram
+from rejeu.loops.device.program import MAX_TURNS, NO_LIMIT, Limits, Remake
+from rejeu.loops.device.trainer import DeviceTrainer, group_size
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.run import Progress, Run, Timer
@@ -78,9 +77,19 @@ def train(
         NonFiniteUpdate: if an update leaves numbers that are not finite.
         ValueError: if the steps are too many to be counted with 32 bits.
     """
-    kind = OnPolicyTrainer if isinstance(config, RolloutConfig) else OffPolicyTrainer
-    size = group_size(len(runs), devices)
-    trainer: DeviceTrainer = kind(runs, learner, config, stops.at_episodes, size, devices, remake, hyper)
+    kind: Any = OnPolicyProgram if isinstance(config, RolloutConfig) else OffPolicyProgram
+    program = kind.of(
+        runs[0],
+        config,
+        algorithm=learner.algorithm,
+        explorer=learner.explorer,
+        packing=learner.packing,
+        n_envs=runs[0].env.n_envs,
+        skips=learner.skips,
+        stops_at_episode=stops.at_episodes,
+        remake=remake,
+    )
+    trainer = DeviceTrainer(program, runs, learner, group_size(len(runs), devices), devices, hyper)
     first = runs[active[0]].step
     last = None if n_steps is None else first + n_steps
     if last is not None and last >= NO_LIMIT:
@@ -117,7 +126,7 @@ def take_chunks(
             timer.lap()
         for run in runs:
             if run.obs is None or run.env.must_reset:
-                trainer.begin_episodes(run)
+                trainer.program.begin_episodes(run)
         if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
             trained = [*active]
             trainer.push(float(progress(leader.step - first)), leader)
@@ -133,7 +142,7 @@ def take_chunks(
             schedule(progress, step - first, n_turns, n_envs, capacity, last, first),
             np.int32(ALL),
             np.uint32(leader.learn_from),
-            np.bool_(trainer.uses_part(leader, n_turns, last)),
+            np.bool_(trainer.program.uses_part(leader, n_turns, last)),
         )
         began = time.perf_counter()
         trainer.take(limits, active)

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh
 
 from rejeu import spaces
 from rejeu.algorithms.config import OffPolicyConfig
@@ -26,10 +24,7 @@ from rejeu.buffers.device_priorities import Pending, noted
 from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
-from rejeu.loops.device.actions import random_action
-from rejeu.loops.device.program import Carry, Learned, Limits, Loop, Program, step_envs
-from rejeu.loops.device.sharding import over_runs
-from rejeu.loops.device.trainer import DeviceTrainer, capacity_of
+from rejeu.loops.device.program import Carry, Learned, Limits, Loop, Program, capacity_of, random_action, step_envs
 from rejeu.loops.off_policy import begin_episodes
 from rejeu.loops.run import Run
 from rejeu.prng import nth
@@ -57,12 +52,102 @@ class OffPolicyProgram(Program):
 
     replay: DeviceReplay
 
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: DeviceRing) -> Transition:
-        return draw(self.replay, env, experience, nth(carry.key, jnp.uint32(0)), jnp.float32(0))[0]
+    @classmethod
+    def of(cls, run: Run, config: OffPolicyConfig, **settings: Any) -> OffPolicyProgram:
+        """Returns the program for runs like ``run``."""
+        replay = replay_of(run, config)
+        capacity = min(capacity_of(replay.n_envs), (replay.rows - 1) // 2)
+        return cls(config=config, replay=replay, capacity=capacity, **settings)
+
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: DeviceRing, clock: Clock, number: Any) -> Transition:
+        key = jax.random.fold_in(draws(carry.key, clock.step), number + 1)
+        return self.draw(env, experience, key, clock.progress)[0]
 
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
         one = lambda loop: (loop[0] + 1, take_turn(self, env, loop[1], limits, loop[0]))  # noqa: E731
         return jax.lax.while_loop(lambda loop: may_go_on(*loop), one, (jnp.int32(0), loop))[1]
+
+    def choose(self, env: FunctionalEnv, carry: Carry, state: PyTree, clock: Clock) -> Carry:
+        """Returns the carry with the actions of the next turn; see :func:`rejeu.loops.off_policy.choose`."""
+        episodes, before = carry.episodes, carry.action
+        assert before is not None
+
+        def explored() -> tuple[Array, PyTree]:
+            actor, key = self.algorithm.actor(state), nth(carry.key, clock.step)
+            action, explorer = self.explorer.act(carry.explorer, actor, episodes.obs, episodes.ended, key, clock)
+            return action.astype(before.dtype), explorer
+
+        def random() -> tuple[Array, PyTree]:
+            key = jax.random.fold_in(draws(carry.key, clock.step), 0)
+            return random_action(env.action_space, self.n_envs, key).astype(before.dtype), carry.explorer
+
+        if self.config.learning_starts:
+            action, explorer = jax.lax.cond(clock.step < self.config.learning_starts, random, explored)
+        else:
+            action, explorer = explored()
+        return carry._replace(action=action, explorer=explorer)
+
+    def draw(self, env: FunctionalEnv, ring: DeviceRing, key: Array, progress: Array) -> tuple[Transition, DeviceRows]:
+        """Returns a batch and its rows; with hindsight, the rewards of new goals are those of ``env``."""
+        if self.replay.strategy is None:
+            return self.replay.draw(ring, key, progress)
+        assert isinstance(env, GoalEnv)
+        goal = ring.obs[self.replay.achieved][:1]
+        judges = jax.eval_shape(env.compute_terminated, goal, goal) is not None
+        terminated: Any = env.compute_terminated if judges else None
+        return self.replay.draw(ring, key, progress, env.compute_reward, terminated)
+
+    def begin_episodes(self, run: Run) -> None:
+        begin_episodes(run)
+
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        return False
+
+    def counts_of(self, run: Run) -> Counts:
+        pending = sum(len(draw.position) for draw, _ in run.td_errors) // self.replay.batch_size
+        return Counts(jnp.uint32(run.step), jnp.int32(run.owed), jnp.int32(run.steps_since_update), jnp.int32(pending))
+
+    def action_of(self, run: Run) -> Array:
+        random = lambda: spaces.random_action(run.env.action_space, self.n_envs, np.random.default_rng(0))  # noqa: E731
+        return jnp.array(random() if run.action is None else run.action)
+
+    def rows_changed(self, n_turns: int) -> int:
+        """Returns one of few numbers, for each of which a program is compiled. A turn may add a step and a new episode."""
+        size = 64
+        while size < 2 * n_turns + 1:
+            size *= 8
+        return min(size, self.replay.rows)
+
+    def uploaded(self, run: Run) -> DeviceRing:
+        replay, buffer = self.replay, run.replay
+        ring = uploaded(replay, buffer.ring)
+        if buffer.priorities is None:
+            return ring
+        sizes = replay.most_updates, replay.batch_size
+        run.td_errors = [pair for pair in run.td_errors if pair[0].version == buffer.ring.version]
+        if not device_priorities.fit(run.td_errors, *sizes):
+            buffer.update_priorities(run.td_errors)
+            run.td_errors = []
+        return ring._replace(priorities=device_priorities.uploaded(buffer.priorities, run.td_errors, *sizes))
+
+    def download(self, run: Run, experience: DeviceRing, counts: Counts) -> None:
+        download(run.buffer.ring, experience)
+        priorities = experience.priorities
+        if priorities is None:
+            return
+        ring = run.buffer.ring
+        values = np.asarray(priorities.values)[: ring.rows * ring.n_envs]
+        run.buffer.priorities.load(values.astype(np.float64), float(priorities.largest))
+        run.td_errors = [
+            (Draw(position.astype(np.int64), time.astype(np.int64), ring.version), jnp.array(td_error))
+            for position, time, td_error in zip(
+                *(np.asarray(part)[: int(counts.pending)] for part in priorities.pending), strict=True
+            )
+        ]
+
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        run.action = np.array(carry.action)
+        run.owed, run.steps_since_update = int(carry.counts.owed), int(carry.counts.since_update)
 
 
 def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
@@ -83,18 +168,18 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
 
     def one(u: Array, passed: tuple[Learned, Pending | None]) -> tuple[Learned, Pending | None]:
         learned, pending = passed
-        batch, rows = draw(replay, env, ring, jax.random.fold_in(root, u + 1), clock.progress)
+        batch, rows = program.draw(env, ring, jax.random.fold_in(root, u + 1), clock.progress)
         learned, td_error = program.learn(learned, batch, clock)
         if pending is not None and td_error is not None:
             pending = noted(pending, u, rows.position, rows.time, td_error)
         return learned, pending
 
     if config.overlap:
-        carry = choose(program, env, carry, learned.state, clock)
+        carry = program.choose(env, carry, learned.state, clock)
     pending = None if ring.priorities is None else ring.priorities.pending
     learned, pending = jax.lax.fori_loop(0, jnp.minimum(n, limits.most_updates), one, (learned, pending))
     if not config.overlap:
-        carry = choose(program, env, carry, learned.state, clock)
+        carry = program.choose(env, carry, learned.state, clock)
     ring = replay.update_priorities(ring, n_pending)  # all batches of the turn have been drawn
     if pending is not None and ring.priorities is not None:
         ring = ring._replace(priorities=ring.priorities._replace(pending=pending))
@@ -104,40 +189,6 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
 def draws(key: Array, step: Array) -> Array:
     """Returns the key of the random actions and batches of a turn that ends at the environment step ``step``."""
     return jax.random.fold_in(nth(key, jnp.uint32(DRAWS)), step)
-
-
-def choose(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, state: PyTree, clock: Clock) -> Carry:
-    """Returns the carry with the actions of the next turn; see :func:`rejeu.loops.off_policy.choose`."""
-    episodes, before = carry.episodes, carry.action
-    assert before is not None
-
-    def explored() -> tuple[Array, PyTree]:
-        actor, key = program.algorithm.actor(state), nth(carry.key, clock.step)
-        action, explorer = program.explorer.act(carry.explorer, actor, episodes.obs, episodes.ended, key, clock)
-        return action.astype(before.dtype), explorer
-
-    def random() -> tuple[Array, PyTree]:
-        key = jax.random.fold_in(draws(carry.key, clock.step), 0)
-        return random_action(env.action_space, program.n_envs, key).astype(before.dtype), carry.explorer
-
-    if program.config.learning_starts:
-        action, explorer = jax.lax.cond(clock.step < program.config.learning_starts, random, explored)
-    else:
-        action, explorer = explored()
-    return carry._replace(action=action, explorer=explorer)
-
-
-def draw(
-    replay: DeviceReplay, env: FunctionalEnv, ring: DeviceRing, key: Array, progress: Array
-) -> tuple[Transition, DeviceRows]:
-    """Returns a batch and its rows; with hindsight, the rewards of new goals are those of ``env``."""
-    if replay.strategy is None:
-        return replay.draw(ring, key, progress)
-    assert isinstance(env, GoalEnv)
-    goal = ring.obs[replay.achieved][:1]
-    judges = jax.eval_shape(env.compute_terminated, goal, goal) is not None
-    terminated: Any = env.compute_terminated if judges else None
-    return replay.draw(ring, key, progress, env.compute_reward, terminated)
 
 
 def due(config: OffPolicyConfig, counts: Counts, taken: Array, ended: Array, learn_from: Array) -> tuple[Array, Counts]:
@@ -168,104 +219,6 @@ def most_updates(config: OffPolicyConfig, n_envs: int) -> int | None:
     return every - 1 + n_envs if isinstance(config.train_freq, int) else None
 
 
-class OffPolicyTrainer(DeviceTrainer):
-    """Trains runs with a replay buffer. Mutable."""
-
-    def make_program(self, run: Run, config: OffPolicyConfig, **settings: Any) -> OffPolicyProgram:
-        rows = run.buffer.ring.rows
-        capacity = min(capacity_of(run.env.n_envs), (rows - 1) // 2)
-        return OffPolicyProgram(config=config, replay=replay_of(run, config), capacity=capacity, **settings)
-
-    def begin_episodes(self, run: Run) -> None:
-        begin_episodes(run)
-
-    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
-        return False
-
-    def carry_of(self, run: Run, progress: float) -> Carry:
-        action = run.action
-        if action is None:  # of its shape
-            action = spaces.random_action(run.env.action_space, run.env.n_envs, np.random.default_rng(0))
-        pending = sum(len(draw.position) for draw, _ in run.td_errors) // self.program.replay.batch_size
-        counts = Counts(
-            jnp.uint32(run.step), jnp.int32(run.owed), jnp.int32(run.steps_since_update), jnp.int32(pending)
-        )
-        carry = self.common_carry(run, counts, jnp.array(action))
-        if run.action is None:
-            run.action = np.array(self.compiled(first_action)(carry, np.float32(progress)))
-            carry = carry._replace(action=jnp.array(run.action))
-        return carry
-
-    def uploaded(self, run: Run) -> DeviceRing:
-        replay, buffer = self.program.replay, run.replay
-        ring = uploaded(replay, buffer.ring)
-        if buffer.priorities is None:
-            return ring
-        sizes = replay.most_updates, replay.batch_size
-        run.td_errors = [pair for pair in run.td_errors if pair[0].version == buffer.ring.version]
-        if not device_priorities.fit(run.td_errors, *sizes):
-            buffer.update_priorities(run.td_errors)
-            run.td_errors = []
-        return ring._replace(priorities=device_priorities.uploaded(buffer.priorities, run.td_errors, *sizes))
-
-    def saved(self, experience: DeviceRing, n_turns: int) -> DeviceRing:
-        size = rounded_up(2 * n_turns + 1, self.program.replay.rows)  # a turn may add a step and a new episode
-        return self.compiled(partial(rows_to_be_written, size, self.mesh, self.size))(experience)
-
-    def put_back(self, experience: DeviceRing, saved: DeviceRing) -> DeviceRing:
-        return self.compiled(partial(rows_put_back, self.mesh, self.size), donate_argnums=1)(experience, saved)
-
-    def download(self, run: Run, experience: DeviceRing, counts: Counts) -> None:
-        download(run.buffer.ring, experience)
-        priorities = experience.priorities
-        if priorities is None:
-            return
-        ring = run.buffer.ring
-        values = np.asarray(priorities.values)[: ring.rows * ring.n_envs]
-        run.buffer.priorities.load(values.astype(np.float64), float(priorities.largest))
-        run.td_errors = [
-            (Draw(position.astype(np.int64), time.astype(np.int64), ring.version), jnp.array(td_error))
-            for position, time, td_error in zip(
-                *(np.asarray(part)[: int(counts.pending)] for part in priorities.pending), strict=True
-            )
-        ]
-
-    def pull_counts(self, run: Run, carry: Carry) -> None:
-        run.action = np.array(carry.action)
-        run.owed, run.steps_since_update = int(carry.counts.owed), int(carry.counts.since_update)
-
-    def bad_batch(self, carry: Carry, experience: DeviceRing, clock: Clock, number: int) -> Transition:
-        return self.compiled(drawn)(experience, carry.key, clock, np.uint32(number + 1))
-
-
-def first_action(program: OffPolicyProgram, env: FunctionalEnv, carry: Carry, progress: Any) -> Array | None:
-    """Returns the first actions of a run."""
-    program = program.with_hyperparameters(carry.hyper)
-    clock = Clock(carry.counts.step, carry.episodes.n_finished, progress)
-    return choose(program, env, carry, program.packing.unpack(carry.state), clock).action
-
-
-def drawn(
-    program: OffPolicyProgram, env: FunctionalEnv, ring: DeviceRing, key: Array, clock: Clock, number: Any
-) -> Transition:
-    """Returns the batch of a gradient step of a turn."""
-    return draw(program.replay, env, ring, jax.random.fold_in(draws(key, clock.step), number), clock.progress)[0]
-
-
-def rows_to_be_written(
-    size: int, mesh: Mesh | None, n: int, program: OffPolicyProgram, env: Any, ring: DeviceRing
-) -> Any:
-    """Returns what a chunk may change of the replay buffers of ``n`` runs; see :meth:`DeviceReplay.next_rows`."""
-    return over_runs(lambda ring: program.replay.next_rows(ring, size), n, mesh, (0,), 0)(ring)
-
-
-def rows_put_back(
-    mesh: Mesh | None, n: int, program: OffPolicyProgram, env: Any, ring: DeviceRing, rows: Any
-) -> DeviceRing:
-    """Returns the replay buffers of ``n`` runs before a chunk."""
-    return over_runs(program.replay.with_rows, n, mesh, (0, 0), 0)(ring, rows)
-
-
 def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:
     """Returns how batches are drawn on the device from the replay buffer of a run."""
     buffer, hindsight = run.buffer, config.hindsight
@@ -289,15 +242,3 @@ def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:
         priorities=config.priorities,
         most_updates=1 if config.priorities is None else most_updates(config, ring.n_envs) or 1,
     )
-
-
-def rounded_up(n: int, most: int) -> int:
-    """Returns one of few sizes that is at least ``n``, and at most ``most``, since each is compiled.
-
-    >>> rounded_up(5, 10_000), rounded_up(70, 10_000), rounded_up(70, 100)
-    (64, 512, 100)
-    """
-    size = 64
-    while size < n:
-        size *= 8
-    return min(size, most)

@@ -17,8 +17,7 @@ from jax import Array
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core import Clock, Rollout
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.loops.device.program import Carry, Limits, Loop, Program, step_envs
-from rejeu.loops.device.trainer import DeviceTrainer, capacity_of
+from rejeu.loops.device.program import Carry, Limits, Loop, Program, capacity_of, step_envs
 from rejeu.loops.on_policy import begin_episodes
 from rejeu.loops.run import Run
 from rejeu.prng import nth
@@ -37,8 +36,13 @@ class Counts(NamedTuple):
 class OnPolicyProgram(Program):
     """Turns that fill a rollout, and updates on all of it."""
 
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout) -> Rollout:
-        return rollout_of(experience, jnp.int32(0))
+    @classmethod
+    def of(cls, run: Run, config: RolloutConfig, **settings: Any) -> OnPolicyProgram:
+        """Returns the program for runs like ``run``."""
+        return cls(config=config, capacity=capacity_of(run.env.n_envs), **settings)
+
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout, clock: Clock, number: Any) -> Rollout:
+        return rollout_of(experience, carry.counts.length)
 
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
         n_steps = self.config.n_steps
@@ -61,6 +65,50 @@ class OnPolicyProgram(Program):
 
         begin = (jnp.int32(0), loop, jnp.int32(0))
         return jax.lax.while_loop(lambda outer: may_go_on(*outer[:2]), one_rollout, begin)[1]
+
+    def begin_episodes(self, run: Run) -> None:
+        begin_episodes(run, self.config)
+
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        """Returns whether the rollout that is under way at the step ``last`` is learned from.
+
+        It begins in this chunk or holds the steps of the buffer.
+        """
+        n_steps, n_envs = self.config.n_steps, run.env.n_envs
+        if last is None or run.step + n_turns * n_envs < last:
+            return False
+        length = run.replay.length
+        turns, size = (length + n_turns) % n_steps, run.replay.size() + last - run.step
+        if length + n_turns >= n_steps:
+            size = turns * n_envs - (run.step + n_turns * n_envs - last)
+        return bool(turns) and self.config.learns_from_part(size, n_envs)
+
+    def counts_of(self, run: Run) -> Counts:
+        return Counts(jnp.uint32(run.step), jnp.int32(run.replay.length))
+
+    def action_of(self, run: Run) -> None:
+        return None
+
+    def rows_changed(self, n_turns: int) -> None:
+        return None
+
+    def uploaded(self, run: Run) -> Rollout:
+        steps: Any = jax.tree.map(jnp.array, run.replay.rollout())
+        return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
+
+    def download(self, run: Run, experience: Rollout, counts: Counts) -> None:
+        buffer, n = run.buffer, int(counts.length)
+        buffer.length = n
+        buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
+        if n:
+            own, found = (
+                jax.tree.leaves(one._replace(started=None, carry=None)) for one in (buffer.rollout(), experience)
+            )
+            for host, device in zip(own, found, strict=True):
+                host[:n] = np.asarray(device)[:n]
+
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        """Does nothing: the length of the rollout is copied with it."""
 
 
 def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
@@ -100,57 +148,3 @@ def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
 def rollout_of(steps: Rollout, length: Any) -> Rollout:
     """Returns the first ``length`` steps as the update takes them."""
     return steps._replace(valid=steps.valid & (jnp.arange(len(steps.valid)) < length)[:, None])
-
-
-class OnPolicyTrainer(DeviceTrainer):
-    """Trains runs with a rollout buffer. Mutable."""
-
-    def make_program(self, run: Run, config: RolloutConfig, **settings: Any) -> OnPolicyProgram:
-        return OnPolicyProgram(config=config, capacity=capacity_of(run.env.n_envs), **settings)
-
-    def begin_episodes(self, run: Run) -> None:
-        begin_episodes(run, self.program.config)
-
-    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
-        """Returns whether the rollout that is under way at the step ``last`` is learned from.
-
-        It begins in this chunk or holds the steps of the buffer.
-        """
-        n_steps, n_envs = self.program.config.n_steps, run.env.n_envs
-        if last is None or run.step + n_turns * n_envs < last:
-            return False
-        length = run.replay.length
-        turns, size = (length + n_turns) % n_steps, run.replay.size() + last - run.step
-        if length + n_turns >= n_steps:
-            size = turns * n_envs - (run.step + n_turns * n_envs - last)
-        return bool(turns) and self.program.config.learns_from_part(size, n_envs)
-
-    def carry_of(self, run: Run, progress: float) -> Carry:
-        return self.common_carry(run, Counts(jnp.uint32(run.step), jnp.int32(run.replay.length)), None)
-
-    def uploaded(self, run: Run) -> Rollout:
-        steps: Any = jax.tree.map(jnp.array, run.replay.rollout())
-        return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
-
-    def saved(self, experience: Rollout, n_turns: int) -> Rollout:
-        return experience  # which is not donated
-
-    def put_back(self, experience: Rollout, saved: Rollout) -> Rollout:
-        return saved
-
-    def download(self, run: Run, experience: Rollout, counts: Counts) -> None:
-        buffer, n = run.buffer, int(counts.length)
-        buffer.length = n
-        buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
-        if n:
-            own, found = (
-                jax.tree.leaves(one._replace(started=None, carry=None)) for one in (buffer.rollout(), experience)
-            )
-            for host, device in zip(own, found, strict=True):
-                host[:n] = np.asarray(device)[:n]
-
-    def pull_counts(self, run: Run, carry: Carry) -> None:
-        """Does nothing: the length of the rollout is copied with it."""
-
-    def bad_batch(self, carry: Carry, experience: Rollout, clock: Clock, number: int) -> Rollout:
-        return rollout_of(experience, carry.counts.length)

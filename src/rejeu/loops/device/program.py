@@ -1,4 +1,7 @@
-"""What the programs of all loops on the device share: chunks of turns, in which environments step and episodes are counted."""
+"""What the programs of all loops on the device share: chunks of turns, in which environments step and episodes are counted.
+
+A :class:`Program` also says how a run of the host becomes its arguments, and how experience comes back.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from rejeu import spaces
@@ -32,12 +36,20 @@ from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
 from rejeu.envs.masks import masked
 from rejeu.loops import nonfinite
-from rejeu.loops.device.actions import scale
 from rejeu.loops.learner import td_error_of
 from rejeu.loops.packing import Packing
+from rejeu.loops.run import Run
+from rejeu.prng import below
 
+MAX_TURNS = 1000
+"""Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
+LOG_SIZE = 2**18
+"""Entries of a chunk's log of episodes at most: turns times environments."""
 NO_LIMIT = 2**32 - 1
 """The value for no last step; steps are counted in ``uint32``."""
+
+Remake = Callable[[Any], tuple[Algorithm, Explorer]]
+"""Makes the algorithm of a configuration, and its exploration."""
 
 
 class Limits(NamedTuple):
@@ -180,16 +192,48 @@ class Program(ABC):
     """Whether updates that leave NaN are undone."""
     stops_at_episode: bool
     """Whether a chunk ends with the first turn in which an episode ends."""
-    remake: Callable[[Any], tuple[Algorithm, Explorer]] | None = None
+    remake: Remake | None = None
     """Makes the algorithm of a configuration, and its exploration, where hyperparameters differ between runs."""
 
     @abstractmethod
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: Any) -> Transition | Rollout:
-        """Returns what the algorithm learns from; only its shapes matter."""
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: Any, clock: Clock, number: Any) -> Any:
+        """Returns the batch of the ``number``-th gradient step of a turn that ends at ``clock``."""
 
     @abstractmethod
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
         """Returns what turns pass on, which are taken while ``may_go_on(number of turns, loop)``."""
+
+    @abstractmethod
+    def begin_episodes(self, run: Run) -> None:
+        """Starts an episode in every environment of a run."""
+
+    @abstractmethod
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        """Returns whether an incomplete rollout is learned from if the step ``last`` is reached in so many turns."""
+
+    @abstractmethod
+    def counts_of(self, run: Run) -> Any:
+        """Returns the counters of a run."""
+
+    @abstractmethod
+    def action_of(self, run: Run) -> Array | None:
+        """Returns :attr:`Carry.action`; where none was chosen yet, any of its shape."""
+
+    @abstractmethod
+    def rows_changed(self, n_turns: int) -> int | None:
+        """Returns how many rows of each environment so many turns may change in place, at least; None if they copy them."""
+
+    @abstractmethod
+    def uploaded(self, run: Run) -> Any:
+        """Returns the experience of a run, on the device."""
+
+    @abstractmethod
+    def download(self, run: Run, experience: Any, counts: Any) -> None:
+        """Copies experience on the device into the buffer of a run."""
+
+    @abstractmethod
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        """Copies what only this kind of learning counts into a run."""
 
     def chunk(self, env: FunctionalEnv, carry: Carry, experience: Any, limits: Limits) -> tuple[Carry, Any, Report]:
         """Returns carry, experience and report after a number of turns."""
@@ -235,7 +279,7 @@ class Program(ABC):
 
         def update(state: PyTree, carry: Carry, experience: Any) -> tuple[PyTree, Metrics]:
             clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
-            return self.algorithm.update(state, self.batch(env, carry, experience), clock)
+            return self.algorithm.update(state, self.batch(env, carry, experience, clock, 0), clock)
 
         _, found = jax.eval_shape(update, state, carry, experience)
         metrics = {name: jnp.float32(0) for name in found if name != TD_ERROR}
@@ -259,6 +303,11 @@ class Program(ABC):
         is_over = learned.in_a_row >= nonfinite.MAX_SKIPPED  # the turns after it, in the same chunk, do not count
         in_a_row = jnp.where(is_bad | is_over, learned.in_a_row + ~is_over, 0)
         return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
+
+
+def capacity_of(n_envs: int) -> int:
+    """Returns the turns of a chunk at most, for that number of environments."""
+    return max(min(MAX_TURNS, LOG_SIZE // n_envs), 1)
 
 
 def changed(config: Any, hyper: dict[str, Array]) -> Any:
@@ -350,3 +399,45 @@ def all_finite(*arrays: Array) -> Array:
     """Returns whether all numbers are finite, ``bool[]``."""
     floats = [jnp.isfinite(array).all() for array in arrays if jnp.issubdtype(array.dtype, jnp.floating)]
     return jnp.stack(floats).all() if floats else jnp.bool(True)
+
+
+def scale(space: gym.Space, action: Array) -> Array:
+    """Returns actions in the range of the environment, as :func:`rejeu.spaces.scale_action` does on the host.
+
+    Between bounds that are not symmetric about 0, the last bit may differ, because the host computes in 64 bits.
+
+    >>> scale(gym.spaces.Box(-2.0, 2.0, (1,)), jnp.array([[0.25], [3.0]])).tolist()
+    [[0.5], [2.0]]
+    """
+    if isinstance(space, gym.spaces.Box):
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        action = action.reshape(-1, *space.shape)
+        if space.dtype.kind != "f":
+            levels = jnp.floor(low[None] + (action + 1.0) * (0.5 * (high - low + 1.0))[None])
+            return jnp.clip(levels, low[None], high[None]).astype(jax.dtypes.canonicalize_dtype(space.dtype))
+        bounded = np.isfinite(low) & np.isfinite(high)
+        middle = np.where(bounded, 0.5 * (low + high), 0.0).astype(np.float32)
+        half = np.where(bounded, 0.5 * (high - low), 1.0).astype(np.float32)
+        scaled = jnp.clip(middle[None] + action * half[None], space.low[None], space.high[None])
+        return scaled.astype(jax.dtypes.canonicalize_dtype(space.dtype))
+    if isinstance(space, gym.spaces.Discrete):
+        return action.astype(jnp.int32) + int(space.start)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        starts = np.broadcast_to(space.start, space.nvec.shape).astype(np.int32)
+        return action.reshape(-1, *space.nvec.shape) + starts[None]
+    assert isinstance(space, gym.spaces.MultiBinary)
+    return action.reshape(-1, *space.shape).astype(jnp.int8)
+
+
+def random_action(space: gym.Space, n: int, key: Array) -> Array:
+    """Returns ``n`` uniformly random actions in the range of algorithms, like :func:`rejeu.spaces.random_action`."""
+    if isinstance(space, gym.spaces.Box):
+        bits = jax.random.bits(key, (n, int(np.prod(space.shape))), jnp.uint32)
+        return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-23) - 1.0
+    sizes: Any = {
+        gym.spaces.Discrete: lambda: np.int32(space.n),  # type: ignore[attr-defined]
+        gym.spaces.MultiDiscrete: lambda: space.nvec.ravel().astype(np.int32),  # type: ignore[attr-defined]
+        gym.spaces.MultiBinary: lambda: np.full(int(np.prod(space.shape)), 2, np.int32),  # type: ignore[arg-type]
+    }[type(space)]()
+    bits = jax.random.bits(key, (n, *sizes.shape), jnp.uint32)
+    return below(bits, sizes if sizes.ndim == 0 else sizes[None])

@@ -1,40 +1,41 @@
-"""Runs on the device: the arguments of the program, and what comes back to the host after a chunk."""
+"""Runs on the device: the arguments of the program, what comes back to the host after a chunk, and which devices share it.
+
+Several runs are the leading axis of all arrays. Each of several devices computes an equal number of them, apart from the
+others.
+"""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from rejeu.core import Algorithm, Clock, Explorer, Rollout, Transition
+from rejeu.core import Clock, PyTree
 from rejeu.envs.base import Step, success_by
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, joined, split
 from rejeu.envs.masks import functional_vector
 from rejeu.loops.checks import check_bounds, check_finite, check_obs
 from rejeu.loops.device.program import Carry, EpisodeLog, EpisodeState, Limits, Program, Report
-from rejeu.loops.device.sharding import copies, filled, mesh_of, over_runs, spread, unstacked
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Episode, Progress, Run
+from rejeu.xla import for_runs
 
-MAX_TURNS = 1000
-"""Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
-LOG_SIZE = 2**18
-"""Entries of a chunk's log of episodes at most: turns times environments."""
+T = TypeVar("T")
+RUNS = "runs"
+"""Name of the axis of runs."""
+MOST_ON_CPU = 8
+"""Runs that a CPU device computes at once at most: the layers of more do not fit into the cache of a core."""
 SHARED = ("counts", "valid")
 """Fields that are equal in all runs: counters, and which steps of a rollout count."""
-
-Remake = Callable[[Any], tuple[Algorithm, Explorer]]
-"""Makes the algorithm of a configuration, and its exploration."""
 
 
 @dataclass
@@ -46,114 +47,63 @@ class Group:
     """The replay buffers or rollouts, on the device."""
     report: Any = None
     """Of the last chunk, on the device."""
-    before: tuple[Any, Any] | None = None
-    """The carry before the last chunk, and what puts the experience back."""
+    before: tuple[Any, Callable[[Any], Any]] | None = None
+    """The carry before the last chunk, and the function that puts the experience back."""
 
 
-class DeviceTrainer(ABC):
+class DeviceTrainer:
     """Runs the compiled program and copies its results into each host ``Run``. Mutable.
 
-    Abstract: there is one for each kind of learning. Experience stays on the device until ``Run.replay`` is read.
+    Experience stays on the device until ``Run.replay`` is read.
     """
 
     def __init__(
         self,
+        program: Any,
         runs: Sequence[Run],
         learner: Learner,
-        config: Any,
-        stops_at_episode: bool,
         size: int = 1,
         devices: Sequence[jax.Device] = (),
-        remake: Remake | None = None,
         hyper: Sequence[dict[str, float]] | None = None,
     ) -> None:
         """Takes runs of equal settings in JAX environments.
 
         Args:
+            program: a :class:`Program`.
             runs: mutated.
             learner: keeps the compiled functions, so that later calls find them and they are collected with its agents.
-            config: the hyperparameters.
-            stops_at_episode: whether a chunk ends with the first turn in which an episode ends.
             size: the number of runs for which the program is compiled, a multiple of that of the devices that share them.
                 More runs are trained in groups, which take their chunks one after another.
             devices: which share several runs.
-            remake: makes the algorithm, if hyperparameters differ.
-            hyper: those that differ, by run.
+            hyper: hyperparameters that differ, by run.
         """
-        self.runs, self.learner, self.size = runs, learner, size
+        self.program, self.runs, self.learner, self.size = program, runs, learner, size
         self.env_arrays, self.env_static = split(vector_of(runs[0]).env)
         self.mesh: Mesh | None = mesh_of(size, devices)
         """The devices that share the runs; None if one computes all."""
         self.hyper = {id(run): one for run, one in zip(runs, hyper or [{}] * len(runs), strict=True)}
-        self.program: Any = self.make_program(
-            runs[0],
-            config,
-            algorithm=learner.algorithm,
-            explorer=learner.explorer,
-            packing=learner.packing,
-            n_envs=runs[0].env.n_envs,
-            skips=learner.skips,
-            stops_at_episode=stops_at_episode,
-            remake=remake,
-        )
         self.groups: list[Group] = []
         self.carries: dict[int, Carry] = {}
         """The carry after the last chunk by run, on the host apart from large arrays of a single run."""
         self.reports: dict[int, Report] = {}
         """Of the last chunk by run, on the host."""
 
-    @abstractmethod
-    def make_program(self, run: Run, config: Any, **settings: Any) -> Program:
-        """Returns what is compiled."""
-
-    @abstractmethod
-    def begin_episodes(self, run: Run) -> None:
-        """Starts an episode in every environment of a run."""
-
-    @abstractmethod
-    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
-        """Returns whether an incomplete rollout is learned from if the step ``last`` is reached in so many turns."""
-
-    @abstractmethod
     def carry_of(self, run: Run, progress: float) -> Carry:
         """Returns the carry of a run, which may choose its first actions."""
-
-    @abstractmethod
-    def uploaded(self, run: Run) -> Any:
-        """Returns the experience of a run, on the device."""
-
-    @abstractmethod
-    def saved(self, experience: Any, n_turns: int) -> Any:
-        """Returns what :meth:`put_back` needs to undo so many turns."""
-
-    @abstractmethod
-    def put_back(self, experience: Any, saved: Any) -> Any:
-        """Returns the experience as it was when it was saved, as far as :meth:`download` reads it."""
-
-    @abstractmethod
-    def download(self, run: Run, experience: Any, counts: Any) -> None:
-        """Copies experience on the device into the buffer of a run."""
-
-    @abstractmethod
-    def pull_counts(self, run: Run, carry: Carry) -> None:
-        """Copies what only this kind of learning counts into a run."""
-
-    @abstractmethod
-    def bad_batch(self, carry: Carry, experience: Any, clock: Clock, number: int) -> Transition | Rollout:
-        """Returns the batch of a gradient step that was left out in the last turn, the ``number``-th of the turn."""
-
-    def common_carry(self, run: Run, counts: Any, action: jax.Array | None) -> Carry:
-        """Returns the carry of a run with these counters."""
-        return Carry(
+        carry = Carry(
             state=run.state,
             key=jnp.asarray(run.key),
             explorer=jax.tree.map(jnp.asarray, run.carry),
-            action=action,
+            action=self.program.action_of(run),
             episodes=episodes_of(run),
-            counts=counts,
+            counts=self.program.counts_of(run),
             in_a_row=jnp.int32(0),
             hyper={name: jnp.float32(value) for name, value in self.hyper[id(run)].items()},
         )
+        if carry.action is not None and run.action is None:
+            run.action = np.array(self.compiled(first_action)(carry, np.float32(progress)))
+            carry = carry._replace(action=jnp.array(run.action))
+        return carry
 
     def push(self, progress: float, leader: Run) -> None:
         """Puts the runs onto the device, with the counters of ``leader``."""
@@ -163,10 +113,10 @@ class DeviceTrainer(ABC):
 
     def _pushed(self, runs: Sequence[Run], leader: Run, progress: float) -> Group:
         if self.size == 1:
-            experience = self.uploaded(runs[0])
+            experience = self.program.uploaded(runs[0])
             return Group(self.carry_of(runs[0], progress), experience)
-        experience = spread(lambda run: jax.device_get(self.uploaded(run)), runs, self.mesh)
-        experience = with_shared(experience, lambda: self.uploaded(leader))
+        experience = spread(lambda run: jax.device_get(self.program.uploaded(run)), runs, self.mesh)
+        experience = with_shared(experience, lambda: self.program.uploaded(leader))
         carry = spread(lambda run: self.carry_of(run, progress), runs, self.mesh)
         return Group(with_shared(carry, lambda: self.carry_of(leader, progress)), experience)
 
@@ -192,12 +142,16 @@ class DeviceTrainer(ABC):
 
     def start(self, group: Group, limits: Limits) -> None:
         """Starts a chunk of turns, and does not wait for it."""
-        saved = self.saved(group.experience, int(limits.n_turns))
-        options = {} if saved is group.experience else {"donate_argnums": 3}
+        before, n_rows, options = group.experience, self.program.rows_changed(int(limits.n_turns)), {}
+        back: Callable[[Any], Any] = lambda experience: before  # noqa: E731
+        if n_rows is not None:
+            rows = self.compiled(partial(next_rows, self.mesh, self.size, n_rows))(group.experience)
+            put_back = self.compiled(partial(with_rows, self.mesh, self.size), donate_argnums=1)
+            back, options = lambda experience: put_back(experience, rows), {"donate_argnums": 3}
         chunk = self.compiled(partial(take_chunk, self.mesh, self.size), **options)
-        before = group.carry, saved
-        group.carry, group.experience, group.report = chunk(group.carry, limits, group.experience)
-        group.before = before
+        carry = group.carry
+        group.carry, group.experience, group.report = chunk(carry, limits, group.experience)
+        group.before = carry, back
 
     def finish(self, g: int) -> None:
         """Waits for the chunk of a group, and copies what it did to the host, apart from experience."""
@@ -218,8 +172,8 @@ class DeviceTrainer(ABC):
         """Puts carries and experience of all runs back before the last chunk, of which nothing was pulled."""
         for group in self.groups:
             if group.before is not None:
-                (group.carry, saved), group.before = group.before, None
-                group.experience = self.put_back(group.experience, saved)
+                (group.carry, back), group.before = group.before, None
+                group.experience = back(group.experience)
 
     def fault(self, which: int) -> bool:
         """Returns whether the last chunk left something that is not finite in a run."""
@@ -238,7 +192,7 @@ class DeviceTrainer(ABC):
         if report.n_updates:
             values = [*report.metrics.values(), report.n_bad]
             run.metrics = Readings(tuple(report.metrics), np.array(values, np.float32))  # type: ignore[arg-type]
-        self.pull_counts(run, carry)
+        self.program.pull_counts(run, carry)
         run.fetch = partial(self._fetch, which)
         self.groups[which // self.size].before = None
         if run.step >= run.next_look:
@@ -250,7 +204,7 @@ class DeviceTrainer(ABC):
         """Copies the experience of a run to its buffer on the host."""
         group = self.groups[which // self.size]
         experience = group.experience if self.size == 1 else of_run(group.experience, which % self.size)
-        self.download(self.runs[which], experience, copies(group.carry.counts))
+        self.program.download(self.runs[which], experience, copies(group.carry.counts))
 
     def raise_fault(self, which: int, limits: Limits) -> NoReturn:
         """Raises the error of a chunk of which nothing was pulled; the run is put before the fault.
@@ -305,7 +259,7 @@ class DeviceTrainer(ABC):
         self._repeat(limits._replace(most_updates=np.int32(number)), in_a_row)
         carry, group = self.carries[0], self.groups[0]
         clock = Clock(carry.counts.step, carry.episodes.n_finished, limits.progress[1])
-        batch = copies(self.bad_batch(group.carry, group.experience, clock, number))
+        batch = copies(self.compiled(bad_batch)(group.carry, group.experience, clock, np.uint32(number)))
         before = None if self.program.skips else group.carry.state
         raise NonFiniteUpdate(before, batch, clock, skipped, run.n_updates + number)
 
@@ -324,6 +278,28 @@ def take_chunk(
     return over_runs(one, n, mesh, axes, (axes[0], axes[2], 0))(carry, limits, experience)
 
 
+def first_action(program: Program, env: FunctionalEnv, carry: Carry, progress: Any) -> jax.Array | None:
+    """Returns the first actions of a run."""
+    program = program.with_hyperparameters(carry.hyper)
+    clock = Clock(carry.counts.step, carry.episodes.n_finished, progress)
+    return program.choose(env, carry, program.packing.unpack(carry.state), clock).action  # type: ignore[attr-defined]
+
+
+def bad_batch(program: Program, env: FunctionalEnv, carry: Carry, experience: Any, clock: Clock, number: Any) -> Any:
+    """Returns the batch of a gradient step that was left out in the last turn, the ``number``-th of the turn."""
+    return program.batch(env, carry, experience, clock, number)
+
+
+def next_rows(mesh: Mesh | None, n: int, size: int, program: Any, env: Any, experience: Any) -> Any:
+    """Returns what a chunk may change in the replay buffers of ``n`` runs; see :meth:`DeviceReplay.next_rows`."""
+    return over_runs(lambda ring: program.replay.next_rows(ring, size), n, mesh, (0,), 0)(experience)
+
+
+def with_rows(mesh: Mesh | None, n: int, program: Any, env: Any, experience: Any, rows: Any) -> Any:
+    """Returns the replay buffers of ``n`` runs before a chunk."""
+    return over_runs(program.replay.with_rows, n, mesh, (0, 0), 0)(experience, rows)
+
+
 def axes_of(tree: Any) -> Any:
     """Returns for each field of a carry or of experience 0, or None if all runs share it."""
     return type(tree)(**{name: None if name in SHARED else 0 for name in tree._fields})
@@ -340,11 +316,6 @@ def with_shared(tree: Any, make: Callable[[], Any]) -> Any:
     names = [name for name in tree._fields if name in SHARED]
     of_one = make() if names else None
     return tree._replace(**{name: getattr(of_one, name) for name in names})
-
-
-def capacity_of(n_envs: int) -> int:
-    """Returns the turns of a chunk at most, for that number of environments."""
-    return max(min(MAX_TURNS, LOG_SIZE // n_envs), 1)
 
 
 def vector_of(run: Run) -> JaxVector:
@@ -399,3 +370,90 @@ def episodes_in(run: Run, log: EpisodeLog, first_step: int, last_step: int) -> l
         step = min(first_step + (turn + 1) * run.env.n_envs, last_step)
         episodes.append(Episode(step, env, value, int(log.length[turn, env]), success, run.seconds["total"]))
     return episodes
+
+
+def mesh_of(n_runs: int, devices: Sequence[jax.Device]) -> Mesh | None:
+    """Returns the devices that share so many runs; None if one computes all."""
+    used = np.array(devices[:n_runs])
+    return Mesh(used, (RUNS,)) if len(used) > 1 else None
+
+
+def filled(runs: Sequence[T], size: int) -> list[T]:
+    """Returns the runs, and the first one again until there are ``size``.
+
+    What the additional ones compute is not used. It takes no time, because other devices are busy as long.
+
+    >>> filled("abc", 4)
+    ['a', 'b', 'c', 'a']
+    """
+    return [*runs, *[runs[0]] * (size - len(runs))]
+
+
+def group_size(n_runs: int, devices: Sequence[jax.Device]) -> int:
+    """Returns how many runs are computed at once: a multiple of the number of devices that share them."""
+    n_devices = min(max(len(devices), 1), n_runs)
+    of_each = -(-n_runs // n_devices)
+    is_cpu = not devices or devices[0].platform == "cpu"
+    n_groups = -(-of_each // MOST_ON_CPU) if is_cpu else 1
+    return n_devices * -(-of_each // n_groups)
+
+
+def spread(make: Callable[[T], PyTree], runs: Sequence[T], mesh: Mesh | None) -> PyTree:
+    """Returns the trees that ``make`` returns for the runs as one, whose leaves have a leading axis of runs.
+
+    The number of runs must be a multiple of the number of devices, each of which gets its share.
+    """
+    if mesh is None:
+        return stacked([make(run) for run in runs])
+    size, sharding = len(runs) // mesh.size, NamedSharding(mesh, PartitionSpec(RUNS))
+    shares = [
+        jax.device_put(stacked([make(run) for run in runs[i * size : (i + 1) * size]]), device)
+        for i, device in enumerate(mesh.devices)
+    ]
+
+    def joined(*parts: jax.Array) -> jax.Array:
+        return jax.make_array_from_single_device_arrays((len(runs), *parts[0].shape[1:]), sharding, parts)
+
+    return jax.tree.map(joined, *shares)
+
+
+def over_runs(
+    function: Callable[..., Any], n: int, mesh: Mesh | None, in_axes: Any, out_axes: Any
+) -> Callable[..., Any]:
+    """Returns ``function`` of one run for all: ``jax.vmap``, and each device computes its share.
+
+    Args:
+        function: of one run.
+        n: the number of runs; a single one has no axis.
+        mesh: the devices.
+        in_axes: 0 for arguments with an axis of runs, None for those without one; trees as for ``jax.vmap``.
+        out_axes: likewise of the results.
+    """
+    if n == 1:
+        return function
+    mapped = jax.vmap(for_runs(function, n if mesh is None else n // mesh.size), in_axes, out_axes)
+    if mesh is None:
+        return mapped
+    spec = lambda axis: PartitionSpec() if axis is None else PartitionSpec(RUNS)  # noqa: E731
+    specs = lambda axes: jax.tree.map(spec, axes, is_leaf=lambda axis: axis is None)  # noqa: E731
+    return jax.shard_map(mapped, mesh=mesh, in_specs=specs(in_axes), out_specs=specs(out_axes), check_vma=False)
+
+
+def stacked(trees: Sequence[PyTree]) -> PyTree:
+    """Returns trees of equal structure as one on the device, whose leaves have a leading axis."""
+
+    def joined(*leaves: Any) -> jax.Array:
+        on_host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
+        return jnp.array(np.stack(leaves)) if on_host else jnp.stack(leaves)
+
+    return jax.tree.map(joined, *trees)
+
+
+def unstacked(tree: PyTree, n: int) -> list[PyTree]:
+    """Returns the ``n`` trees of which :func:`stacked` made one; a single one has no leading axis."""
+    return [tree] if n == 1 else [jax.tree.map(lambda leaf, i=i: leaf[i], tree) for i in range(n)]
+
+
+def copies(tree: PyTree) -> PyTree:
+    """Returns copies of arrays on the host."""
+    return jax.tree.map(np.array, jax.device_get(tree))
