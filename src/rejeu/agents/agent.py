@@ -10,8 +10,9 @@ import jax
 import numpy as np
 
 from rejeu import devices, spaces
-from rejeu.agents import model_files, outputs, policy, resume, training
+from rejeu.agents import exporting, model_files, outputs, policy, resume, training
 from rejeu.agents.base import BaseAgent
+from rejeu.agents.exporting import Exported, Target
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
 from rejeu.envs import seeds
@@ -191,6 +192,32 @@ class Agent(BaseAgent):
             return self.last_saved
 
         return write
+
+    def export(
+        self, path: str | Path, to: Target | None = None, *, noise: bool = False, batch: int | None = None
+    ) -> Exported:
+        """Writes the policy to a file that acts as :meth:`predict` does, outside of rejeu.
+
+        It takes raw observations, one input for each array, and returns actions of the environment: normalization, scaling
+        and clipping are inside. The state of a recurrent policy and action masks are inputs. Before the file is kept it is
+        compared with ``predict(deterministic=True)`` on 1,000 observations, recorded in a new environment, or sampled from
+        the observation space if none can be made. A card in JSON is written beside it.
+
+        Args:
+            path: of the file. An older one is replaced only when the new one is complete.
+            to: ``"onnx"``, ``"c"`` or ``"stablehlo"``; None goes by the suffix: ``.onnx``, ``.c`` (with a header beside it) or
+                ``.stablehlo``.
+            noise: sample from the policy, with the random numbers as further inputs; else take its mode.
+            batch: observations at once; None for any number. C takes one.
+
+        Raises:
+            ValueError: if a part of the policy cannot be expressed in the format, or the file acts otherwise than
+                ``predict``; nothing is written then.
+            MissingExtra: if ``onnx`` is not installed.
+            OSError: if the file cannot be written.
+        """
+        with devices.chosen(self.device):
+            return exporting.export(self, path, to, noise, batch)
 
     @classmethod
     def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:

@@ -235,6 +235,27 @@ class Evaluate(RunOptions):
 
 
 @dataclass(frozen=True)
+class Export(RunOptions):
+    """Writes the policy of a trained agent to a file that acts without rejeu: ONNX, C or StableHLO.
+
+    The file is compared with predict on 1,000 observations before it is kept. Example: rejeu export runs/NAME --to onnx
+    """
+
+    run: ModelPath
+    to: Annotated[Literal["onnx", "c", "stablehlo"] | None, Shown("{onnx,c,stablehlo}")] = None
+    """Format; by default that of the suffix of --out, else onnx."""
+    out: Annotated[Path | None, Shown("PATH")] = None
+    """File to write, or an existing folder; by default policy.onnx, .c or .stablehlo in the folder of the run, or
+    next to the model under its name."""
+    noise: bool = False
+    """Sample from the policy, with the random numbers as inputs, instead of taking its mode."""
+    batch: Count = None
+    """Observations at once; by default any number. C takes one."""
+    which: Which = "best"
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Record(RunOptions):
     """Records a video of a few episodes of a trained agent in the environment's own package."""
 
@@ -428,6 +449,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "sweep": Sweep,
     "evaluate": Evaluate,
     "record": Record,
+    "export": Export,
     "play": Play,
     "watch": Watch,
     "check": Check,
@@ -445,6 +467,7 @@ MODULES = {
     "compare": "runs",
     "course": "courses",
     "evaluate": "models",
+    "export": "models",
     "pbt": "tune",
     "play": "models",
     "record": "models",

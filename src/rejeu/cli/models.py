@@ -1,4 +1,4 @@
-"""``rejeu evaluate``, ``record``, ``watch`` and ``play``: a trained agent, or a person, plays."""
+"""``rejeu evaluate``, ``record``, ``export``, ``watch`` and ``play``: a trained agent, or a person, plays."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from rejeu import devices
 from rejeu.agents import load
+from rejeu.agents.exporting import SUFFIXES, export, target_of
 from rejeu.cli import environment
-from rejeu.cli.commands import Evaluate, Play, Record, Watch
+from rejeu.cli.commands import Evaluate, Export, Play, Record, Watch
 from rejeu.cli.output import echo
+from rejeu.errors import CheckpointError
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.video import record_video
 from rejeu.runs.folder import RunFolder, find_model
@@ -48,6 +50,27 @@ def run_record(arguments: Record) -> tuple[int, dict[str, Any]]:
     path = record_video(load(model), out, env=made.rendering, episodes=arguments.episodes, seed=arguments.seed)
     echo(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {made}")
     return 0, {"video": path, "episodes": arguments.episodes, "model": model, "env_id": made.env_id}
+
+
+def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
+    """Writes the policy of an agent to a file of another format, and prints how it compares with ``predict``."""
+    model = find_model(arguments.run, arguments.which)
+    out, to = arguments.out, arguments.to
+    if out is None or out.is_dir():
+        to = to or "onnx"
+        beside = model.parent / "policy" if arguments.run.is_dir() else model.with_suffix("")
+        out = (beside if out is None else out / beside.name).with_suffix(SUFFIXES[to])
+    target_of(out, to)  # an error before the agent is loaded
+    make_env = None
+    try:
+        make_env = environment.environment_of(model, arguments).make
+    except (CheckpointError, ImportError, ValueError) as error:
+        if arguments.env is not None:
+            raise
+        echo(f"the observations are sampled from the observation space, because there is no environment: {error}")
+    found = export(load(model), out, to, arguments.noise, arguments.batch, make_env, str(arguments.run))
+    echo(found)
+    return 0, found.to_dict()
 
 
 def run_watch(arguments: Watch) -> tuple[int, dict[str, Any]]:

@@ -1,0 +1,262 @@
+"""``agent.export``: an agent's policy as a file of another format, compared with ``predict`` before it is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from rejeu import spaces
+from rejeu.agents.base import BaseAgent
+from rejeu.core import Masked
+from rejeu.envs.make import VectorEnv
+from rejeu.envs.masks import mask_leaf
+from rejeu.envs.registry import maker, register
+from rejeu.export import c_file, check, stablehlo_file
+from rejeu.export.check import Check, Recording, Run
+from rejeu.export.contract import CARD, Policy, policy_of
+from rejeu.io import atomic
+from rejeu.loops import nonfinite
+
+Target = Literal["onnx", "c", "stablehlo"]
+SUFFIXES: dict[str, str] = {"onnx": ".onnx", "c": ".c", "stablehlo": ".stablehlo"}
+"""Of the file of each format."""
+MOST_SECONDS = 60.0
+"""Wall time after which no further observation is recorded, in a slow environment."""
+
+
+class Exported(NamedTuple):
+    """What :meth:`rejeu.SAC.export` has written."""
+
+    path: Path
+    """Of the file."""
+    card: Path
+    """Of the card about it: names, shapes, dtypes and bounds of what it takes and returns, its origin, and the check."""
+    target: str
+    """The format."""
+    bytes: int
+    """Size of the file."""
+    check: Check | None
+    """How it compares with ``predict``; None if what runs such a file is not installed."""
+    note: str = ""
+    """Why it was not checked."""
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.bytes / 1000:,.1f} kB; {self.note or self.check}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns it as JSON values."""
+        return {**self._asdict(), "check": None if self.check is None else self.check._asdict()}
+
+
+def target_of(path: Path, to: str | None) -> str:
+    """Returns the format of a file: ``to``, or that of the suffix of ``path``.
+
+    Raises:
+        ValueError: if there is no such format.
+    """
+    found = to if to is not None else next((key for key, suffix in SUFFIXES.items() if suffix == path.suffix), None)
+    if found not in SUFFIXES:
+        wrong = f"to={to!r}" if to is not None else f"the suffix of {str(path)!r}"
+        raise ValueError(
+            f"{wrong} is no format that a policy can be exported to; there are "
+            + ", ".join(f"{key} ({suffix})" for key, suffix in SUFFIXES.items())
+        )
+    return found
+
+
+def export(
+    agent: BaseAgent,
+    path: str | Path,
+    to: Target | None,
+    noise: bool,
+    batch: int | None,
+    make_env: Callable[[], Any] | None = None,
+    source: str = "",
+) -> Exported:
+    """Writes the policy of an agent; the arguments are those of :meth:`rejeu.SAC.export`.
+
+    Args:
+        agent: the agent.
+        path: of the file.
+        to: the format; None goes by the suffix.
+        noise: sample from the policy instead of taking its mode, with the random numbers as inputs.
+        batch: observations at once.
+        make_env: makes an environment in which observations are recorded; None for that of the agent.
+        source: the run or model it is from, for the card.
+    """
+    path = Path(path)
+    target = target_of(path, to)
+    path = path if path.suffix else path.with_suffix(SUFFIXES[target])
+    if target == "c":
+        if batch not in (None, 1):
+            raise ValueError(f"batch={batch}: {target} takes one observation at a time; leave it out")
+        batch = 1
+    elif batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 1):
+        raise ValueError(f"batch={batch!r} must be a number of observations, or None for any number")
+    made = policy_for(agent, noise, batch)
+    one = made if batch == 1 else policy_for(agent, noise, 1)
+    recording, duration = record(agent, one, make_env)
+    card = card_of(agent, made, target, source, duration)
+    contents, run = written(made, one, card, target, path.stem)
+    found = None if run is None else check.compare(one, recording, run)
+    if found is not None and not found.difference <= check.LARGEST_DIFFERENCE:
+        raise ValueError(
+            f"the {target} file differs from predict by {found.difference:.3g}, more than {check.LARGEST_DIFFERENCE:g}, "
+            f"on {found.n} observations ({found.source}), and was not kept; please report this with the model"
+        )
+    note = "" if run is not None else f"not checked, because {MISSING[target]} is not installed"
+    about = {**card, "sha256": hashlib.sha256(contents[0]).hexdigest(), "check": found and found._asdict()}
+    card_path = path.with_name(f"{path.name}.json")
+    files = [path, path.with_suffix(".h")][: len(contents)]
+    for file, content in [*zip(files, contents, strict=True), (card_path, json.dumps(about, indent=1).encode())]:
+        with atomic.replacing(file) as out:
+            out.write(content)
+    return Exported(path, card_path, target, len(contents[0]), found, note)
+
+
+MISSING = {"onnx": "onnxruntime", "c": "a C compiler (cc, gcc or clang)", "stablehlo": "JAX"}
+"""What runs the files of each format."""
+
+
+def written(
+    made: Policy, one: Policy, card: dict[str, Any], target: str, stem: str
+) -> tuple[tuple[bytes, ...], Run | None]:
+    """Returns the contents of the files of a policy, and the run of the first; None if it cannot be run here.
+
+    Args:
+        made: the policy.
+        one: the same for one observation at a time.
+        card: about it.
+        target: the format.
+        stem: the name of the files without suffix.
+    """
+    single = made.batch in (None, 1)
+    if target == "c":
+        c, header = c_file.write(one, card, stem)
+        return (c, header), check.c_run(one, c, header, stem)
+    if target == "stablehlo":
+        content = stablehlo_file.write(made, card)
+        again = content if single else stablehlo_file.write(one, card)
+        return (content,), check.one_by_one(one, stablehlo_file.read(again))
+    from rejeu.export import onnx_file  # needs an extra
+
+    content = onnx_file.write(made, card)
+    return (content,), check.onnx_run(one, content if single else onnx_file.write(one, card))
+
+
+def policy_for(agent: BaseAgent, noise: bool, batch: int | None) -> Policy:
+    """Returns the policy of an agent as a program."""
+    algorithm = agent.learner.algorithm
+    mask = mask_leaf(agent.action_space, "the environment") if agent.takes_masks else None
+    actor = jax.tree.map(np.asarray, algorithm.actor(agent.state))
+    return policy_of(algorithm, actor, agent.observation_space, agent.action_space, mask, batch, noise)
+
+
+def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
+    """Returns the contract of a policy in JSON values."""
+    nonfinite.settle(agent)
+    weights = hashlib.sha256()
+    for array in jax.tree.leaves(agent.learner.algorithm.actor(agent.state)):
+        weights.update(np.ascontiguousarray(array).tobytes())
+    env = agent.run.env
+    wide = target in ("onnx", "c")
+    narrow = lambda port: port if wide else port._replace(dtype=spaces.narrow(port.dtype))  # noqa: E731
+    return {
+        "card": CARD,
+        "rejeu": metadata.version("rejeu"),
+        "target": target,
+        "algorithm": agent.name,
+        "env_id": env.env_id if env is not None else agent.trained_on and agent.trained_on[0],
+        "source": source,
+        "seed": agent.seed,
+        "steps": agent.run.step,
+        "weights": weights.hexdigest(),
+        "seconds_per_step": duration,
+        "batch": "free" if made.batch is None else made.batch,
+        "inputs": [narrow(port).to_json() for port in made.inputs],
+        "outputs": [narrow(port).to_json() for port in made.outputs],
+        "versions": {"jax": jax.__version__, "numpy": np.__version__},
+    }
+
+
+def record(agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None) -> tuple[Recording, float | None]:
+    """Returns observations with the actions of ``predict``, and the duration of a step in seconds if it is known.
+
+    They are recorded in a new environment like those it was trained on, in which the agent acts; where none can be made,
+    they are samples of the observation space.
+    """
+    vector, duration = environment(agent, make_env)
+    ports = [port for port in one.inputs if port.role in ("observation", "action_mask")]
+    rows: list[list[np.ndarray]] = []
+    actions, starts = [], []
+    rng, end = np.random.default_rng(0), time.perf_counter() + MOST_SECONDS
+    agent.observation_space.seed(0)
+    memory, ended = None, np.ones(1, bool)
+    obs = vector.reset(0) if vector is not None else _sample(agent, one, rng)
+    try:
+        while len(rows) < check.OBSERVATIONS and time.perf_counter() < end:
+            arrays = [np.array(array[0]) for array in jax.tree.leaves(obs)]
+            action, memory = agent.predict(obs, memory, ended, deterministic=True)  # type: ignore[attr-defined]
+            rows.append(arrays)
+            actions.append(action[0])
+            starts.append(bool(ended[0]))
+            if vector is None:
+                obs, ended = _sample(agent, one, rng), np.array([len(rows) % 100 == 0])
+                continue
+            step = vector.step(action)
+            ended = step.terminated | step.truncated
+            obs = vector.reset_done(ended) if ended.any() else step.obs
+    finally:
+        if vector is not None:
+            vector.close()
+    columns = zip(ports, zip(*rows, strict=True), strict=True)
+    inputs = {port.name: np.stack(column).astype(port.dtype) for port, column in columns}
+    inputs |= {port.name: np.array(starts) for port in one.of("episode_start")}
+    for port in one.of("noise"):  # with these numbers a sample is the mode
+        number = 0.0 if port.drawn == "normal" else 0.5
+        inputs[port.name] = np.full((len(rows), *port.shape), number, port.dtype)
+    return Recording(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration
+
+
+def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:
+    """Returns a new environment like those of training, None if none can be made, and the duration of its steps."""
+    made_from = agent.trained_on if agent.run.env is None else agent.run.env.made_from
+    if make_env is None and made_from is not None and register(made_from[0]):
+        make_env = maker(made_from[0], **made_from[1])
+    if make_env is None:
+        return None, None
+    env = make_env()
+    vector = agent.make_envs(env, 1, seed=0)
+    agent.check_spaces(vector, "the environment to record observations in")
+    return vector, seconds_per_step(env)
+
+
+def seconds_per_step(env: Any) -> float | None:
+    """Returns the duration of a step in the time of an environment, None if it does not say."""
+    inner = env.unwrapped
+    config = getattr(inner, "config", None)
+    if isinstance(config, dict) and "policy_frequency" in config:  # highway-env
+        return 1.0 / float(config["policy_frequency"])
+    found = next((value for name in ("dt", "tau") if isinstance(value := getattr(inner, name, None), float)), None)
+    return None if found is None else float(found)
+
+
+def _sample(agent: BaseAgent, one: Policy, rng: np.random.Generator) -> Any:
+    """Returns a batch of one sample of the observation space, with a mask if the agent takes masks."""
+    obs = jax.tree.map(
+        lambda part: np.asarray(part)[None], spaces.plain(agent.observation_space, agent.observation_space.sample())
+    )
+    masks = one.of("action_mask")
+    if not masks:
+        return obs
+    mask = rng.random((1, *masks[0].shape)) < 0.7
+    mask[:, 0] = True
+    return Masked(obs, mask)

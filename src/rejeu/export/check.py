@@ -1,0 +1,245 @@
+"""Files compared with ``predict`` on recorded observations, one at a time, and their latency."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rejeu.export.c_file import TYPES, identifier, size
+from rejeu.export.contract import Policy
+from rejeu.export.program import Value
+
+LARGEST_DIFFERENCE = 1e-5
+"""A file whose actions differ by more is not kept. Of an action with bounds in halves of its range, if these are above 1; of
+one without bounds relative to its size, if that is above 1."""
+OBSERVATIONS = 1000
+DECISIVE = ("argmax", "floor", "gt")
+"""Primitives that make whole numbers of others."""
+COMPILERS = ("cc", "gcc", "clang")
+
+
+class Recording(NamedTuple):
+    """Observations, in the order in which a policy saw them, and its actions."""
+
+    inputs: dict[str, np.ndarray]
+    """By the names of the policy's inputs, ``(n, *shape)``; without the state."""
+    actions: np.ndarray
+    """Of ``predict``, ``(n, *shape)``."""
+    source: str
+    """Where they are from, such as the id of an environment."""
+
+
+class Check(NamedTuple):
+    """How a file compares with ``predict``."""
+
+    n: int
+    """Number of observations."""
+    source: str
+    """Where they are from."""
+    difference: float
+    """The largest between two numbers of actions; of whole numbers 0, unless two choices are not equally good."""
+    ties: int
+    """Number of observations with another choice, of two whose values differ by less than 1e-5."""
+    p50: float
+    """Median time for one observation, in microseconds."""
+    p99: float
+    """The time that 99 % of the calls need at most."""
+
+    def __str__(self) -> str:
+        ties = f", {self.ties} ties" if self.ties else ""
+        return (
+            f"largest difference from predict {self.difference:.2g}{ties} ({self.n:,} observations, {self.source}); "
+            f"{self.p50:.3g} us for an observation, 99 % within {self.p99:.3g} us"
+        )
+
+
+Run = Callable[[Mapping[str, np.ndarray]], tuple[np.ndarray, np.ndarray]]
+"""Returns actions ``(n, *shape)`` and times in seconds ``(n,)`` for inputs ``(n, *shape)`` in order."""
+
+
+def compare(policy: Policy, recording: Recording, run: Run) -> Check:
+    """Returns how a file compares with ``predict``.
+
+    Args:
+        policy: what was exported, for one observation at a time.
+        recording: what it is compared with.
+        run: of the file.
+    """
+    actions, seconds = run(recording.inputs)
+    expected = recording.actions
+    p50, p99 = (float(1e6 * np.percentile(seconds, q)) for q in (50, 99))
+    if expected.dtype.kind != "f":
+        differing = (actions != expected).reshape(len(actions), -1).any(axis=1)
+        ties = [is_tie(policy, recording.inputs, int(i)) for i in np.flatnonzero(differing)]
+        return Check(len(actions), recording.source, 0.0 if all(ties) else 1.0, sum(ties), p50, p99)
+    low, high = (np.asarray(one, np.float64) for one in (policy.outputs[0].low, policy.outputs[0].high))
+    with np.errstate(invalid="ignore"):
+        half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.abs(expected))
+    difference = np.abs(actions - expected.astype(np.float64)) / np.maximum(half, 1.0)
+    return Check(len(actions), recording.source, float(difference.max(initial=0.0)), 0, p50, p99)
+
+
+def is_tie(policy: Policy, inputs: Mapping[str, np.ndarray], row: int) -> bool:
+    """Returns whether the best choices for an observation are equally good, up to 1e-5.
+
+    A policy with memory is taken at the start of an episode, so there only such ties are seen.
+    """
+    decisive = [one for one in policy.program.operations if one.name in DECISIVE]
+    arrays = [inputs[port.name][row][None] if port.name in inputs else _zeros(value) for port, value in _pairs(policy)]
+    found = policy.program.ending_in([operation.inputs[0] for operation in decisive])(*arrays)
+    for operation, value in zip(decisive, map(np.asarray, found), strict=True):
+        allowed = LARGEST_DIFFERENCE * max(1.0, float(np.abs(value[np.abs(value) < 1e8]).max(initial=0.0)))
+        if operation.name == "argmax":
+            first, second = np.moveaxis(np.sort(value, axis=operation.params["axes"][0]), -1, 0)[[-1, -2]]
+            distance = first - second
+        else:
+            distance = np.abs(value - np.round(value)) if operation.name == "floor" else np.abs(value)
+        if (distance < allowed).any():
+            return True
+    return False
+
+
+def _pairs(policy: Policy) -> Any:
+    return zip(policy.inputs, policy.program.arguments, strict=True)
+
+
+def _zeros(value: Value) -> np.ndarray:
+    return np.zeros([one if one != -1 else 1 for one in value.sizes], value.dtype)
+
+
+def one_by_one(policy: Policy, call: Callable[[dict[str, np.ndarray]], Mapping[str, Any]]) -> Run:
+    """Returns the run of a function from inputs to outputs by name, which is given one observation at a time."""
+    state = policy.of("state")
+
+    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        memory = {port.name: np.zeros((1, *port.shape), port.dtype) for port in state}
+        actions, seconds = [], []
+        n = len(next(iter(inputs.values())))
+        for i in range(-1, n):  # the first once more, to compile
+            given = {name: array[max(i, 0)][None] for name, array in inputs.items()}
+            start = time.perf_counter()
+            found = {name: np.asarray(one) for name, one in call(given | memory).items()}
+            if i >= 0:
+                seconds.append(time.perf_counter() - start)
+                actions.append(found["action"][0])
+                memory = {port.name: found[f"next_{port.name}"] for port in state}
+        return np.array(actions), np.array(seconds)
+
+    return run
+
+
+def onnx_run(policy: Policy, content: bytes) -> Run | None:
+    """Returns the run of an ONNX model; None without ONNX Runtime."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    names = [port.name for port in policy.outputs]
+    return one_by_one(policy, lambda inputs: dict(zip(names, session.run(names, inputs), strict=True)))
+
+
+def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str | None = None) -> Run | None:
+    """Returns the run of a C file; None without a compiler.
+
+    Raises:
+        RuntimeError: if it does not compile without warnings.
+    """
+    compiler = compiler or next((one for one in COMPILERS if shutil.which(one)), None)
+    if compiler is None:
+        return None
+
+    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / f"{stem}.c").write_bytes(source)
+            (folder / f"{stem}.h").write_bytes(header)
+            (folder / "main.c").write_text(main_of(policy, stem), encoding="utf-8")
+            options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", f"{stem}.c"]
+            for arguments in (options, ["-O2", "main.c", f"{stem}.o", "-lm", "-o", "main"]):
+                made = subprocess.run([compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+                if made.returncode:
+                    raise RuntimeError(f"{compiler} does not compile the C file: {made.stderr[:1000]}")
+            given = [port for port in policy.inputs if port.role != "state"]
+            n = len(next(iter(inputs.values())))
+            parts = [np.ascontiguousarray(inputs[p.name].reshape(n, -1), p.dtype).view(np.uint8) for p in given]
+            rows = np.concatenate(parts, axis=1)
+            found = subprocess.run([folder / "main"], input=rows.tobytes(), capture_output=True, check=True).stdout
+        action = policy.outputs[0]
+        made_of = np.dtype([("action", action.dtype, action.shape), ("seconds", "f8")])
+        result = np.frombuffer(found, made_of)
+        return result["action"], result["seconds"]
+
+    return run
+
+
+def main_of(policy: Policy, stem: str) -> str:
+    """Returns a program that reads inputs from standard input, and writes actions and times to standard output."""
+    name, given = identifier(stem), [port for port in policy.inputs if port.role != "state"]
+    lines, arguments = [], []
+    for i, port in enumerate(given):
+        kind = "uint8_t" if port.role == "episode_start" else TYPES[port.dtype]
+        lines.append(f"static {kind} a{i}[{size(port)}];")
+        arguments += [] if port.role == "episode_start" else [f"a{i}"]
+    reads = " && ".join(f"fread(a{i}, sizeof a{i}, 1, stdin)" for i in range(len(given)))
+    starts = [f"if (a{i}[0]) {name}_reset();" for i, port in enumerate(given) if port.role == "episode_start"]
+    action = policy.outputs[0]
+    return "\n".join(
+        [
+            f'#include "{stem}.h"\n#include <stdio.h>\n#include <time.h>',
+            *lines,
+            f"static {TYPES[action.dtype]} action[{size(action)}];",
+            "int main(void) {\n\tstruct timespec one, two;",
+            f"\twhile ({reads}) {{",
+            *(f"\t\t{line}" for line in starts),
+            "\t\tclock_gettime(CLOCK_MONOTONIC, &one);",
+            f"\t\t{name}_act({', '.join([*arguments, 'action'])});",
+            "\t\tclock_gettime(CLOCK_MONOTONIC, &two);",
+            "\t\tdouble seconds = (double)(two.tv_sec - one.tv_sec) + 1e-9 * (double)(two.tv_nsec - one.tv_nsec);",
+            "\t\tfwrite(action, sizeof action, 1, stdout);\n\t\tfwrite(&seconds, sizeof seconds, 1, stdout);",
+            "\t}\n\treturn 0;\n}\n",
+        ]
+    )
+
+
+def node_run(policy: Policy, script: str) -> Run | None:
+    """Returns the run of a policy in JavaScript; None without Node.js."""
+    if shutil.which("node") is None:
+        return None
+
+    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        n = len(next(iter(inputs.values())))
+        given = [port.name for port in policy.inputs if port.role == "observation"]
+        rows = [[inputs[name][i].ravel().tolist() for name in given] for i in range(n)]
+        with tempfile.TemporaryDirectory() as name:
+            (Path(name) / "main.js").write_text(f"{script}\n{NODE}", encoding="utf-8")
+            text = json.dumps(rows)
+            command = ["node", str(Path(name) / "main.js")]
+            found = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
+        actions, seconds = json.loads(found)
+        action = policy.outputs[0]
+        return np.array(actions, action.dtype).reshape(n, *action.shape), np.array(seconds)
+
+    return run
+
+
+NODE = """
+const actions = [], seconds = [];
+for (const row of JSON.parse(require("fs").readFileSync(0, "utf8"))) {
+  const start = process.hrtime.bigint();
+  const action = policy(...row);
+  seconds.push(Number(process.hrtime.bigint() - start) * 1e-9);
+  actions.push(Array.from(action));
+}
+console.log(JSON.stringify([actions, seconds]));
+"""

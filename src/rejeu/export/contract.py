@@ -1,0 +1,178 @@
+"""What a policy takes and returns: its program with names, shapes, dtypes and bounds, and the card about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, ShapeDtypeStruct, export
+
+from rejeu import spaces
+from rejeu.core import Algorithm, Clock, Masked, PyTree
+from rejeu.exploration import explorer as exploration
+from rejeu.export.program import Program, trace
+from rejeu.spaces import Leaf
+
+Role = Literal["observation", "action_mask", "state", "episode_start", "noise", "action"]
+CARD = 1
+"""Version of the layout of cards."""
+
+
+class Port(NamedTuple):
+    """An input or output."""
+
+    name: str
+    role: Role
+    shape: tuple[int, ...]
+    """Without the batch axis."""
+    dtype: str
+    low: Any = None
+    """Smallest values as of :func:`rejeu.spaces.describe`; None without bounds."""
+    high: Any = None
+    """Largest values, likewise."""
+    drawn: str = ""
+    """For noise: ``normal`` (standard) or ``uniform`` (in [0, 1)), independent numbers in each step."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns it as JSON values, without what is not given."""
+        return {key: value for key, value in self._asdict().items() if value not in (None, "")}
+
+
+class Policy(NamedTuple):
+    """A policy as a program. Every array has a leading batch axis."""
+
+    program: Program
+    inputs: tuple[Port, ...]
+    """In the order of the program's arguments: observation, then ``action_mask``, state and ``episode_start``, noise."""
+    outputs: tuple[Port, ...]
+    """The action, then the next state."""
+    batch: int | None
+    """Observations at once; None for any number."""
+
+    def of(self, role: Role) -> list[Port]:
+        """Returns the inputs of a role."""
+        return [port for port in self.inputs if port.role == role]
+
+
+def policy_of(
+    algorithm: Algorithm,
+    actor: PyTree,
+    observation_space: gym.Space,
+    action_space: gym.Space,
+    mask: Leaf | None,
+    batch: int | None = None,
+    noise: bool = False,
+) -> Policy:
+    """Returns the policy of an algorithm from raw observations to actions of the environment.
+
+    Args:
+        algorithm: with normalization, if there is any.
+        actor: the weights.
+        observation_space: of the environment.
+        action_space: of the environment.
+        mask: of the allowed actions, None for policies without.
+        batch: number of observations at once, None for a free number.
+        noise: sample from the policy, with the random numbers as inputs; else its mode.
+
+    Raises:
+        ValueError: if a free batch size or the drawing cannot be expressed, or ``noise`` is for a deterministic policy.
+    """
+    leaves, structure = spaces.leaves(observation_space), spaces.structure(observation_space)
+    size = export.symbolic_shape("batch")[0] if batch is None else batch
+    has_memory = algorithm.recall is not None
+    explorer = algorithm.explorer if has_memory else exploration.plain(algorithm)
+    assert explorer is not None
+    carry = explorer.init(actor, 1) if has_memory else ()
+    memory, carry_structure = jax.tree.flatten(carry)
+    scale = action_scaler(action_space)
+
+    def act(obs: list[Array], mask: Array | None, memory: list[Array], start: Any, key: Any) -> list[Array]:
+        arrays: PyTree = jax.tree.unflatten(structure, [one[None] for one in obs])
+        arrays = arrays if mask is None else Masked(arrays, mask[None])
+        before = jax.tree.unflatten(carry_structure, [one[None] for one in memory])
+        after: PyTree = ()
+        if noise:
+            ended = jnp.ones(1, bool) if start is None else start[None]
+            action, after = explorer.act(before, actor, arrays, ended, key, Clock(np.uint32(0), 0, 1.0))
+        elif has_memory:
+            action, after = algorithm.recall(before, actor, arrays, start[None])  # type: ignore[misc]
+        else:
+            action = algorithm.exploit(actor, arrays)
+        return [scale(action)[0], *(one[0] for one in jax.tree.leaves(after) if has_memory)]
+
+    example = lambda shape, dtype: ShapeDtypeStruct((size, *shape), dtype)  # noqa: E731
+    arguments = (
+        [example(leaf.shape, leaf.dtype) for leaf in leaves],
+        None if mask is None else example(mask.shape, bool),
+        [example(one.shape[1:], one.dtype) for one in memory],
+        example((), bool) if has_memory else None,
+        example((2,), np.uint32) if noise else None,
+    )
+    program = trace(jax.vmap(act), *arguments, draws=noise)
+    if noise and not program.draws:
+        raise ValueError("noise=True is for policies that are sampled from; this one always returns the same action")
+    parts = spaces.parts(observation_space, observation_space)
+    inputs = [
+        Port(leaf.path or "observation", "observation", leaf.shape, leaf.dtype, *bounds(part))
+        for leaf, part in zip(leaves, parts, strict=True)
+    ]
+    state = [Port(f"state_{i}", "state", one.shape[1:], str(one.dtype)) for i, one in enumerate(memory)]
+    inputs += [] if mask is None else [Port("action_mask", "action_mask", mask.shape, "bool")]
+    inputs += [*state, Port("episode_start", "episode_start", (), "bool")] if has_memory else []
+    for i, (kind, value) in enumerate(program.draws):
+        inputs.append(Port(f"noise_{i}", "noise", value.shape[1:], str(value.dtype), drawn=kind))
+    is_integer = isinstance(action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
+    dtype = "int64" if is_integer else str(program.outputs[0].dtype)
+    action = Port("action", "action", action_space.shape or (), dtype, *bounds(action_space))
+    return Policy(program, distinct(inputs), (action, *(one._replace(name=f"next_{one.name}") for one in state)), batch)
+
+
+def distinct(ports: Sequence[Port]) -> tuple[Port, ...]:
+    """Returns ports whose names differ; an underscore is added to what is no observation."""
+    taken = {port.name for port in ports if port.role == "observation"}
+    result = []
+    for port in ports:
+        name = port.name
+        while port.role != "observation" and name in taken:
+            name += "_"
+        taken.add(name)
+        result.append(port._replace(name=name))
+    return tuple(result)
+
+
+def bounds(space: gym.Space) -> tuple[Any, Any]:
+    """Returns the smallest and the largest values of an array of a space, in JSON values."""
+    ((kind, body),) = spaces.describe(space).items()
+    if kind == "Box":
+        return body["low"], body["high"]
+    if kind == "MultiBinary":
+        return 0, 1
+    start, n = np.asarray(body["start"]), np.asarray(body["n" if kind == "Discrete" else "nvec"])
+    return start.tolist(), (start + n - 1).tolist()
+
+
+def action_scaler(space: gym.Space) -> Callable[[Array], Array]:
+    """Returns :func:`rejeu.spaces.scale_action` in JAX: float32 instead of double precision, int32 instead of int64."""
+    shape = (-1, *(space.shape or ()))
+    if isinstance(space, gym.spaces.Box):
+        bounded = np.isfinite(space.low) & np.isfinite(space.high)
+        low, high = (np.where(bounded, one, one.dtype.type(0)).astype(np.float64) for one in (space.low, space.high))
+        if space.dtype.kind != "f":
+            half, first, dtype = jnp.float32(0.5 * (high - low + 1.0)), jnp.float32(low), spaces.narrow(space.dtype)
+            whole = lambda action: jnp.floor(first[None] + (action.reshape(shape) + 1.0) * half[None])  # noqa: E731
+            return lambda action: jnp.clip(whole(action), first[None], jnp.float32(high)[None]).astype(dtype)
+        half = jnp.float32(np.where(bounded, 0.5 * (high - low), 1.0))
+        middle = jnp.float32(0.5 * (low + high))
+        limits = jnp.float32(space.low)[None], jnp.float32(space.high)[None]
+        return lambda action: jnp.clip(middle[None] + action.reshape(shape) * half[None], *limits)
+    if isinstance(space, gym.spaces.MultiBinary):
+        return lambda action: action.reshape(shape).astype(jnp.int8)
+    assert isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
+    start = np.asarray(
+        space.start if isinstance(space, gym.spaces.Discrete) else np.broadcast_to(space.start, shape[1:])
+    )
+    return lambda action: action.reshape(shape) + jnp.int32(start)[None]

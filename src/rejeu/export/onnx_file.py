@@ -1,0 +1,300 @@
+"""Programs as ONNX models, by the package ``onnx`` alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rejeu.errors import MissingExtra
+from rejeu.export.contract import Policy
+from rejeu.export.program import Operation, Value, unsupported
+
+try:
+    import onnx
+    from onnx import helper, numpy_helper
+except ImportError:
+    raise MissingExtra("export to ONNX", "onnx", "export") from None
+
+OPSET, IR_VERSION = 18, 8
+"""Of December 2022; ONNX Runtime reads them since version 1.14."""
+TO_THE_END = np.iinfo(np.int64).max
+
+ELEMENTWISE = {
+    "abs": "Abs", "acos": "Acos", "acosh": "Acosh", "add": "Add", "add_any": "Add", "and": "And", "asin": "Asin",
+    "asinh": "Asinh", "atan": "Atan", "atanh": "Atanh", "ceil": "Ceil", "cos": "Cos", "cosh": "Cosh", "div": "Div",
+    "eq": "Equal", "erf": "Erf", "exp": "Exp", "floor": "Floor", "ge": "GreaterOrEqual", "gt": "Greater",
+    "le": "LessOrEqual", "log": "Log", "logistic": "Sigmoid", "lt": "Less", "max": "Max", "min": "Min", "mul": "Mul",
+    "neg": "Neg", "not": "Not", "or": "Or", "pow": "Pow", "sign": "Sign", "sin": "Sin", "sinh": "Sinh", "sqrt": "Sqrt",
+    "sub": "Sub", "tan": "Tan", "tanh": "Tanh", "xor": "Xor",
+}  # fmt: skip
+"""Operators of primitives that are one operator."""
+REDUCTIONS = {
+    "reduce_max": "ReduceMax",
+    "reduce_min": "ReduceMin",
+    "reduce_prod": "ReduceProd",
+    "reduce_sum": "ReduceSum",
+    "reduce_or": "ReduceMax",
+    "reduce_and": "ReduceMin",
+}
+
+
+class Graph:
+    """The nodes and constants of a model that have been made so far."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.initializers: list[Any] = []
+        self.names: dict[Value, str] = {}
+        self.narrow: dict[Value, str] = {}
+        """Of broadcast arrays: the name of one with axes of length 1 in the place of repetitions."""
+        self.batch = ""
+        """Name of the size of the batch, ``int64 (1,)``; empty until it is needed."""
+        self._constants: dict[bytes, str] = {}
+
+    def node(self, kind: str, inputs: Sequence[str], **attributes: Any) -> str:
+        """Adds a node and returns the name of its output."""
+        name = f"v{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
+        return name
+
+    def constant(self, array: Any) -> str:
+        """Adds a constant and returns its name; equal ones are stored once."""
+        array = np.asarray(array)
+        key = repr((array.dtype, array.shape)).encode() + array.tobytes()
+        if key not in self._constants:
+            self._constants[key] = name = f"c{len(self.initializers)}"
+            self.initializers.append(numpy_helper.from_array(array, name))
+        return self._constants[key]
+
+    def name(self, value: Value) -> str:
+        """Returns the name of an array in its full shape."""
+        if value.data is not None:
+            return self.constant(value.data)
+        if value not in self.names:
+            self.names[value] = self.node("Expand", [self.narrow[value], self.shape(value)])
+        return self.names[value]
+
+    def loose(self, value: Value) -> str:
+        """Returns the name of an array that broadcasts to its shape."""
+        return self.narrow.get(value) or self.name(value)
+
+    def shape(self, value: Value) -> str:
+        """Returns the name of an array's shape, ``int64 (n_axes,)``."""
+        sizes = value.sizes
+        if -1 not in sizes:
+            return self.constant(np.array(sizes, np.int64))
+        parts = [self.batch if size == -1 else self.constant(np.array([size], np.int64)) for size in sizes]
+        return self.node("Concat", parts, axis=0)
+
+    def reshape(self, name: str, sizes: Sequence[int]) -> str:
+        """Returns the name of an array in another shape; -1 for the size of the batch."""
+        return self.node("Reshape", [name, self.constant(np.array(sizes, np.int64))])
+
+    def cast(self, name: str, dtype: Any) -> str:
+        """Returns the name of an array in another dtype."""
+        return self.node("Cast", [name], to=helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+
+
+def add(graph: Graph, operation: Operation) -> None:
+    """Adds the nodes of one operation."""
+    name, inputs, outputs = operation.name, operation.inputs, operation.outputs
+    if name == "broadcast_in_dim":
+        sizes = [1] * len(outputs[0].shape)
+        for axis, size in zip(operation.params["broadcast_dimensions"], inputs[0].sizes, strict=True):
+            sizes[axis] = size
+        graph.narrow[outputs[0]] = graph.reshape(graph.name(inputs[0]), sizes)
+    elif name in ELEMENTWISE or name in COMPOSED:
+        has_shape = any(one.shape == outputs[0].shape and one not in graph.narrow for one in inputs)
+        names = [graph.loose(one) if has_shape else graph.name(one) for one in inputs]
+        if name in ELEMENTWISE:
+            graph.names[outputs[0]] = graph.node(ELEMENTWISE[name], names)
+        else:
+            graph.names[outputs[0]] = COMPOSED[name](graph, operation, names)
+    elif name == "split":
+        lengths = graph.constant(np.array(operation.params["sizes"], np.int64))
+        names = [f"v{len(graph.nodes)}_{i}" for i in range(len(outputs))]
+        node = helper.make_node("Split", [graph.name(inputs[0]), lengths], names, axis=operation.params["axis"])
+        graph.nodes.append(node)
+        graph.names |= zip(outputs, names, strict=True)
+    elif name in REDUCTIONS:
+        is_logical = name in ("reduce_or", "reduce_and")
+        taken = graph.cast(graph.name(inputs[0]), np.int32) if is_logical else graph.name(inputs[0])
+        axes = graph.constant(np.array(operation.params["axes"], np.int64))
+        found = graph.node(REDUCTIONS[name], [taken, axes], keepdims=0)
+        graph.names[outputs[0]] = graph.cast(found, bool) if is_logical else found
+    elif name in STRUCTURAL:
+        graph.names[outputs[0]] = STRUCTURAL[name](graph, operation, [graph.name(one) for one in inputs])
+    else:
+        raise unsupported(operation, "ONNX")
+
+
+Make = Callable[[Graph, Operation, list[str]], str]
+"""Adds the nodes of an operation whose inputs have these names, and returns the name of its output."""
+
+
+def scalar(operation: Operation, value: float) -> np.ndarray:
+    """Returns a number in the dtype of the first input."""
+    return np.asarray(value, operation.inputs[0].dtype)
+
+
+def power(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """A power with a whole exponent."""
+    if operation.params["y"] == 2:
+        return graph.node("Mul", [names[0], names[0]])
+    return graph.node("Pow", [names[0], graph.constant(scalar(operation, operation.params["y"]))])
+
+
+def select(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """A choice between two arrays."""
+    if len(names) != 3 or operation.inputs[0].dtype != bool:
+        raise unsupported(operation, "ONNX", " for more than two choices")
+    return graph.node("Where", [names[0], names[2], names[1]])
+
+
+def not_equal(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """Inequality."""
+    return graph.node("Not", [graph.node("Equal", names)])
+
+
+def rounded(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """Rounding; of halves to even numbers."""
+    if int(operation.params["rounding_method"]) != 1:
+        raise unsupported(operation, "ONNX", " for halves away from zero")
+    return graph.node("Round", names)
+
+
+COMPOSED: dict[str, Make] = {
+    "convert_element_type": lambda g, op, n: g.cast(n[0], op.params["new_dtype"]),
+    "expm1": lambda g, op, n: g.node("Sub", [g.node("Exp", n), g.constant(scalar(op, 1.0))]),
+    "integer_pow": power,
+    "log1p": lambda g, op, n: g.node("Log", [g.node("Add", [n[0], g.constant(scalar(op, 1.0))])]),
+    "ne": not_equal,
+    "rem": lambda g, op, n: g.node("Mod", n, fmod=1),
+    "round": rounded,
+    "rsqrt": lambda g, op, n: g.node("Reciprocal", [g.node("Sqrt", n)]),
+    "select_n": select,
+}
+"""Primitives of each element by itself that are several operators, or have parameters."""
+
+
+def product(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """A product of matrices, with any axes."""
+    (left_axes, right_axes), (left_batch, right_batch) = operation.params["dimension_numbers"]
+    left, right = operation.inputs
+    if not left_batch and len(right.shape) == 2 and (*left_axes, *right_axes) == (len(left.shape) - 1, 0):
+        return graph.node("MatMul", names)
+
+    def arranged(name: str, value: Value, batch: Any, contracted: Any, is_left: bool) -> str:
+        free = [axis for axis in range(len(value.shape)) if axis not in (*batch, *contracted)]
+        groups = (batch, free, contracted) if is_left else (batch, contracted, free)
+        name = graph.node("Transpose", [name], perm=[axis for group in groups for axis in group])
+        sizes = [[value.sizes[axis] for axis in group] for group in groups]
+        return graph.reshape(name, [-1 if -1 in group else int(np.prod(group)) for group in sizes])
+
+    made = (
+        arranged(names[0], left, left_batch, left_axes, True),
+        arranged(names[1], right, right_batch, right_axes, False),
+    )
+    return graph.reshape(graph.node("MatMul", made), operation.outputs[0].sizes)
+
+
+def convolution(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """A convolution."""
+    params, (left, right, out) = operation.params, operation.params["dimension_numbers"]
+    if params["batch_group_count"] != 1 or any(size != 1 for size in params["lhs_dilation"]):
+        raise unsupported(operation, "ONNX", " if it is transposed")
+    found = graph.node(
+        "Conv",
+        [graph.node("Transpose", [name], perm=axes) for name, axes in zip(names, (left, right), strict=True)],
+        strides=params["window_strides"],
+        pads=[pair[end] for end in (0, 1) for pair in params["padding"]],
+        dilations=params["rhs_dilation"],
+        group=params["feature_group_count"],
+    )
+    return graph.node("Transpose", [found], perm=np.argsort(out).tolist())
+
+
+def sliced(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """A part of an array."""
+    params, shape = operation.params, operation.inputs[0].sizes
+    ends = [TO_THE_END if size == -1 else end for size, end in zip(shape, params["limit_indices"], strict=True)]
+    steps = params["strides"] or [1] * len(ends)
+    parts = (params["start_indices"], ends, range(len(ends)), steps)
+    return graph.node("Slice", [names[0], *(graph.constant(np.array([*part], np.int64)) for part in parts)])
+
+
+def reversed_(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """An array backwards."""
+    axes = np.array(operation.params["dimensions"], np.int64)
+    parts = (np.full_like(axes, -1), np.full_like(axes, -TO_THE_END), axes, np.full_like(axes, -1))
+    return graph.node("Slice", [names[0], *map(graph.constant, parts)])
+
+
+def padded(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """An array with a border."""
+    config = operation.params["padding_config"]
+    if any(interior for _, _, interior in config):
+        raise unsupported(operation, "ONNX", " between elements")
+    pads = np.array([[low for low, _, _ in config], [high for _, high, _ in config]], np.int64).ravel()
+    return graph.node("Pad", [names[0], graph.constant(pads), names[1]])
+
+
+def position(kind: str) -> Make:
+    """The index of the largest or smallest element."""
+
+    def make(graph: Graph, operation: Operation, names: list[str]) -> str:
+        found = graph.node(kind, names, axis=operation.params["axes"][0], keepdims=0)
+        return graph.cast(found, operation.params["index_dtype"])
+
+    return make
+
+
+def reshaped(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """An array in another shape."""
+    return graph.reshape(names[0], operation.outputs[0].sizes)
+
+
+STRUCTURAL: dict[str, Make] = {
+    "argmax": position("ArgMax"),
+    "argmin": position("ArgMin"),
+    "concatenate": lambda g, op, n: g.node("Concat", n, axis=op.params["dimension"]),
+    "conv_general_dilated": convolution,
+    "dot_general": product,
+    "expand_dims": reshaped,
+    "pad": padded,
+    "reshape": reshaped,
+    "rev": reversed_,
+    "slice": sliced,
+    "squeeze": reshaped,
+    "transpose": lambda g, op, n: g.node("Transpose", n, perm=op.params["permutation"]),
+}
+"""Primitives that move or combine elements."""
+
+
+def write(policy: Policy, card: dict[str, Any]) -> bytes:
+    """Returns the model of a policy, with the card in its metadata."""
+    graph, program = Graph(), policy.program
+    size = "batch" if policy.batch is None else policy.batch
+    inputs = []
+    for port, value in zip(policy.inputs, program.arguments, strict=True):
+        graph.names[value] = port.name
+        kind = helper.np_dtype_to_tensor_dtype(np.dtype(port.dtype))
+        inputs.append(helper.make_tensor_value_info(port.name, kind, [size, *port.shape]))
+    shape = graph.node("Shape", [policy.inputs[0].name])
+    graph.batch = graph.node("Slice", [shape, *(graph.constant(np.array([i], np.int64)) for i in (0, 1))])
+    for operation in program.operations:
+        add(graph, operation)
+    outputs = []
+    for port, value in zip(policy.outputs, program.outputs, strict=True):
+        kind = helper.np_dtype_to_tensor_dtype(np.dtype(port.dtype))
+        graph.nodes.append(helper.make_node("Cast", [graph.name(value)], [port.name], to=kind))
+        outputs.append(helper.make_tensor_value_info(port.name, kind, [size, *port.shape]))
+    made = helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.initializers)
+    opset = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(made, opset_imports=opset, ir_version=IR_VERSION, producer_name="rejeu")
+    helper.set_model_props(model, {"rejeu": json.dumps(card)})
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString()

@@ -1,0 +1,213 @@
+"""A traced function as a list of operations on arrays, which the writers of each format translate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+LARGEST_FOLD = 4096
+"""Elements up to which a constant may be larger than the constants it is computed from, as by broadcasting."""
+INLINED = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+"""Parameters of primitives that call a function."""
+IDENTITIES = ("copy", "copy_p", "optimization_barrier", "reduce_precision", "stop_gradient")
+DRAWS = {"_normal": "normal", "_uniform": "uniform", "_randint": "uniform"}
+"""JAX's functions that draw, by name, and the distribution of the input that replaces them."""
+
+REWRITTEN: dict[str, Callable[..., Any]] = {
+    "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
+    "exp2": lambda x: jnp.power(x.dtype.type(2), x),
+    "square": lambda x: x * x,
+    "stack": lambda *parts, axis: jnp.concatenate([jnp.expand_dims(one, axis) for one in parts], axis),
+}
+"""Primitives that are written with others, so that no format needs them."""
+
+
+class Value:
+    """An array: its shape, in which the free size of the batch is symbolic, its dtype, and its numbers if constant."""
+
+    def __init__(self, shape: Sequence[Any], dtype: Any, data: np.ndarray | None = None) -> None:
+        self.shape, self.dtype, self.data = tuple(shape), np.dtype(dtype), data
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The shape, with -1 for the free size of the batch."""
+        return tuple(size if isinstance(size, int) else -1 for size in self.shape)
+
+
+class Operation(NamedTuple):
+    """One primitive of JAX."""
+
+    primitive: Any
+    inputs: tuple[Value, ...]
+    outputs: tuple[Value, ...]
+    params: dict[str, Any]
+    where: str
+    """The line that asked for it, outside of JAX; empty if unknown."""
+
+    @property
+    def name(self) -> str:
+        """Name of the primitive."""
+        return self.primitive.name
+
+
+class Program(NamedTuple):
+    """A function of arrays as operations in the order of their execution."""
+
+    inputs: tuple[Value, ...]
+    draws: tuple[tuple[str, Value], ...]
+    """Inputs that replace what the function drew, with their distributions: ``normal``, or ``uniform`` in [0, 1)."""
+    operations: tuple[Operation, ...]
+    outputs: tuple[Value, ...]
+
+    def __call__(self, *arrays: Any) -> list[Any]:
+        """Returns the outputs for inputs and draws, computed by JAX; it may be compiled."""
+        known: dict[Value, Any] = dict(zip(self.arguments, arrays, strict=True))
+        for operation in self.operations:
+            inputs = [known[one] if one.data is None else jnp.asarray(one.data) for one in operation.inputs]
+            found = operation.primitive.bind(*inputs, **operation.params)
+            outputs = found if operation.primitive.multiple_results else [found]
+            known |= zip(operation.outputs, outputs, strict=True)
+        return [known[one] if one.data is None else jnp.asarray(one.data) for one in self.outputs]
+
+    @property
+    def arguments(self) -> tuple[Value, ...]:
+        """Inputs, then draws."""
+        return (*self.inputs, *(value for _, value in self.draws))
+
+    def ending_in(self, outputs: Sequence[Value]) -> Program:
+        """Returns the program of other outputs, without the operations that these do not need."""
+        needed, kept = {*outputs}, []
+        for operation in reversed(self.operations):
+            if not needed.isdisjoint(operation.outputs):
+                needed |= {*operation.inputs}
+                kept.append(operation)
+        draws = tuple((kind, value) for kind, value in self.draws if value in needed)
+        return Program(self.inputs, draws, tuple(reversed(kept)), tuple(outputs))
+
+
+def unsupported(operation: Operation, target: str, detail: str = "") -> ValueError:
+    """Returns the error for an operation that has no translation."""
+    where = f" ({operation.where})" if operation.where else ""
+    return ValueError(
+        f"the policy cannot be exported to {target}: JAX's primitive {operation.name!r}{where} has no translation there"
+        f"{detail}; write that part with other operations, or export to stablehlo, which holds all of them"
+    )
+
+
+def trace(function: Callable[..., Any], *examples: Any, draws: bool = False) -> Program:
+    """Returns a function of arrays as a program.
+
+    Args:
+        function: of arrays, which returns a pytree of arrays.
+        examples: pytrees of the shapes and dtypes of its arguments.
+        draws: whether the last argument is a PRNG key, ``uint32 (..., 2)``, which is no input of the program.
+
+    Raises:
+        ValueError: if it draws random numbers in another way than by ``jax.random.normal``, ``uniform``, ``gumbel``,
+            ``categorical`` and the like.
+    """
+    closed = jax.make_jaxpr(function)(*examples)
+    tracing = _Tracing()
+    leaves = [Value(one.aval.shape, one.aval.dtype) for one in closed.jaxpr.invars]
+    constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in closed.consts]
+    outputs = tracing.inline(closed.jaxpr, [*constants, *leaves])
+    inputs = tuple(leaves[:-1] if draws else leaves)
+    program = Program(inputs, tuple(tracing.draws), tuple(tracing.operations), ()).ending_in(outputs)
+    for operation in program.operations:
+        if not {*operation.inputs}.isdisjoint({*leaves} - {*inputs}):
+            raise unsupported(operation, "a file", ": it draws random numbers that cannot be an input")
+    return program
+
+
+class _Tracing:
+    """The operations of a function that have been found so far."""
+
+    def __init__(self) -> None:
+        self.operations: list[Operation] = []
+        self.draws: list[tuple[str, Value]] = []
+
+    def inline(self, jaxpr: Any, arguments: Sequence[Value]) -> list[Value]:
+        """Adds the operations of a jaxpr with these constants and arguments, and returns its outputs."""
+        known: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], arguments, strict=True))
+
+        def read(atom: Any) -> Value:
+            return _constant(atom) if isinstance(atom, core.Literal) else known[atom]
+
+        for equation in jaxpr.eqns:
+            outputs = self.add(equation, [read(atom) for atom in equation.invars])
+            known |= zip(equation.outvars, outputs, strict=True)
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def add(self, equation: Any, inputs: Sequence[Value]) -> Sequence[Value]:
+        """Adds an operation and returns its outputs."""
+        name, params = equation.primitive.name, equation.params
+        if name in IDENTITIES or (name == "convert_element_type" and inputs[0].dtype == params["new_dtype"]):
+            return inputs
+        if params.get("name") in DRAWS and "jaxpr" in params:
+            return self.draw(DRAWS[params["name"]], equation.outvars[0].aval, inputs[1:])
+        if name in REWRITTEN:
+            examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in inputs]
+            kept = {key: params[key] for key in params if name == "stack"}
+            return self.inline(jax.make_jaxpr(partial(REWRITTEN[name], **kept))(*examples).jaxpr, inputs)
+        inner = next((params[key] for key in INLINED if key in params), None)
+        if inner is not None and name not in ("scan", "while", "cond"):
+            constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in getattr(inner, "consts", ())]
+            return self.inline(getattr(inner, "jaxpr", inner), [*constants, *inputs])
+        avals = [one.aval for one in equation.outvars]
+        sizes = [aval.size for aval in avals]
+        is_static = all(isinstance(size, int) for size in sizes) and not any("random" in str(a.dtype) for a in avals)
+        if is_static and all(one.data is not None for one in inputs):
+            largest = max([LARGEST_FOLD, *(one.data.size for one in inputs)])  # type: ignore[union-attr]
+            if all(size <= largest for size in sizes) and not str(name).startswith("random"):
+                found = equation.primitive.bind(*[jnp.asarray(one.data) for one in inputs], **params)
+                arrays = found if equation.primitive.multiple_results else [found]
+                return [Value(array.shape, array.dtype, np.asarray(array)) for array in arrays]
+        outputs = tuple(Value(aval.shape, _dtype(aval)) for aval in avals)
+        self.operations.append(
+            Operation(equation.primitive, tuple(inputs), outputs, params, _line(equation.source_info))
+        )
+        return outputs
+
+    def draw(self, kind: str, aval: Any, bounds: Sequence[Value]) -> Sequence[Value]:
+        """Returns an input in the place of numbers that are drawn; uniform ones are scaled to their bounds."""
+        drawn = Value([size for i, size in enumerate(aval.shape) if i == 0 or size != 1], np.float32)
+        self.draws.append((kind, drawn))
+
+        def scaled(u: Any, *bounds: Any) -> Any:
+            u = u.reshape(aval.shape)
+            if kind == "normal":
+                return u
+            low, high = (jnp.broadcast_to(one, aval.shape).astype(jnp.float32) for one in bounds)
+            number = low + u * (high - low)
+            return number if aval.dtype == number.dtype else jnp.floor(number).astype(aval.dtype)
+
+        bounds = bounds if kind == "uniform" else ()
+        examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in (drawn, *bounds)]
+        return self.inline(jax.make_jaxpr(scaled)(*examples).jaxpr, [drawn, *bounds])
+
+
+def _constant(literal: Any) -> Value:
+    array = np.asarray(literal.val, literal.aval.dtype)
+    return Value(array.shape, array.dtype, array)
+
+
+def _dtype(aval: Any) -> Any:
+    """Returns the dtype of an array; that of its bits for a PRNG key."""
+    return np.uint32 if jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key) else aval.dtype
+
+
+def _line(source_info: Any) -> str:
+    """Returns the innermost line outside of installed packages and rejeu that made an operation."""
+    own = Path(__file__).resolve().parents[1]
+    for frame in getattr(source_info.traceback, "frames", ()):
+        path = Path(frame.file_name)
+        if "site-packages" not in path.parts and own not in path.parents and path.is_file():
+            return f"{path.name}, line {frame.line_num}, in {frame.function_name}"
+    return ""

@@ -1,0 +1,45 @@
+"""Programs as StableHLO, by ``jax.export``: a zip file of the module, JAX's own form of it, and the card."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array, ShapeDtypeStruct, export
+
+from rejeu.export.contract import Policy
+
+MODULE, EXPORTED, CARD = "module.mlir.bc", "exported.jax", "card.json"
+"""Names in the zip file: StableHLO as portable bytecode, the bytes for ``jax.export.deserialize``, the contract."""
+
+
+def write(policy: Policy, card: dict[str, Any]) -> bytes:
+    """Returns the zip file of a policy. The module takes and returns arrays in the order of the card."""
+
+    def act(inputs: dict[str, Array]) -> dict[str, Array]:
+        found = policy.program(*(inputs[port.name] for port in policy.inputs))
+        return {port.name: one for port, one in zip(policy.outputs, found, strict=True)}
+
+    examples = {
+        port.name: ShapeDtypeStruct(value.shape, value.dtype)
+        for port, value in zip(policy.inputs, policy.program.arguments, strict=True)
+    }
+    made = export.export(jax.jit(act), platforms=["cpu", "cuda", "tpu"])(examples)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(MODULE, made.mlir_module_serialized)
+        file.writestr(EXPORTED, bytes(made.serialize()))
+        file.writestr(CARD, json.dumps(card, indent=1))
+    return content.getvalue()
+
+
+def read(content: bytes) -> Callable[[dict[str, np.ndarray]], dict[str, Array]]:
+    """Returns the policy of a zip file, as a function from inputs by name to outputs by name."""
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        made = export.deserialize(bytearray(file.read(EXPORTED)))
+    return jax.jit(made.call)

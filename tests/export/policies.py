@@ -1,0 +1,85 @@
+"""Small agents of every algorithm for every kind of observation, whose environments are never stepped."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from rejeu import agents
+from tests.sharing import shared_learners
+
+LIMITS = np.array([-2.0, -1.0], np.float32), np.array([2.0, 5.0], np.float32)
+OBSERVATIONS: dict[str, gym.Space] = {
+    "MLP": spaces.Box(-3.0, 3.0, (4,), np.float32),
+    "CNN": spaces.Box(0, 255, (2, 16, 16), np.uint8),
+    "Dict": spaces.Dict(
+        {
+            "camera": spaces.Dict({"left": spaces.Box(0, 255, (12, 12, 3), np.uint8)}),
+            "bits": spaces.MultiBinary(2),
+            "gear": spaces.Discrete(3, start=1),
+            "speed": spaces.Box(-np.inf, np.inf, (3,), np.float64),
+            "switches": spaces.MultiDiscrete([2, 3]),
+        }
+    ),
+    "large CNN": spaces.Box(0, 255, (4, 40, 40), np.uint8),
+}
+ACTIONS: dict[str, gym.Space] = {
+    "Box": spaces.Box(*LIMITS),
+    "Discrete": spaces.Discrete(3, start=1),
+    "MultiDiscrete": spaces.MultiDiscrete([3, 2]),
+    "MultiBinary": spaces.MultiBinary(3),
+    "whole numbers": spaces.Box(-4, 4, (2,), np.int32),
+    "unbounded": spaces.Box(-np.inf, np.inf, (2,), np.float32),
+}
+CONTINUOUS, DISCRETE = ("SAC", "DDPG", "TD3", "TQC", "CrossQ"), ("DQN", "QRDQN", "PQN", "SAC", "DDPG")
+ON_POLICY = ("PPO", "A2C", "RecurrentPPO", "MaskablePPO")
+KINDS = [
+    *((name, "Box") for name in CONTINUOUS),
+    *((name, "Discrete") for name in DISCRETE),
+    *((name, kind) for name in ON_POLICY for kind in ("Box", "Discrete") if (name, kind) != ("MaskablePPO", "Box")),
+]
+"""Every algorithm with every kind of action that matters to its policy."""
+SMALL: dict[str, dict[str, Any]] = {
+    "CrossQ": {"policy_kwargs": {"net_arch": [16]}},
+    "DQN": {"policy_kwargs": {"net_arch": [16]}, "dueling": True},
+    "RecurrentPPO": {"policy_kwargs": {"lstm_hidden_size": 8}},
+}
+
+
+class Still(gym.Env[Any, Any]):
+    """An environment that has spaces, and nothing else."""
+
+    def __init__(self, observation: str, action: str) -> None:
+        self.observation_space, self.action_space = OBSERVATIONS[observation], ACTIONS[action]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def action_masks(self) -> np.ndarray:
+        return np.ones(3 if isinstance(self.action_space, spaces.Discrete) else 5, np.int8)
+
+
+def agent_of(name: str, action: str, observation: str = "MLP", **settings: Any) -> agents.Agent:
+    """Returns an agent with random weights; with statistics of a few observations if it normalizes."""
+    policy = "MultiInputPolicy" if observation == "Dict" else "MlpPolicy"
+    small = SMALL.get(name, {"policy_kwargs": {"net_arch": [16, 16]}})
+    with shared_learners():
+        agent = agents.AGENTS[name](policy, Still(observation, action), seed=0, **{**small, **settings})
+    if settings.get("normalize"):
+        rng = np.random.default_rng(0)
+        parameters = agent.get_parameters()
+        for key, array in parameters.items():
+            if key.startswith("statistics.obs"):
+                parameters[key] = np.asarray(rng.uniform(0.5, 2.0, array.shape), array.dtype)
+        agent.set_parameters(parameters)
+    return agent
+
+
+def observations(agent: agents.Agent, n: int, seed: int) -> list[Any]:
+    """Returns samples of the observation space."""
+    agent.observation_space.seed(seed)
+    return [agent.observation_space.sample() for _ in range(n)]

@@ -1,0 +1,232 @@
+"""Exported policies act as ``predict`` does, in every format."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu import spaces
+from rejeu.agents import exporting
+from rejeu.algorithms.sac.continuous import policy as sac_policy
+from rejeu.cli import main
+from rejeu.export import check, contract
+from rejeu.spaces import parts
+from tests.export.policies import KINDS, agent_of, observations
+from tests.tiers import crossed, exhaustive
+
+onnxruntime = pytest.importorskip("onnxruntime")
+has_compiler = any(map(shutil.which, check.COMPILERS))
+FORMS = {
+    "MLP": {},
+    "MLP, normalized": {"normalize": True},
+    "CNN": {"observation": "CNN"},
+    "Dict": {"observation": "Dict"},
+    "Dict, normalized": {"observation": "Dict", "normalize": True},
+}
+CASES = [
+    pytest.param(name, action, form, target, marks=[] if i % len(FORMS) == j and i % 3 == k else exhaustive)
+    for i, (name, action) in enumerate(KINDS)
+    for j, form in enumerate(FORMS)
+    for k, target in enumerate(("onnx", "c", "stablehlo"))
+]
+"""By default each algorithm with one form and one format."""
+OTHERS = {
+    "GRU": ("RecurrentPPO", "Box", {"policy_kwargs": {"lstm_hidden_size": 8, "cell": "gru"}}),
+    "MultiDiscrete": ("PPO", "MultiDiscrete", {}),
+    "MultiDiscrete with masks": ("MaskablePPO", "MultiDiscrete", {}),
+    "MultiBinary": ("A2C", "MultiBinary", {}),
+    "whole numbers": ("SAC", "whole numbers", {}),
+    "unbounded": ("PPO", "unbounded", {}),
+    "squashed": ("PPO", "Box", {"policy_kwargs": {"squash_output": True, "net_arch": [16]}}),
+    "gSDE": ("PPO", "Box", {"use_sde": True}),
+    "SimBa": ("SAC", "Box", {"policy_kwargs": {"architecture": "simba", "width": 16}}),
+    "layer norm": ("TD3", "Box", {"policy_kwargs": {"net_arch": [16], "layer_norm": True, "activation_fn": "elu"}}),
+    "branches": ("SAC", "Box", {"policy_kwargs": {"state_layers": [8], "actor_layers": [8], "activation_fn": "gelu"}}),
+    "silu": ("DQN", "Discrete", {"policy_kwargs": {"net_arch": [16], "activation_fn": "silu"}}),
+    "CNN with layer norm": ("SAC", "Box", {"observation": "CNN", "policy_kwargs": {"cnn_layer_norm": True}}),
+    "large CNN": ("QRDQN", "Discrete", {"observation": "large CNN"}),
+}
+
+
+@pytest.fixture(autouse=True)
+def fewer(monkeypatch):
+    monkeypatch.setattr(check, "OBSERVATIONS", 100)
+
+
+def skip_without_compiler(target):
+    if target == "c" and not has_compiler:
+        pytest.skip("there is no C compiler")
+
+
+def inputs_of(agent, samples):
+    """The observations as a file takes them, by name."""
+    leaves = spaces.leaves(agent.observation_space)
+    rows = [parts(agent.observation_space, one) for one in samples]
+    return {
+        leaf.path or "observation": np.stack([np.asarray(row[i], leaf.dtype) for row in rows])
+        for i, leaf in enumerate(leaves)
+    }
+
+
+@pytest.mark.parametrize(("name", "action", "form", "target"), CASES)
+def test_a_file_acts_as_predict(name, action, form, target, tmp_path):
+    skip_without_compiler(target)
+    found = agent_of(name, action, **FORMS[form]).export(tmp_path / f"policy{exporting.SUFFIXES[target]}")
+    assert found.check.n == 100
+    assert found.check.difference <= 1e-5
+    assert found.bytes == found.path.stat().st_size > 1000
+
+
+@pytest.mark.parametrize(("kind", "target"), crossed([*OTHERS], ["onnx", "c", "stablehlo"]))
+def test_a_file_acts_as_predict_with_other_networks_and_actions(kind, target, tmp_path):
+    skip_without_compiler(target)
+    name, action, settings = OTHERS[kind]
+    found = agent_of(name, action, **settings).export(tmp_path / f"policy{exporting.SUFFIXES[target]}")
+    assert found.check.difference <= 1e-5
+
+
+@pytest.mark.parametrize("observation", ["MLP", "Dict"])
+def test_a_batch_of_observations_has_the_actions_of_predict(observation, tmp_path):
+    agent = agent_of("SAC", "Box", observation, normalize=True)
+    path = agent.export(tmp_path / "policy.onnx").path
+    samples = observations(agent, 50, seed=3)
+    (action,) = onnxruntime.InferenceSession(path).run(["action"], inputs_of(agent, samples))
+    expected = np.stack([agent.predict(one, deterministic=True)[0] for one in samples])
+    np.testing.assert_allclose(action, expected, atol=1e-5)
+    assert np.ptp(expected, axis=0).min() > 0.1  # else any constant would do
+
+
+def test_memory_and_masks_are_inputs_that_matter(tmp_path):
+    agent = agent_of("RecurrentPPO", "Box")
+    session = onnxruntime.InferenceSession(agent.export(tmp_path / "policy.onnx").path)
+    state, memory = None, {one.name: np.zeros((1, 8), np.float32) for one in session.get_inputs()[1:-1]}
+    for i, one in enumerate(observations(agent, 30, seed=3)):
+        start = np.array([i % 10 == 0])
+        action, state = agent.predict(one[None], state, start, deterministic=True)
+        given = {"observation": one[None], "episode_start": start, **memory}
+        found = session.run(None, given)
+        np.testing.assert_allclose(found[0], action, atol=1e-5)
+        memory = dict(zip(memory, found[1:], strict=True))
+    masked = agent_of("MaskablePPO", "Discrete")
+    session = onnxruntime.InferenceSession(masked.export(tmp_path / "masked.onnx").path)
+    obs = np.zeros((3, 4), np.float32)
+    (action,) = session.run(None, {"observation": obs, "action_mask": np.eye(3, dtype=bool)})
+    assert action.tolist() == [1, 2, 3]
+
+
+def test_noise_is_an_input(tmp_path):
+    agent = agent_of("SAC", "Box")
+    session = onnxruntime.InferenceSession(agent.export(tmp_path / "policy.onnx", noise=True).path)
+    rng = np.random.default_rng(0)
+    obs, noise = rng.normal(size=(20, 4)).astype(np.float32), rng.normal(size=(20, 2)).astype(np.float32)
+    (action,) = session.run(None, {"observation": obs, "noise_0": noise})
+    drawn = sac_policy(agent.state.actor, obs)
+    low, high = agent.action_space.low, agent.action_space.high
+    expected = low + (np.tanh(drawn.mean + np.exp(drawn.log_std) * noise) + 1) * (high - low) / 2
+    np.testing.assert_allclose(action, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "action"), [("PPO", "Discrete"), ("DQN", "Discrete"), ("RecurrentPPO", "Box")])
+def test_uniform_noise_samples_the_policy(name, action, tmp_path):
+    agent = agent_of(name, action)
+    session = onnxruntime.InferenceSession(agent.export(tmp_path / "policy.onnx", noise=True).path)
+    rng, given = np.random.default_rng(0), {}
+    for one in session.get_inputs():
+        shape = [4000, *one.shape[1:]]
+        kind = rng.normal if name == "RecurrentPPO" else rng.random
+        given[one.name] = kind(size=shape).astype(np.float32) if one.type == "tensor(float)" else np.ones(shape, bool)
+    given["observation"] = np.repeat(np.ones((1, 4), np.float32), 4000, axis=0)
+    actions = session.run(None, given)[0]
+    again = agent.predict(given["observation"], deterministic=False)[0]
+    if action == "Discrete":
+        counts, expected = (np.bincount(one, minlength=4) for one in (actions, again))
+        np.testing.assert_allclose(counts, expected, atol=200)  # four standard deviations are 130
+    else:
+        np.testing.assert_allclose(actions.std(axis=0), again.std(axis=0), rtol=0.1)
+
+
+def test_a_policy_without_chance_has_no_noise(tmp_path):
+    with pytest.raises(ValueError, match="always returns the same action"):
+        agent_of("TD3", "Box").export(tmp_path / "policy.onnx", noise=True)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_contract_is_in_the_file_and_beside_it(tmp_path):
+    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=3, learning_starts=10).learn(12)
+    found = agent.export(tmp_path / "policy.onnx", batch=2)
+    session = onnxruntime.InferenceSession(found.path)
+    card = json.loads(session.get_modelmeta().custom_metadata_map["rejeu"])
+    beside = json.loads(found.card.read_text())
+    assert {key: beside[key] for key in card} == card
+    assert (card["algorithm"], card["env_id"], card["seed"], card["steps"]) == ("SAC", "Pendulum-v1", 3, 12)
+    assert card["seconds_per_step"] == 0.05
+    assert card["inputs"][0]["high"] == [1.0, 1.0, 8.0]
+    assert (card["outputs"][0]["low"], card["outputs"][0]["dtype"]) == (-2.0, "float32")
+    assert session.get_inputs()[0].shape == [2, 3]
+    assert beside["check"]["source"] == "Pendulum-v1"
+
+
+def test_c_compiles_as_c_and_is_included_by_cpp(tmp_path):
+    agent_of("RecurrentPPO", "Box", "Dict").export(tmp_path / "my-policy.c")
+    header = (tmp_path / "my-policy.h").read_text()
+    assert "#define MY_POLICY_SPEED_SIZE 3" in header
+    assert "void my_policy_act(const int8_t bits[2], const uint8_t camera_left[432]" in header
+    assert "void my_policy_reset(void);" in header
+
+
+def test_a_file_that_differs_is_not_kept(tmp_path, monkeypatch):
+    agent, path = agent_of("SAC", "Box"), tmp_path / "policy.onnx"
+    path.write_bytes(b"older")
+    scaler = contract.action_scaler
+    monkeypatch.setattr(contract, "action_scaler", lambda space: lambda action: 1.001 * scaler(space)(action))
+    with pytest.raises(ValueError, match=r"differs from predict by .* and was not kept"):
+        agent.export(path)
+    assert path.read_bytes() == b"older"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_choices_that_differ_must_be_equally_good():
+    agent = agent_of("PPO", "Discrete")
+    one = exporting.policy_for(agent, False, 1)
+    recording, _ = exporting.record(agent, one, None)
+    run = lambda inputs: (recording.actions % 3 + 1, np.ones(100))  # noqa: E731
+    assert check.compare(one, recording, run).difference == 1.0
+    equal = jax.tree.map(np.zeros_like, agent.state)
+    agent.run.state = agent.learner.pack(equal)
+    one = exporting.policy_for(agent, False, 1)
+    found = check.compare(one, recording, run)
+    assert (found.difference, found.ties) == (0.0, 100)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("policy.txt", {}, r"no format that a policy can be exported to; there are onnx \(.onnx\), c"),
+        ("policy.onnx", {"to": "tflite"}, "to='tflite' is no format"),
+        ("policy.onnx", {"batch": 0}, "batch=0 must be a number of observations"),
+        ("policy.c", {"batch": 2}, "c takes one observation at a time"),
+    ],
+)
+def test_invalid_arguments_are_one_line(name, arguments, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        agent_of("PPO", "Box").export(tmp_path / name, **arguments)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_command_exports_a_run(tmp_path, capsys):
+    agent = rejeu.PPO("MlpPolicy", "CartPole-v1", seed=0, n_steps=32, batch_size=32)
+    agent.save(tmp_path / "model.safetensors")
+    assert main(["export", str(tmp_path / "model.safetensors"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["target"], found["check"]["source"]) == ("onnx", "CartPole-v1")
+    assert (tmp_path / "model.onnx").is_file()
+    assert main(["export", str(tmp_path / "missing"), "--to", "c"]) == 2
+    assert main(["export", str(tmp_path / "model.safetensors"), "--out", str(tmp_path / "policy.exe")]) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert "there is no run folder or model file" in errors[0]
+    assert "is no format that a policy can be exported to" in errors[1]
