@@ -38,8 +38,8 @@ from gymnasium import spaces
 from provenance import provenance, write
 
 import rejeu
-from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint
+from rejeu.runs.folder import run_files
 from trials.environment_kinds import ENDS, RAISES, REFUSED, TRAINS, WORKERS, Kind, kinds
 
 RESULT = Path(__file__).parent / "results" / "environments.json"

@@ -132,8 +132,8 @@ def vector(case: Case) -> Any:
 def live(name: str, folder: str, kept: bool) -> None:
     """Trains to the end, from the newest checkpoint if there is one. Prints the first step and a final digest."""
     import rejeu
-    from rejeu.agents.run_files import run_files
     from rejeu.callbacks import Checkpoint
+    from rejeu.runs.folder import run_files
 
     case = CASES[name]
     agent_class = rejeu.AGENTS[case.algorithm]

@@ -18,10 +18,11 @@ import pytest
 
 import rejeu
 from rejeu import xla
-from rejeu.agents.run_files import copy_run, run_files
+from rejeu.agents.run_files import copy_run
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.io import checkpoint
+from rejeu.runs.folder import run_files
 from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.io import failed_writes
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.reporting.logging import CsvFile, TensorBoard
+from rejeu.runs.folder import run_files
 from rejeu.sb3.common.callbacks import CheckpointCallback, EvalCallback
 from tests.full_disk import FullDisk
 from tests.helpers import small_sac

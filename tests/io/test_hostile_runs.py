@@ -14,10 +14,10 @@ import pytest
 
 import rejeu
 from rejeu.agents.resume import like, restore_buffer
-from rejeu.agents.run_files import run_files
 from rejeu.callbacks import Checkpoint
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, tensors
+from rejeu.runs.folder import run_files
 from tests import hostile_files
 from tests.agents.test_resume import BALL, OFF, SMALL, vector
 from tests.sharing import shared_learners

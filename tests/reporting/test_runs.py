@@ -97,6 +97,15 @@ def test_interrupted_and_crashed_run(folder):
     assert read_run(aged(folder)).state == "crashed"
 
 
+def test_steps_without_an_episode_are_those_of_the_newest_checkpoint(folder):
+    for name in ("episodes", "evaluations", "metrics"):
+        (folder / f"{name}.csv").write_bytes(b"step\n")
+    (folder / "checkpoints").mkdir()
+    for step in (0, 60):
+        (folder / "checkpoints" / f"run_{step:012d}.safetensors").touch()
+    assert (read_run(folder).steps, read_run(folder).state) == (60, "interrupted")
+
+
 def test_running_run_by_its_lock(folder):
     (folder / "checkpoints").mkdir()
     with FileLock(folder / "checkpoints" / "lock"):

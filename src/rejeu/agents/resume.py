@@ -24,7 +24,6 @@ from rejeu.agents.run_files import (
     RunHeader,
     SavedBest,
     SavedRun,
-    run_files,
     run_folder,
     versions,
 )
@@ -43,6 +42,7 @@ from rejeu.loops.checks import is_finite
 from rejeu.loops.packing import Readings
 from rejeu.loops.run import Run
 from rejeu.loops.training_call import TrainingCall
+from rejeu.runs.folder import run_files
 from rejeu.validation import number, whole_seed
 
 A = TypeVar("A", bound=BaseAgent)

@@ -42,8 +42,8 @@ from rejeu.io import atomic, checkpoint, json_arrays
 from rejeu.io.records import Count, Positive, Seconds
 from rejeu.loops import nonfinite
 from rejeu.loops.run import Run
+from rejeu.runs.folder import run_files, step_of
 
-RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 ROWS_FILE = re.compile(r"rows_\d{12}_[0-9a-f]+\.safetensors")
 SCALARS = ("learn_from", "owed", "steps_since_update")
 """Counters of a run that model files do not hold."""
@@ -210,26 +210,6 @@ def _remove(path: Path) -> None:
     """Removes a file; if that fails, the next checkpoint tries again."""
     with suppress(OSError):
         path.unlink()
-
-
-def run_files(folder: Path) -> list[Path]:
-    """Returns the checkpoints in a folder, newest first."""
-    if not folder.is_dir():
-        return []
-    return sorted((path for path in folder.iterdir() if RUN_FILE.fullmatch(path.name)), reverse=True)
-
-
-def step_of(path: Path) -> int:
-    """Returns the environment step of a checkpoint."""
-    found = RUN_FILE.fullmatch(path.name)
-    assert found is not None
-    return int(found[1])
-
-
-def newest_step(folder: Path) -> int:
-    """Returns the environment step of the newest checkpoint in a folder, -1 if there is none."""
-    found = run_files(folder)
-    return step_of(found[0]) if found else -1
 
 
 UPDATES = 3

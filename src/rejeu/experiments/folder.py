@@ -26,7 +26,6 @@ import numpy as np
 from filelock import FileLock
 from msgspec import Meta
 
-from rejeu.agents.run_files import newest_step
 from rejeu.errors import CheckpointError
 from rejeu.experiments.jobs import MAX_JOBS, Job, Resources, from_file
 from rejeu.experiments.process import hold
@@ -35,6 +34,7 @@ from rejeu.io.records import Malformed, convert, parse_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
 from rejeu.runs.config import RunConfig, Task
+from rejeu.runs.folder import newest_step
 from rejeu.runs.values import quoted
 
 SWEEP, PLAN, HIDDEN = "sweep.json", "plan.toml", ".sweep"

@@ -32,7 +32,7 @@ from filelock import FileLock
 from msgspec import Meta
 
 from rejeu import presets
-from rejeu.agents.run_files import copy_run, newest_step, run_files, step_of
+from rejeu.agents.run_files import copy_run
 from rejeu.algorithms.search import FIXED_AT_START, Choice, Dimension, NearOne, SearchSpace, Uniform, plain
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.experiments import space as spaces, study_plan as plans
@@ -46,6 +46,7 @@ from rejeu.io.records import Count, Malformed, convert, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS
 from rejeu.reporting.tables import read_table
 from rejeu.runs.config import RunConfig, Task
+from rejeu.runs.folder import newest_step, run_files, step_of
 
 FILE = "population.json"
 """File that makes a folder one of a population."""

@@ -22,11 +22,11 @@ from typing import Literal, Protocol
 
 from filelock import FileLock
 
-from rejeu.agents.run_files import newest_step
 from rejeu.experiments.process import hold, last_line
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.runs import is_locked
 from rejeu.runs.config import Task, write_task
+from rejeu.runs.folder import newest_step
 from rejeu.supervised import TAKEN
 
 POLL = 0.2

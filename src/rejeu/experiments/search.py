@@ -19,7 +19,6 @@ import numpy as np
 
 from rejeu import presets, validation
 from rejeu.agents import AGENTS
-from rejeu.agents.run_files import newest_step
 from rejeu.experiments import scheduler as schedulers
 from rejeu.experiments.process import LocalLauncher
 from rejeu.experiments.scheduler import Scheduler, Work
@@ -32,6 +31,7 @@ from rejeu.reporting.comparison import Comparison, compare
 from rejeu.reporting.runs import EVALUATIONS, Run, read_run
 from rejeu.reporting.tables import read_table
 from rejeu.runs.config import RunConfig, Task
+from rejeu.runs.folder import newest_step
 
 if TYPE_CHECKING:
     import optuna

@@ -25,7 +25,7 @@ from rejeu.errors import CheckpointError
 from rejeu.io.records import Malformed, convert, is_deep, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
 from rejeu.runs.config import MAX_BYTES, RunConfig, parse
-from rejeu.runs.folder import RunFolder, newest_inside
+from rejeu.runs.folder import RunFolder, newest_inside, newest_step
 from rejeu.runs.values import quoted
 
 RENAMED = {
@@ -104,7 +104,7 @@ class Run:
     versions: Mapping[str, str] = field(default_factory=dict)
     state: State = "unknown"
     steps: int = 0
-    """Environment steps done."""
+    """Environment steps done, by the tables and the newest checkpoint."""
     steps_asked: int | None = None
     """Environment steps to do; None if unknown, or if the run is limited by ``minutes_asked``."""
     minutes_asked: float | None = None
@@ -192,7 +192,7 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
         path=folder,
         name=shown(folder.name, MAX_NAME),
         versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
-        steps=max((int(part.column("step")[-1]) for part in tables if len(part)), default=0),
+        steps=max(0, newest_step(files.checkpoints), *(int(part.column("step")[-1]) for part in tables if len(part))),
         seconds=max((one[-1] for one in times if len(one) and math.isfinite(one[-1])), default=math.nan),
         episodes=Episodes.of(table),
         evaluations=evaluations,

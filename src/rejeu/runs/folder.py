@@ -17,6 +17,9 @@ from rejeu.runs import config
 from rejeu.runs.config import DecidedRun
 from rejeu.runs.values import quoted
 
+RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
+"""Name of a checkpoint, with its environment step."""
+
 
 @dataclass(frozen=True)
 class File:
@@ -163,3 +166,23 @@ def find_model(run: Path, which: Literal["best", "last"]) -> Path:
             f"{run} holds no {model.name}; is it a run folder? --which {other} takes the other model"
         )
     return model
+
+
+def run_files(folder: Path) -> list[Path]:
+    """Returns the checkpoints in a folder, newest first."""
+    if not folder.is_dir():
+        return []
+    return sorted((path for path in folder.iterdir() if RUN_FILE.fullmatch(path.name)), reverse=True)
+
+
+def step_of(path: Path) -> int:
+    """Returns the environment step of a checkpoint."""
+    found = RUN_FILE.fullmatch(path.name)
+    assert found is not None
+    return int(found[1])
+
+
+def newest_step(folder: Path) -> int:
+    """Returns the environment step of the newest checkpoint in a folder, -1 if there is none."""
+    found = run_files(folder)
+    return step_of(found[0]) if found else -1
