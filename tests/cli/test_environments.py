@@ -287,12 +287,17 @@ gym.register("Wrong-v0", "wrong_env:Wrong")
 """
 
 
-def test_check_finds_all_errors_and_train_refuses_with_the_same_lines(here, capsys):
-    (here / "wrong_env.py").write_text(WRONG)
-    assert main(["check", "wrong_env.py"]) == 1
+@pytest.mark.parametrize(
+    ("arguments", "fault"), [("self", "takes no seed"), ("self, *, seed=None", "takes no options")]
+)
+def test_check_finds_all_errors_and_train_refuses_with_the_same_lines(arguments, fault, here, capsys):
+    name = fault.replace(" ", "_")
+    wrong = WRONG.replace("reset(self)", f"reset({arguments})").replace("Wrong-v0", f"{name}-v0")
+    (here / f"{name}.py").write_text(wrong.replace("wrong_env", name))
+    assert main(["check", f"{name}.py"]) == 1
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("error: ")]
     parts = [
-        "takes no seed",
+        fault,
         "reset returned the observation only",
         "dtype float64",
         "shape (1,)",
@@ -301,7 +306,7 @@ def test_check_finds_all_errors_and_train_refuses_with_the_same_lines(here, caps
     ]
     assert len(lines) == len(parts)
     assert all(any(part in line for line in lines) for part in parts)
-    assert main(["train", "wrong_env.py", "--steps", "10", "--out", "run"]) == 2
+    assert main(["train", f"{name}.py", "--steps", "10", "--out", "run"]) == 2
     assert capsys.readouterr().err.splitlines()[: len(lines)] == lines
     assert not (here / "run").exists()
 

@@ -153,7 +153,7 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
-    if (fault := validation.seed_fault(env)) is not None:
+    if (fault := validation.arguments_fault(env)) is not None:
         found["seed"] = Finding("error", fault)
         env = env.unwrapped  # wrappers pass a seed on
     if _reset(env, found, None if fault else SEED) is None:

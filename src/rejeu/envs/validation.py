@@ -151,7 +151,7 @@ def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] 
     try:
         return env.reset(**arguments)  # type: ignore[arg-type]
     except TypeError as error:
-        if seed is not None and (fault := seed_fault(env)) is not None:
+        if seed is not None and (fault := arguments_fault(env)) is not None:
             raise BadEnvironmentError(fault) from error
         raise
 
@@ -234,14 +234,16 @@ def to_vector(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
     return kept
 
 
-def seed_fault(env: gym.Env) -> str | None:
-    """Describes which of an environment and its wrappers cannot be reset with a seed."""
+def arguments_fault(env: gym.Env) -> str | None:
+    """Describes which of an environment and its wrappers cannot be reset with a seed, or with the options of a wrapper."""
     layer: Any = env
     while layer is not None:
         parameters = inspect.signature(layer.reset).parameters
-        if "seed" not in parameters and all(one.kind is not one.VAR_KEYWORD for one in parameters.values()):
+        needed = ("seed",) if layer is env else ("seed", "options")  # of which wrappers pass on both
+        missing = [name for name in needed if name not in parameters]
+        if missing and all(one.kind is not one.VAR_KEYWORD for one in parameters.values()):
             return (
-                f"{type(layer).__name__}.reset({', '.join(parameters)}) takes no seed, expected "
+                f"{type(layer).__name__}.reset({', '.join(parameters)}) takes no {missing[0]}, expected "
                 "reset(*, seed=None, options=None); add the arguments, and call super().reset(seed=seed) in it"
             )
         layer = getattr(layer, "env", None) if isinstance(layer, gym.Wrapper) else None
