@@ -36,7 +36,7 @@ from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
 from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
 from rejeu.algorithms.rollout_config import RolloutConfig  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
-from rejeu.presets.result import Result  # noqa: E402
+from rejeu.presets import Result  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
 PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"

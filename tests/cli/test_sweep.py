@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import load_file
 
 import rejeu
-from rejeu import cli, supervised
+from rejeu import cli, interrupt
 from rejeu.experiments.folder import read_folder
 
 PLAN = """\
@@ -33,9 +33,9 @@ PPO.n_steps = 32
 """
 CHILD = """
 import signal, sys, time
-from rejeu import supervised
+from rejeu import interrupt
 signal.signal(signal.SIGTERM, lambda *_: (print("stopping", flush=True), sys.exit(143)))
-with supervised.by_parent():
+with interrupt.by_parent():
     print(repr(sys.stdin.read()), flush=True)
     for _ in range(600):  # Python handles a signal of another thread between two calls
         time.sleep(0.1)
@@ -79,7 +79,7 @@ def child(tmp_path):
         [sys.executable, "-c", CHILD],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        env={**os.environ, supervised.LOCK: str(lock)},
+        env={**os.environ, interrupt.LOCK: str(lock)},
         text=True,
     )
     yield process, lock

@@ -10,7 +10,7 @@ import pytest
 
 from rejeu.agents import PPO
 from rejeu.envs.make import make_vector
-from rejeu.envs.workers.arrivals import checked_record
+from rejeu.envs.workers.vector import checked_record
 from rejeu.errors import WorkerError
 from tests.worker_environments import Gated, Losable, Paced
 

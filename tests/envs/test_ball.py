@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from scipy.stats import norm
 
 import rejeu
-from rejeu.envs.ball.ball import Ball
+from rejeu.envs.ball import Ball
 from rejeu.errors import MissingExtra
 
 NOTHING = np.zeros(2, np.float32)

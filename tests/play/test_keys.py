@@ -10,7 +10,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete, MultiBinary
 
 from rejeu.play import keys
-from rejeu.play.known import KNOWN, full_name, keys_for
+from rejeu.play.keys import KNOWN, full_name, keys_for
 from rejeu.play.window import legend
 
 LANDER, MOUNTAIN = Discrete(4), Discrete(3)

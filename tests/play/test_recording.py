@@ -11,7 +11,7 @@ import pytest
 from rejeu.cli import main
 from rejeu.envs.registry import make_env
 from rejeu.play import play
-from rejeu.reporting.video_file import HOLD_SECONDS
+from rejeu.reporting.video import HOLD_SECONDS
 from tests.playing import LEVER, Lever, down, error_of, hold, perform, tap, up
 from tests.reporting.test_video import decode
 

@@ -9,7 +9,7 @@ import pytest
 
 from rejeu.reporting import run_list
 from rejeu.reporting.comparison import compare
-from rejeu.reporting.other_programs import read_monitor
+from rejeu.reporting.run_list import read_monitor
 
 RECORDED = Path(__file__).parents[1] / "golden" / "sb3_monitor"
 ZOO = RECORDED / "ppo" / "CartPole-v1_1"

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rejeu.envs.ball.ball import Ball
+from rejeu.envs.ball import Ball
 from rejeu.reporting import plots
 
 

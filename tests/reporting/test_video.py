@@ -21,9 +21,8 @@ import pytest
 import rejeu
 from rejeu.envs import rendering
 from rejeu.errors import MissingExtra
-from rejeu.reporting import video_file
-from rejeu.reporting.video import record_video, rendering_env, show_videos
-from rejeu.reporting.video_file import VideoFile
+from rejeu.reporting import video as video_file
+from rejeu.reporting.video import VideoFile, record_video, rendering_env, show_videos
 from tests.tiers import exhaustive
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rejeu
-from rejeu import errors, hardware, interrupt, supervised
+from rejeu import errors, hardware, interrupt
 from rejeu.cli import parsing
 from rejeu.cli.commands import COMMANDS, MODULES, check_options, of_task
 from rejeu.runs.config import read_task
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     hardware.quiet_sdl()
-    with interrupt.leaving(), supervised.by_parent(), warnings.catch_warnings():
+    with interrupt.leaving(), interrupt.by_parent(), warnings.catch_warnings():
         warnings.showwarning = show_warning
         status = run_command(argv)
     if status in (128 + number for number in interrupt.NAMES):

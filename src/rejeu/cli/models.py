@@ -87,7 +87,7 @@ def run_watch(arguments: Watch) -> tuple[int, dict[str, Any]]:
 def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
     """Lets a person play, alone or next to an agent, and prints the scores."""
     from rejeu.play import play
-    from rejeu.play.known import full_name
+    from rejeu.play.keys import full_name
 
     made = environment.from_arguments(full_name(arguments.env), arguments)
     agent = None

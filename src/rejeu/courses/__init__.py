@@ -3,7 +3,31 @@
 :mod:`rejeu.courses.notebooks` describes how to write one, :mod:`rejeu.courses.checks` how answers are checked.
 """
 
-from rejeu.courses.games import by_hand
+from typing import Any
+
+from rejeu.courses.checks.base import SESSION
 from rejeu.courses.notebooks import LANGUAGES, Language, Version, minutes, notebook, sources, steps, text, write
+from rejeu.errors import MissingExtra
 
 __all__ = ["LANGUAGES", "Language", "Version", "by_hand", "minutes", "notebook", "sources", "steps", "text", "write"]
+
+
+def by_hand(env: str, episodes: int, seed: int | None = None, against: Any = None) -> list[float]:
+    """Opens a window to play an environment by hand, and returns your scores; without a display it prints that and returns.
+
+    Args:
+        env: an id, or Car, Mountain or Lunar.
+        episodes: the window closes after this number of episodes.
+        seed: seed of the first episode; each further one adds one.
+        against: an agent that plays the same episodes next to you. Its scores are printed.
+    """
+    from rejeu.play import play
+
+    try:
+        game = play(env, episodes=episodes, seed=seed, against=against)
+    except (MissingExtra, OSError) as error:
+        print(SESSION.say("no_game" if isinstance(error, MissingExtra) else "no_window", what=error))
+        return []
+    for opponent in game.players[1:]:
+        print(opponent.name, opponent.scores)
+    return game.players[0].scores

@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv, make_vector
 
 if "rejeu/Ball-v0" not in gym.registry:
-    gym.register("rejeu/Ball-v0", "rejeu.envs.ball.ball:Ball", max_episode_steps=500)
+    gym.register("rejeu/Ball-v0", "rejeu.envs.ball:Ball", max_episode_steps=500)
 if "rejeu/CartPoleNoVelocity-v0" not in gym.registry:
     gym.register(
         "rejeu/CartPoleNoVelocity-v0",
-        "rejeu.envs.partially_observable:cart_pole_without_velocities",
+        "rejeu.envs.wrappers:cart_pole_without_velocities",
         max_episode_steps=500,
         reward_threshold=475.0,
     )

@@ -1,8 +1,8 @@
 """Action masks: which actions an environment allows, passed along with its observations.
 
-An environment returns the mask in ``info["action_mask"]``, at reset and at every step, or by a method ``action_masks()``. It
-is an array of booleans or of zeros and ones: one for each action of a Discrete space, one for each option of every choice of a
-MultiDiscrete space, one for each bit of a MultiBinary space that may be 1.
+An environment returns the mask in ``info["action_mask"]``, at reset and at every step, or by a method ``action_masks()``; one
+in JAX has a method ``action_mask``. The mask is an array of booleans or of zeros and ones: one for each action of a Discrete
+space, one for each option of every choice of a MultiDiscrete space, one for each bit of a MultiBinary space that may be 1.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import gymnasium as gym
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
+from jax import Array
 
 from rejeu.core import Masked
 from rejeu.envs import snapshot
-from rejeu.envs.functional import masks as functional_masks, registry as functional
+from rejeu.envs.functional import registry as functional
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.goals import GoalFunctions
@@ -208,7 +211,7 @@ def make_masked(
         env = make_vector(env, n_envs, "jax", seed)
     if isinstance(env, JaxVector):
         n = n_choices(env.action_space, env.env_id)
-        masked = MaskedVector(env.with_env(functional_masks.MaskInObservation(env.env, n), seed))
+        masked = MaskedVector(env.with_env(FunctionalMask(env.env, n), seed))
         masked.made_from = env.made_from
         return masked
     if isinstance(env, InProcess):
@@ -232,3 +235,46 @@ def make_masked(
     masked = MaskedVector(vector)
     masked.made_from = made_from
     return masked
+
+
+class FunctionalMask(FunctionalEnv):
+    """An environment in JAX whose observations are dicts of ``observation`` and ``action_mask``, ``int8 (n_choices,)``.
+
+    Raises:
+        BadEnvironmentError: by ``reset`` and ``step``, if the environment has no masks.
+    """
+
+    env: FunctionalEnv
+    n_choices: int = eqx.field(static=True)
+    max_episode_steps: int | None = eqx.field(static=True)
+
+    def __init__(self, env: FunctionalEnv, n_choices: int) -> None:
+        self.env, self.n_choices, self.max_episode_steps = env, n_choices, env.max_episode_steps
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        return spaces.Dict({OBSERVATION: self.env.observation_space, MASK: spaces.MultiBinary(self.n_choices)})
+
+    @property
+    def action_space(self) -> spaces.Space:
+        return self.env.action_space
+
+    def reset(self, key: Array) -> tuple[Any, Any]:
+        state, obs = self.env.reset(key)
+        return state, self._observe(state, obs)
+
+    def step(self, key: Array, state: Any, action: Array) -> tuple[Any, Any, Array, Array, Array]:
+        state, obs, *rest = self.env.step(key, state, action)
+        return state, self._observe(state, obs), *rest
+
+    def success(self, state: Any) -> Array | None:
+        return self.env.success(state)
+
+    def _observe(self, state: Any, obs: Any) -> dict[str, Any]:
+        mask = self.env.action_mask(state)
+        if mask is None or mask.shape != (self.n_choices,):
+            shape = "None" if mask is None else f"the shape {mask.shape}"
+            raise BadEnvironmentError(
+                f"{type(self.env).__name__}.action_mask returned {shape}, expected a mask of the shape ({self.n_choices},)"
+            )
+        return {OBSERVATION: obs, MASK: mask.astype(jnp.int8)}

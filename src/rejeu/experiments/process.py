@@ -10,7 +10,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from rejeu import hardware, supervised
+from rejeu import hardware, interrupt
 from rejeu.io import atomic
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -41,7 +41,7 @@ class Process:
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 cwd=folder,
-                env={**environ, supervised.LOCK: str(lock)},
+                env={**environ, interrupt.LOCK: str(lock)},
                 process_group=0 if os.name == "posix" else None,  # Ctrl-C reaches it once, through stop
             )
 

@@ -23,11 +23,10 @@ from typing import Literal, Protocol
 from filelock import FileLock
 
 from rejeu.experiments.process import hold, last_line
-from rejeu.interrupt import Interrupt
+from rejeu.interrupt import TAKEN, Interrupt
 from rejeu.reporting.runs import is_locked
 from rejeu.runs.config import Task, write_task
 from rejeu.runs.folder import newest_step
-from rejeu.supervised import TAKEN
 
 POLL = 0.2
 """Seconds between two looks at the processes."""

@@ -22,8 +22,7 @@ from rejeu.envs.rendering import make_rendering_env, natural_fps
 from rejeu.envs.validation import id_of
 from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Pace, Player
-from rejeu.play.keys import KeyMap
-from rejeu.play.known import full_name, keys_for
+from rejeu.play.keys import KeyMap, full_name, keys_for
 from rejeu.play.recording import Recording
 from rejeu.play.window import Window
 from rejeu.validation import number, whole

@@ -16,7 +16,7 @@ from rejeu.envs.rendering import environment_variable
 from rejeu.envs.validation import id_of
 from rejeu.errors import MissingExtra
 from rejeu.reporting.formatting import counted
-from rejeu.reporting.video_file import HOLD_SECONDS, VideoFile, ffmpeg
+from rejeu.reporting.video import HOLD_SECONDS, VideoFile, ffmpeg
 
 VIDEO_NAME = "video.mp4"
 

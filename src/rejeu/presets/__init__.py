@@ -1,4 +1,7 @@
-"""Tuned hyperparameters as data (``presets.toml``), and their measured results.
+"""Tuned hyperparameters as data (``presets.toml``), their form as a file, and their measured results (``results.json``).
+
+``rejeu tune`` writes a preset to a file, which is untrusted data, and ``rejeu train --preset`` uses it. ``scripts/figures.py``
+writes the results.
 
 >>> find("parking-v0").algorithm
 'SAC'
@@ -7,12 +10,160 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
-from rejeu.presets.preset import Preset, built_in, read, write
-from rejeu.presets.result import Result, find_result, results
+import msgspec
+from msgspec import Meta
+
+from rejeu.errors import CheckpointError
+from rejeu.io import atomic
+from rejeu.io.records import EnvCount, Malformed, Positive, convert, read_json, shown
+
+MAX_BYTES = 2**20
+"""Upper limit on the size of a file."""
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """Tuned settings of one algorithm for one environment."""
+
+    env_id: Name
+    """Id of the environment."""
+    algorithm: Name
+    """Name of the algorithm, a key of ``rejeu.AGENTS``."""
+    hyperparameters: Mapping[str, Any] = field(hash=False)
+    """Hyperparameters that differ from the algorithm's defaults, as keyword arguments of the agent; read-only."""
+    n_envs: EnvCount
+    """Number of parallel environments."""
+    total_steps: Positive
+    """Environment steps of a full run, over all environments."""
+    evaluate_every: Positive
+    """Environment steps between two evaluations."""
+    evaluate_episodes: Annotated[int, Meta(ge=1, le=10_000)]
+    """Episodes of each evaluation."""
+    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async|jax)$")] = "auto"
+    """Backend of the environments, as for ``make_vector``."""
+    source: Annotated[str, Meta(max_length=1000)] = ""
+    """Origin of the hyperparameters."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hyperparameters", MappingProxyType(dict(self.hyperparameters)))
+
+
+def built_in() -> tuple[Preset, ...]:
+    """Returns the presets of rejeu, in the order of ``presets.toml``."""
+    text = resources.files("rejeu.presets").joinpath("presets.toml").read_text(encoding="utf-8")
+    return tuple(convert(one, Preset) for one in tomllib.loads(text)["preset"])
+
+
+def write(preset: Preset, path: str | Path) -> Path:
+    """Writes a preset to a JSON file and returns its path.
+
+    Raises:
+        TypeError: if a hyperparameter is not a JSON value, such as a network of your own.
+    """
+    fields = {one.name: getattr(preset, one.name) for one in dataclasses.fields(preset)}
+    try:
+        text = json.dumps({**fields, "hyperparameters": dict(preset.hyperparameters)}, indent=2, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"the preset of {preset.env_id} has hyperparameters that a file cannot hold: {error}") from None
+    path = Path(path)
+    with atomic.replacing(path) as file:
+        file.write(f"{text}\n".encode())
+    return path
+
+
+def read(path: str | Path) -> Preset:
+    """Returns the preset of a file. The hyperparameters are checked by the algorithm that they are given to.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it is damaged, or something else than a preset.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no preset file {path}; rejeu tune writes one as preset.json")
+    try:
+        return convert(read_json(path, MAX_BYTES), Preset)
+    except (Malformed, CheckpointError) as error:
+        raise CheckpointError(f"{path} is no preset: {shown(error, 1000)}") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What an algorithm reached in an environment, over several seeds."""
+
+    env_id: str
+    """Id of the environment."""
+    algorithm: str
+    """Name of the algorithm."""
+    setting: str
+    """What was not as in the preset, such as ``"sigma=1"``; empty if nothing was."""
+    measure: str
+    """``"mean return"`` or ``"success rate"``."""
+    mean: float
+    """Mean over the seeds."""
+    low: float
+    """Lower end of the 95 % confidence interval of the mean return; of success rates the lowest of a seed."""
+    high: float
+    """Upper end, or the highest of a seed."""
+    seeds: int
+    """Number of seeds."""
+    episodes: int
+    """Episodes of the evaluation of each seed."""
+    budget: str
+    """What each seed was trained for, such as ``"20,000 steps"``."""
+    seconds: tuple[float, float]
+    """Shortest and longest training of a seed."""
+    command: str
+    """The command that measures it."""
+
+    def __str__(self) -> str:
+        """The result in a few words."""
+        return ", ".join(filter(None, (f"{self.measure} {self.figures}", f"{self.seeds} seeds", self.setting)))
+
+    @property
+    def figures(self) -> str:
+        """Mean and spread.
+
+        >>> find_result("Pendulum-v1", "TD3").figures
+        '-156.2 (-158.2 to -154.2)'
+        """
+        show = _percent if self.measure == "success rate" else _number
+        if self.low == self.high:
+            return show(self.mean)
+        return f"{show(self.mean)} ({show(self.low).removesuffix(' %')} to {show(self.high)})"
+
+
+def _number(number: float) -> str:
+    """Returns a return with one decimal, or with two if it is below 1."""
+    return f"{number:.{1 if abs(number) >= 1 else 2}f}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}".removesuffix(".0") + " %"
+
+
+@cache
+def results() -> tuple[Result, ...]:
+    """Returns every result; of several for one preset the first is of the preset as it is."""
+    content = resources.files("rejeu.presets").joinpath("results.json").read_bytes()
+    return msgspec.json.decode(content, type=tuple[Result, ...])
+
+
+def find_result(env_id: str, algorithm: str) -> Result | None:
+    """Returns the first result of an algorithm in an environment, None if there is none."""
+    return next((result for result in results() if (result.env_id, result.algorithm) == (env_id, algorithm)), None)
+
 
 ALL: tuple[Preset, ...] = built_in()
 """Every preset of rejeu. The first one of an environment is the one that ``rejeu train`` uses."""

@@ -19,8 +19,18 @@ from rejeu.io.records import shown
 from rejeu.reporting import statistics
 from rejeu.reporting.charts import GROUP_COLORS, group_chart
 from rejeu.reporting.formatting import cell, counted, csv_text, markdown_table, number
-from rejeu.reporting.grouping import By, group_labels, settings
-from rejeu.reporting.run_curves import FINAL, N_POINTS, Axis, Curve, Score, cut_to_shortest, scale
+from rejeu.reporting.grouping import (
+    FINAL,
+    N_POINTS,
+    Axis,
+    By,
+    Curve,
+    Score,
+    cut_to_shortest,
+    group_labels,
+    scale,
+    settings,
+)
 from rejeu.reporting.run_list import read_all
 from rejeu.reporting.runs import Run
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu.envs.ball.ball import Ball as Reference
+from rejeu.envs.ball import Ball as Reference
 from rejeu.envs.functional import ball, make
 
 

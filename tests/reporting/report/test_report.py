@@ -132,7 +132,7 @@ def test_deeply_nested_configuration_is_a_note(tmp_path):
 def test_videos_are_embedded_within_the_budget_and_else_linked(tmp_path, monkeypatch):
     folder = write(tmp_path / "run")
     (folder / "video.mp4").write_bytes(MP4)
-    monkeypatch.setattr("rejeu.reporting.report.videos.BUDGET", len(MP4) * 2 + 10)
+    monkeypatch.setattr("rejeu.reporting.report.sections.BUDGET", len(MP4) * 2 + 10)
     text = text_of(folder)
     assert text.count('src="data:video/mp4;base64,') == 2  # of the best model and the last
     assert 'href="./videos/step_000001000.mp4"' in text

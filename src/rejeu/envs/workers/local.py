@@ -6,22 +6,18 @@ threads. On other systems they are spawned. Both run the main script again, up t
 
 from __future__ import annotations
 
-import ast
-import linecache
 import multiprocessing
 import signal
 import sys
 from collections.abc import Callable
-from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.envs.workers import process
+from rejeu.envs.workers.pool import CLOSE_SECONDS, Starter, Worker
 from rejeu.envs.workers.process import Copied, Encoder
-from rejeu.envs.workers.worker import CLOSE_SECONDS, Starter, Worker
-from rejeu.errors import WorkerError
 
 START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 
@@ -91,16 +87,8 @@ class Processes(Starter):
             encoders: takes the ``multiprocessing`` context and returns a function that returns the encoder of each worker by
                 its number. None: observations are sent with the dtypes of the space.
             preload: name of an additional module that the workers need.
-
-        Raises:
-            WorkerError: if the main script would start workers recursively.
         """
         start_method = START_METHOD if start_method is None else start_method
-        if start_method != "fork" and main_runs_again():
-            raise WorkerError(
-                "worker processes run the main script again from its beginning, so what starts them must stand under "
-                "`if __name__ == '__main__':`; put it there, or use backend='gymnasium'"
-            )
         self._context: Any = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
             # Imported once, in the server, so that a worker starts in milliseconds. The import starts no threads.
@@ -114,46 +102,6 @@ class Processes(Starter):
         """Does nothing: the workers own all that was started."""
 
     advice = (
-        "It runs the main script again, so that must be possible to import; backend='gymnasium' does without workers"
-    )
-
-
-def check_sendable(make_one: Callable[[], gym.Env]) -> None:
-    """Raises ``TypeError`` unless the function can be pickled and sent to another process."""
-    try:
-        ForkingPickler.dumps(CloudpickleWrapper(make_one))
-    except Exception as error:  # pickling the objects that it refers to can raise anything
-        raise TypeError(
-            f"the function that makes environments is sent to worker processes, and cannot be pickled: {error}; let it "
-            "make what it needs instead of referring to it, or use backend='gymnasium'"
-        ) from error
-
-
-def main_runs_again() -> bool | None:
-    """Returns whether a worker process, which imports the main script, would execute the current statement again.
-
-    None if this is unknown: in a thread other than the main thread, or if the source of the script is unavailable.
-    """
-    main = sys.modules["__main__"]
-    spec = getattr(main, "__spec__", None)
-    path = getattr(main, "__file__", None)
-    if path is None or (spec is not None and spec.name.endswith("__main__")):
-        return False  # interactive, or a package run with -m: a worker imports neither
-    frame, here = sys._getframe(), None
-    while frame is not None:
-        if frame.f_globals is vars(main) and frame.f_code.co_name == "<module>":
-            here = frame.f_lineno
-        frame = frame.f_back  # type: ignore[assignment]
-    source = "".join(linecache.getlines(path, vars(main)))
-    if here is None or not source:
-        return None
-    try:
-        statements = ast.parse(source).body
-    except SyntaxError:
-        return None
-    return not any(
-        isinstance(statement, ast.If)
-        and statement.lineno <= here <= (statement.end_lineno or here)
-        and any(isinstance(node, ast.Name) and node.id == "__name__" for node in ast.walk(statement.test))
-        for statement in statements
+        "It runs the main script again from its beginning, so what starts workers must stand under "
+        "`if __name__ == '__main__':`; backend='gymnasium' does without workers"
     )

@@ -23,8 +23,8 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu import cluster, validation
 from rejeu.envs.workers import process
+from rejeu.envs.workers.pool import LOOK_SECONDS, Starter, Worker, seconds_until
 from rejeu.envs.workers.process import TOKEN_BYTES, RemoteWorker, ToLeaves
-from rejeu.envs.workers.worker import LOOK_SECONDS, Starter, Worker, seconds_until
 from rejeu.errors import WorkerError
 
 SLOW_START_SECONDS = 30.0

@@ -31,10 +31,9 @@ from rejeu.core import (
     Rollout,
     Transition,
 )
-from rejeu.envs.functional.masks import MaskInObservation
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
-from rejeu.envs.masks import masked
+from rejeu.envs.masks import FunctionalMask, masked
 from rejeu.loops import nonfinite
 from rejeu.loops.learner import td_error_of
 from rejeu.loops.packing import Packing
@@ -335,7 +334,7 @@ def empty_log(capacity: int, n_envs: int) -> EpisodeLog:
 
 def observed(env: FunctionalEnv, obs: PyTree) -> PyTree:
     """Returns a batch of observations as agents see them: with the mask apart if there is one."""
-    if isinstance(env, MaskInObservation):
+    if isinstance(env, FunctionalMask):
         parts = masked(obs)
         return Masked(observed(env.env, parts.obs), parts.mask)
     return plain(env.observation_space, obs)

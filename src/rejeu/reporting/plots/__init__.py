@@ -4,7 +4,6 @@ Every function returns a figure, which notebooks display, and writes it to ``pat
 """
 
 from rejeu.reporting.plots.exploration import noise, repulsive_boundary, saturation
-from rejeu.reporting.plots.results import evaluation, learning_curve
-from rejeu.reporting.plots.trajectories import trajectory
+from rejeu.reporting.plots.results import evaluation, learning_curve, trajectory
 
 __all__ = ["evaluation", "learning_curve", "noise", "repulsive_boundary", "saturation", "trajectory"]
