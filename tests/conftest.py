@@ -79,7 +79,7 @@ def forget_registered() -> Iterator[None]:
     import rejeu
     from rejeu import presets
     from rejeu.buffers.strategies import STRATEGIES
-    from rejeu.envs.functional.registry import REGISTRY
+    from rejeu.envs.functional import REGISTRY
     from rejeu.networks.layers import ENCODERS
 
     registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered, REGISTRY, STRATEGIES, ENCODERS)

@@ -273,31 +273,8 @@ def tau_at(n_updates: Array, tau: float, interval: int) -> Any:
 
 
 def averaged_fields(kind: type) -> set[str]:
-    """Returns the names of the fields of a class that are declared :data:`AVERAGED`.
-
-    Adam's first moment counts as one: it averages gradients whose squares are in the second moment.
-    """
-    if kind is optax.ScaleByAdamState:
-        return {"mu"}
-    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
-    return {field.name for field in fields if field.metadata.get("averaged", False)}
-
-
-def averaged_leaves(state: PyTree) -> list[bool]:
-    """Returns for each leaf of ``state``, in the order of ``jax.tree.leaves``, whether it is in an averaged field."""
-
-    def is_averaged(path: tuple[Any, ...]) -> bool:
-        node = state
-        for key in path:
-            if isinstance(key, jax.tree_util.GetAttrKey):
-                if key.name in averaged_fields(type(node)):
-                    return True
-                node = getattr(node, key.name)
-            else:
-                node = node[key.idx if isinstance(key, jax.tree_util.SequenceKey) else key.key]
-        return False
-
-    return [is_averaged(path) for path, _ in jax.tree_util.tree_leaves_with_path(state)]
+    """Returns the names of the fields of a class of states that are declared :data:`AVERAGED`."""
+    return {field.name for field in dataclasses.fields(kind) if field.metadata.get("averaged", False)}
 
 
 def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:

@@ -22,8 +22,8 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks import calling
 from rejeu.callbacks.base import Callback
 from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.envs.functional import is_functional
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.envs.functional.registry import is_functional
 from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt

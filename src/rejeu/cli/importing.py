@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rejeu.envs.functional.registry import REGISTRY
+from rejeu.envs.functional import REGISTRY
 from rejeu.envs.registry import is_plain_id
 
 

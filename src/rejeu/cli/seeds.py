@@ -22,7 +22,7 @@ from rejeu.cli.commands import Train
 from rejeu.cli.importing import find_id
 from rejeu.cli.output import Stopwatch, echo, header
 from rejeu.cli.session import Session, installed_logs, make_evaluation_env
-from rejeu.envs.functional.registry import is_functional
+from rejeu.envs.functional import is_functional
 from rejeu.envs.make import BACKENDS
 from rejeu.experiments.folder import Sweep, SweepFolder, open_folder
 from rejeu.experiments.jobs import Job, again

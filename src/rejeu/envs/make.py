@@ -13,10 +13,9 @@ from typing import Any, Literal, NamedTuple
 import gymnasium as gym
 
 from rejeu import validation
-from rejeu.envs import seeds
+from rejeu.envs import functional, seeds
 from rejeu.envs.base import Step, VectorEnv
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
-from rejeu.envs.functional import registry as functional
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.gymnasium_vector import GymnasiumVector

@@ -19,8 +19,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.core import Masked
-from rejeu.envs import snapshot
-from rejeu.envs.functional import registry as functional
+from rejeu.envs import functional, snapshot
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.goals import GoalFunctions

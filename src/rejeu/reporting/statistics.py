@@ -19,7 +19,7 @@ COVERAGE = {2: 0.50, 3: 0.75, 4: 0.87, 5: 0.90, 6: 0.90, 7: 0.92, 8: 0.93, 9: 0.
 Scores = Sequence[np.ndarray]
 """Scores of a group: for each environment ``(n_runs, ...)``."""
 Draws = Sequence[np.ndarray]
-"""Bootstrap samples: for each environment row numbers, ``int (n_samples, n_runs, ...)``."""
+"""Bootstrap samples: for each environment row numbers, ``int (n_samples, n_runs)``."""
 Statistic = Callable[[Scores], np.ndarray]
 
 
@@ -82,14 +82,7 @@ def draw(scores: Scores, n_samples: int, rng: np.random.Generator) -> list[np.nd
 
 def resampled(scores: Scores, draws: Draws) -> list[np.ndarray]:
     """Returns the scores of bootstrap samples, for each environment ``(n_runs, n_samples, ...)``."""
-    found = []
-    for one, rows in zip(scores, draws, strict=True):
-        if rows.ndim == one.ndim + 1 and rows.ndim > 2:  # drawn separately at each further place
-            taken = one[(rows, *np.ogrid[tuple(slice(size) for size in one.shape)][1:])]
-        else:
-            taken = one[rows]
-        found.append(np.moveaxis(taken, 1, 0))
-    return found
+    return [np.moveaxis(one[rows], 1, 0) for one, rows in zip(scores, draws, strict=True)]
 
 
 def student(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

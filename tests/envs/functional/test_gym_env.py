@@ -9,9 +9,8 @@ import pytest
 import rejeu
 from rejeu.envs import snapshot
 from rejeu.envs.checker import findings
-from rejeu.envs.functional import make
+from rejeu.envs.functional import REGISTRY, make
 from rejeu.envs.functional.gym_env import GymnasiumEnv
-from rejeu.envs.functional.registry import REGISTRY
 from rejeu.envs.rendering import display_for_pygame
 
 IDS = [*REGISTRY]

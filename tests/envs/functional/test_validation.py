@@ -16,8 +16,7 @@ from gymnasium import spaces
 
 import rejeu
 from rejeu.cli import main
-from rejeu.envs.functional import FunctionalEnv, GoalEnv, make
-from rejeu.envs.functional.registry import REGISTRY
+from rejeu.envs.functional import REGISTRY, FunctionalEnv, GoalEnv, make
 from rejeu.envs.functional.validation import check
 from rejeu.errors import BadEnvironmentError
 

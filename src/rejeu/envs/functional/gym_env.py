@@ -9,8 +9,8 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.envs import functional
 from rejeu.envs.canvas import Drawing, Scene
-from rejeu.envs.functional import registry
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 
@@ -45,12 +45,12 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         self,
         env: FunctionalEnv | str,
         render_mode: str | None = None,
-        drawing: registry.MakeDrawing | None = None,
+        drawing: functional.MakeDrawing | None = None,
         **env_kwargs: Any,
     ) -> None:
         if isinstance(env, str):
-            drawing = registry.drawing_of(env) if drawing is None else drawing
-            env = registry.make(env, **registry.without_limit(env), **env_kwargs)
+            drawing = functional.drawing_of(env) if drawing is None else drawing
+            env = functional.make(env, **functional.without_limit(env), **env_kwargs)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} must be None, 'human' or 'rgb_array'")
         if render_mode is not None and drawing is None:
