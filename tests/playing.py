@@ -10,7 +10,7 @@ import pytest
 
 from rejeu import play as play_package
 from rejeu.cli import main
-from rejeu.play.game import Pace
+from rejeu.play.window import Window
 
 pygame = pytest.importorskip("pygame")
 
@@ -76,7 +76,7 @@ def perform(script, run, *arguments, **settings):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(play_package, "turn", turn)
-        patch.setattr(Pace, "wait", lambda self: None)
+        patch.setattr(Window, "wait", lambda self, fps: None)
         return run(*arguments, **settings)
 
 

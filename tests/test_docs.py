@@ -124,7 +124,7 @@ def windows_close(monkeypatch):
     """Closes each window after some turns."""
     pygame = pytest.importorskip("pygame")
     from rejeu import play as package
-    from rejeu.play.game import Pace
+    from rejeu.play.window import Window
 
     real, count = package.turn, [0]
 
@@ -135,7 +135,7 @@ def windows_close(monkeypatch):
         real(window, game)
 
     monkeypatch.setattr(package, "turn", turn)
-    monkeypatch.setattr(Pace, "wait", lambda self: None)
+    monkeypatch.setattr(Window, "wait", lambda self, fps: None)
 
 
 @pytest.mark.parametrize("page", PYTHON_PAGES, ids=name)

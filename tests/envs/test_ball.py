@@ -177,14 +177,17 @@ def test_picture_shows_the_ball_where_it_is(dimension):
     assert channels == 3
     assert height % 2 == width % 2 == 0  # for videos
     drawing = ball._drawing
-    x, y = drawing._points([ball.position], 0)[0]
+    place = drawing.main.place
+    x, y = drawing.main.points(np.array([ball.position]), 0)[0]
     patch = frame[round(y) - 5 : round(y) + 6, max(round(x) - 5, 0) : round(x) + 6].astype(int)
     assert (patch[..., 2] > patch[..., 0] + 40).mean() > 0.7
-    inside = [(drawing._x(-10), drawing._x(10))] if dimension == 2 else []
+    inside = [(place(-10, 0)[0], place(10, 0)[0])] if dimension == 2 else []
     for left, right in inside:
         assert left < x < right
         assert (x - left) / (right - left) == pytest.approx(0.8)
-    assert (drawing._y(-10) - y) / (drawing._y(-10) - drawing._y(10)) == pytest.approx(0.35 if dimension == 2 else 0.8)
+    assert (place(0, -10)[1] - y) / (place(0, -10)[1] - place(0, 10)[1]) == pytest.approx(
+        0.35 if dimension == 2 else 0.8
+    )
     ball.close()
 
 
@@ -216,12 +219,12 @@ def test_in_three_dimensions_the_third_coordinate_is_drawn_where_it_is():
     middle, low = (ball.render().astype(int) for ball in balls)
     assert middle.shape[0] % 2 == middle.shape[1] % 2 == 0  # for videos
     drawing = balls[0]._drawing
-    plane, (_, second, third) = round(drawing.right), drawing.strips
+    plane, (_, second, third) = round(drawing.main.right), drawing.strips
     assert (middle[:, :plane] == low[:, :plane]).all()
     assert (middle[: int(second.bottom)] == low[: int(second.bottom)]).all()
-    for frame, height in ((middle, 0.0), (low, -5.0 / 12.2)):  # the strip shows 2.2 beyond the walls at 10
+    for frame, height in ((middle, 0.0), (low, -5.0)):  # the strip shows 2.2 beyond the walls at 10
         x, y = third.place(0.0, height)
-        assert y == pytest.approx(third.bottom - (height + 1) / 2 * (third.bottom - third.top))
+        assert y == pytest.approx(third.bottom - (height / 12.2 + 1) / 2 * (third.bottom - third.top))
         red, _, blue = frame[round(y), round(x) + 1]
         assert blue > red + 100
 
@@ -232,7 +235,7 @@ def test_a_ball_lost_outside_the_plane_that_is_drawn_is_seen_and_named():
     ball.step(np.array([0.0, 0.0, 0.0, 2.0]))
     assert ball.over
     ball.render()
-    said = ball._drawing._caption(ball._trail, ball.n_steps, ball.over, True)
+    said = ball._drawing._caption(np.array(ball._trail), ball.n_steps, ball.over, True)
     assert said == "lost in step 1 by x4"
 
 
@@ -241,7 +244,7 @@ def test_many_dimensions_are_drawn_as_the_first_ten_beside_the_plane():
     ball = placed(*[0.0] * 14, render_mode="rgb_array")
     assert ball.render().shape == (666, 940, 3)
     assert len(ball._drawing.strips) == 10
-    assert ball._drawing.strips[-1].bottom == pytest.approx(ball._drawing.bottom)
+    assert ball._drawing.strips[-1].bottom == pytest.approx(ball._drawing.main.bottom)
 
 
 def test_drawing_without_a_render_mode_says_how_to_get_one():

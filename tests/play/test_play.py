@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import play as play_package
 from rejeu.cli import main
 from rejeu.envs.registry import make_env
 from rejeu.play import Game, play, watch
-from rejeu.play.game import Pace, Player
+from rejeu.play.game import Player
 from rejeu.play.window import HEADER, MARGIN, Window, message, score_summary
 from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
 
@@ -269,52 +268,23 @@ def test_own_keys_are_given_on_the_command_line():
 
 def test_the_rate_is_the_environments_own_or_what_is_asked_for(monkeypatch):
     rates = []
-    monkeypatch.setattr(play_package, "Pace", lambda rate: rates.append(rate) or Pace(rate))
-    perform(lambda window, game: iter(()), play, LEVER)
-    perform(lambda window, game: iter(()), play, LEVER, fps=7)
-    assert rates == [20, 7]
+
+    def script(window, game):
+        monkeypatch.setattr(window, "wait", rates.append)
+        yield
+
+    perform(script, play, LEVER)
+    perform(script, play, LEVER, fps=7)
+    assert {*rates} == {20, 7}
 
 
-class Clock:
-    """Time that goes by only while somebody sleeps or works."""
-
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
-
-    def go(self, seconds):
-        self.now += seconds
-
-
-def test_the_pace_does_not_drift_whatever_the_work_takes():
-    clock = Clock()
-    pace = Pace(10, clock, clock.go)
-    moments = []
-    for work in (0.01, 0.09, 0.0, 0.15, 0.02, 0.05):  # the fourth takes longer than a period, the next makes up for it
-        clock.go(work)
-        pace.wait()
-        moments.append(clock.now - 100)
-    np.testing.assert_allclose(moments, [0.1, 0.2, 0.3, 0.45, 0.5, 0.6])
-
-
-def test_after_a_long_delay_the_pace_goes_on_from_there():
-    clock = Clock()
-    pace = Pace(10, clock, clock.go)
-    clock.go(5)
-    moments = []
-    for _ in range(3):
-        pace.wait()
-        moments.append(clock.now - 105)
-    np.testing.assert_allclose(moments, [0, 0.1, 0.2], atol=1e-9)
-
-
-def test_a_real_clock_keeps_the_rate():
-    pace, began = Pace(200), time.perf_counter()
-    for _ in range(40):
-        pace.wait()
-    assert 0.199 <= time.perf_counter() - began < 0.4
+def test_the_window_keeps_the_rate():
+    with Window("rate") as window:
+        window.wait(100)
+        began = time.perf_counter()
+        for _ in range(20):
+            window.wait(100)
+        assert 0.19 <= time.perf_counter() - began < 0.4
 
 
 def test_the_window_shows_both_pictures_side_by_side_and_the_keys_held():

@@ -28,26 +28,39 @@ FINE = 2
 """Supersampling factor: the image is drawn at this multiple of its size and downscaled, for smooth edges."""
 FADING = 80
 """Number of steps over which the trail fades."""
-MARGIN = 2.2
-"""Width of the visible area outside the walls, in units of position."""
+REACH = WALL + 2.2
+"""Largest visible distance from the middle, in units of position; positions beyond are drawn at the edge."""
 LINE_SIZE, PLANE_SIZE, STRIPS_WIDTH = (900, 460), (620, 666), 320
 """Width and height in pixels of the image in one dimension and of the plane. They are even, as videos require."""
 MOST_STRIPS = 10
 """Maximum number of coordinates that are plotted against time next to the plane."""
 
 
-class Strip(NamedTuple):
-    """Area of the plot of one coordinate against time, in pixels."""
+class Panel(NamedTuple):
+    """An area of the picture, in pixels: the plane of the first two coordinates, or one coordinate against time."""
 
     left: float
     top: float
     right: float
     bottom: float
+    low: float
+    high: float
+    """What is at the left and the right edge."""
+    coordinate: int | None = None
+    """The coordinate that is plotted against time, None for the plane."""
 
-    def place(self, share: float, height: float) -> Point:
-        """Returns the pixel coordinates of a time fraction in [0, 1] and a height from -1 (bottom) to 1 (top)."""
-        y = 0.5 * (self.top + self.bottom) - 0.5 * height * (self.bottom - self.top)
-        return self.left + share * (self.right - self.left), y
+    def place(self, x: float, y: float) -> Point:
+        """Returns the pixel of ``x`` on the horizontal axis and the position ``y`` on the vertical one."""
+        share = (x - self.low) / (self.high - self.low)
+        height = (y + REACH) / (2 * REACH)
+        return self.left + share * (self.right - self.left), self.bottom - height * (self.bottom - self.top)
+
+    def points(self, trail: np.ndarray, step: int) -> list[Point]:
+        """Returns the pixels of positions ``(n, dimension)``, the last of which is that of ``step``."""
+        visible = trail.clip(-REACH, REACH)
+        if self.coordinate is None:
+            return [self.place(x, y) for x, y in visible[:, :2].tolist()]
+        return [self.place(step - len(trail) + 1 + i, y) for i, y in enumerate(visible[:, self.coordinate].tolist())]
 
 
 class BallDrawing(Canvas):
@@ -64,85 +77,92 @@ class BallDrawing(Canvas):
         Raises:
             MissingExtra: if pygame is not installed.
         """
-        self.dimension, self.n_steps, self.wall = dimension, n_steps, WALL
+        self.dimension, self.n_steps = dimension, n_steps
         width, height = LINE_SIZE if dimension == 1 else PLANE_SIZE
         size = width + STRIPS_WIDTH if dimension > 2 else width, height
         super().__init__(size, render_mode, "rejeu/Ball-v0", 30.0, FINE)
         self.pygame.font.init()
         self.font = self.pygame.font.Font(None, 22 * FINE)
         self.large_font = self.pygame.font.Font(None, 30 * FINE)
-        self.left, self.top = (64, 72) if dimension == 1 else (46, 76)
-        self.right, self.bottom = width - 26, height - (48 if dimension == 1 else 42)
-        self._draw_field()
+        if dimension == 1:
+            self.main = Panel(64, 72, width - 26, height - 48, 0, n_steps, 0)
+        else:
+            self.main = Panel(46, 76, width - 26, height - 42, -REACH, REACH)
         self.strips = self._strips() if dimension > 2 else []
-        if self.strips:
-            self._text("x1", (self.right - 4, self.bottom + 15), FAINT, "right")
-            self._text("x2", (self.left - 9, self.top + 8), FAINT, "right")
-        for i, strip in enumerate(self.strips):
-            self._draw_strip(i, strip)
+        self.surface.fill(PAPER)
+        for panel in (self.main, *self.strips):
+            self._draw_box(panel)
+        self._draw_labels()
         self.field = self.surface.copy()
 
     def paint(self, scene: Scene) -> None:
-        trail = [[float(x) for x in state.position] for state in scene.states]
+        trail = np.array([state.position for state in scene.states], np.float64).reshape(-1, self.dimension)
         step = int(scene.states[-1].time) if scene.states else 0
-        over = scene.over
-        lost = over and bool(trail) and max(map(abs, trail[-1])) > self.wall
-        color = BALL if not over else LOST if lost else HELD
+        lost = scene.over and len(trail) > 0 and bool(np.abs(trail[-1]).max() > WALL)
+        color = BALL if not scene.over else LOST if lost else HELD
         self.surface.blit(self.field, (0, 0))
-        points = self._points(trail, step)
+        points = self.main.points(trail, step)
         self._draw_trail(points)
+        if scene.action is not None and len(points) > 1:
+            self._draw_push(points[-2], np.clip(scene.action, -MAX_PUSH, MAX_PUSH).tolist())
         if points:
-            if scene.action is not None and len(points) > 1:
-                self._draw_push(points[-2], np.clip(scene.action, -MAX_PUSH, MAX_PUSH).tolist())
             self._draw_ball(points[-1], color)
-        for i, strip in enumerate(self.strips):
-            self._draw_course(strip, [position[i] for position in trail], step, color)
-        self._draw_caption(self._caption(trail, step, over, lost), step, color if over else INK, color)
+        for strip in self.strips:
+            self._draw_course(strip.points(trail, step), color)
+        self._draw_caption(self._caption(trail, step, scene.over, lost), step, color if scene.over else INK, color)
 
-    def _x(self, value: float) -> float:
-        low, high = (0.0, float(self.n_steps)) if self.dimension == 1 else (-self.wall - MARGIN, self.wall + MARGIN)
-        return self.left + (self.right - self.left) * (value - low) / (high - low)
+    def _strips(self) -> list[Panel]:
+        """Returns the plots of coordinates against time, which share the height of the plane."""
+        n, gap = min(self.dimension, MOST_STRIPS), 12.0
+        left, right, top, bottom = self.main.right + 74.0, self.size[0] - 26.0, self.main.top, self.main.bottom
+        height = (bottom - top - gap * (n - 1)) / n
+        tops = [top + i * (height + gap) for i in range(n)]
+        return [Panel(left, top, right, top + height, 0, self.n_steps, i) for i, top in enumerate(tops)]
 
-    def _y(self, value: float) -> float:
-        reach = self.wall + MARGIN
-        return self.bottom - (self.bottom - self.top) * (value + reach) / (2 * reach)
+    def _draw_box(self, panel: Panel) -> None:
+        """Draws the static background of a panel: the box, its walls, and a grid unless it is a strip."""
+        west, east = (-WALL, WALL) if panel.coordinate is None else (panel.low, panel.high)
+        self._rectangle((panel.left, panel.top), (panel.right, panel.bottom), OUTSIDE)
+        self._rectangle(panel.place(west, WALL), panel.place(east, -WALL), INSIDE)
+        levels = (0.0,) if panel in self.strips else (-WALL, -WALL / 2, 0.0, WALL / 2, WALL)
+        times = range(self.n_steps // 5, self.n_steps + 1, self.n_steps // 5)
+        upright = levels if panel.coordinate is None else () if panel in self.strips else times
+        for y in levels:
+            self._line(panel.place(west, y), panel.place(east, y), GRID, 1.2)
+        for x in upright:
+            self._line(panel.place(x, -WALL), panel.place(x, WALL), GRID, 1.2)
+        width = 1.6 if panel in self.strips else 2.5
+        for y in (-WALL, WALL):
+            self._line(panel.place(west, y), panel.place(east, y), INK, width)
+        for x in (west, east) if panel.coordinate is None else ():
+            self._line(panel.place(x, -WALL), panel.place(x, WALL), INK, width)
 
-    def _points(self, trail: Sequence[Sequence[float]], step: int) -> list[Point]:
-        """Returns the positions of the trail in the image, clipped to its edges."""
-        reach = self.wall + MARGIN
-        clipped = [[min(max(x, -reach), reach) for x in position] for position in trail]
-        if self.dimension == 1:
-            first = step - len(clipped) + 1
-            return [(self._x(first + i), self._y(position[0])) for i, position in enumerate(clipped)]
-        return [(self._x(position[0]), self._y(position[1])) for position in clipped]
-
-    def _draw_field(self) -> None:
-        """Draws the static background: the box, its walls and the axis labels."""
-        self.surface.fill(PAPER)
-        wall = self.wall
-        west, east = (0, self.n_steps) if self.dimension == 1 else (-wall, wall)
-        self._rectangle((self.left, self.top), (self.right, self.bottom), OUTSIDE)
-        self._rectangle((self._x(west), self._y(wall)), (self._x(east), self._y(-wall)), INSIDE)
-        ticks = [-wall, -wall / 2, 0.0, wall / 2, wall]
+    def _draw_labels(self) -> None:
+        """Writes the numbers at the axes, and the names of the coordinates where there are several plots."""
+        main, below = self.main, self.main.bottom + 15
+        ticks = (-WALL, -WALL / 2, 0.0, WALL / 2, WALL)
         for tick in ticks:
-            self._line((self._x(west), self._y(tick)), (self._x(east), self._y(tick)), GRID, 1.2)
-            self._text(_number(tick), (self.left - 9, self._y(tick)), FAINT, "right")
+            self._text(_number(tick), (main.left - 9, main.place(0, tick)[1]), FAINT, "right")
         for tick in range(0, self.n_steps + 1, self.n_steps // 5) if self.dimension == 1 else ticks:
-            if self.dimension > 1 or tick > 0:
-                self._line((self._x(tick), self._y(-wall)), (self._x(tick), self._y(wall)), GRID, 1.2)
-            self._text(_number(tick), (self._x(tick), self.bottom + 15), FAINT, "center")
-        corners = [(self._x(x), self._y(y)) for x, y in ((west, wall), (east, wall), (east, -wall), (west, -wall))]
-        sides = ((0, 1), (2, 3)) if self.dimension == 1 else ((0, 1), (1, 2), (2, 3), (3, 0))
-        for start, end in sides:
-            self._line(corners[start], corners[end], INK, 2.5)
+            self._text(_number(tick), (main.place(tick, 0)[0], below), FAINT, "center")
+        if not self.strips:
+            return
+        self._text("x1", (main.right - 4, below), FAINT, "right")
+        self._text("x2", (main.left - 9, main.top + 8), FAINT, "right")
+        for i, strip in enumerate(self.strips):
+            self._text(f"x{i + 1}", (strip.left - 9, strip.place(0, 0)[1]), FAINT, "right")
+        for share in (0.0, 0.5, 1.0):
+            place = self.strips[-1].place(share * self.n_steps, 0)[0], below
+            self._text(_number(share * self.n_steps), place, FAINT, "center")
+        if self.dimension > len(self.strips):
+            said = f"{len(self.strips)} of {self.dimension} coordinates"
+            self._text(said, (self.strips[0].right, 30), FAINT, "right")
 
     def _draw_trail(self, points: list[Point]) -> None:
         """Draws the trail. In the plane, the older part has a single faint color and is below the rest."""
         n_old = len(points) if self.dimension == 1 else max(len(points) - FADING, 0)
         if n_old > 1:
-            fine = [(x * FINE, y * FINE) for x, y in points[: n_old + 1]]
-            color, width = (NEW_TRAIL, 1.6) if self.dimension == 1 else (OLD_TRAIL, 1.0)
-            self.pygame.draw.lines(self.surface, color, False, fine, round(width * FINE))
+            self._lines(points[: n_old + 1], *((NEW_TRAIL, 1.6) if self.dimension == 1 else (OLD_TRAIL, 1.0)))
         for i in range(max(n_old, 1), len(points)):
             freshness = 1.0 - (len(points) - 1 - i) / FADING
             color = _mix(OLD_TRAIL, NEW_TRAIL, freshness**2)
@@ -154,7 +174,7 @@ class BallDrawing(Canvas):
 
     def _draw_push(self, origin: Point, push: Sequence[float]) -> None:
         """Draws the push as an arrow from the previous position of the ball."""
-        scale = (self.bottom - self.top) / (2 * (self.wall + MARGIN))
+        scale = (self.main.bottom - self.main.top) / (2 * REACH)
         along = np.array([0.0, -push[0]] if self.dimension == 1 else [push[0], -push[1]]) * scale
         length = float(np.hypot(*along))
         if length < 3.0:
@@ -163,7 +183,8 @@ class BallDrawing(Canvas):
         across, head = np.array([-unit[1], unit[0]]), min(9.0, length)
         neck = base + unit * (length - head)
         self._line(tuple(base), tuple(neck), PUSH, 3.0)
-        self._polygon([base + along, neck + across * head * 0.5, neck - across * head * 0.5], PUSH)
+        tip = [base + along, neck + across * head * 0.5, neck - across * head * 0.5]
+        self.pygame.draw.polygon(self.surface, PUSH, [(float(x) * FINE, float(y) * FINE) for x, y in tip])
 
     def _draw_ball(self, center: Point, color: Color) -> None:
         radius = 9.0
@@ -173,77 +194,41 @@ class BallDrawing(Canvas):
             shift, tint = 0.33 * radius * share, 0.75 * share**2
             self._disc((center[0] - shift, center[1] - shift), radius * (1 - 0.85 * share), _mix(color, INSIDE, tint))
 
-    def _strips(self) -> list[Strip]:
-        """Returns the areas of the plots against time, which share the height of the plane."""
-        n = min(self.dimension, MOST_STRIPS)
-        left, right, gap = self.right + 74.0, self.size[0] - 26.0, 12.0
-        height = (self.bottom - self.top - gap * (n - 1)) / n
-        tops = [self.top + i * (height + gap) for i in range(n)]
-        return [Strip(left, top, right, top + height) for top in tops]
-
-    def _draw_strip(self, coordinate: int, strip: Strip) -> None:
-        """Draws the static background of one plot against time: the box, its walls and the label of the coordinate."""
-        wall = self.wall / (self.wall + MARGIN)
-        self._rectangle((strip.left, strip.top), (strip.right, strip.bottom), OUTSIDE)
-        self._rectangle(strip.place(0, wall), strip.place(1, -wall), INSIDE)
-        self._line(strip.place(0, 0), strip.place(1, 0), GRID, 1.2)
-        for height in (-wall, wall):
-            self._line(strip.place(0, height), strip.place(1, height), INK, 1.6)
-        self._text(f"x{coordinate + 1}", (strip.left - 9, strip.place(0, 0)[1]), FAINT, "right")
-        if coordinate == len(self.strips) - 1:
-            for share in (0.0, 0.5, 1.0):
-                place = strip.place(share, 0)[0], self.bottom + 15
-                self._text(_number(share * self.n_steps), place, FAINT, "center")
-        if coordinate == 0 and self.dimension > len(self.strips):
-            self._text(f"{len(self.strips)} of {self.dimension} coordinates", (strip.right, 30), FAINT, "right")
-
-    def _draw_course(self, strip: Strip, values: Sequence[float], step: int, color: Color) -> None:
-        """Plots the values of one coordinate up to ``step``."""
-        reach, first = self.wall + MARGIN, step - len(values) + 1
-        heights = [min(max(value / reach, -1.0), 1.0) for value in values]
-        points = [strip.place((first + i) / self.n_steps, height) for i, height in enumerate(heights)]
+    def _draw_course(self, points: list[Point], color: Color) -> None:
+        """Draws one coordinate up to the present."""
         if len(points) > 1:
-            self.pygame.draw.lines(self.surface, NEW_TRAIL, False, [(x * FINE, y * FINE) for x, y in points], FINE)
+            self._lines(points, NEW_TRAIL, 1.0)
         if points:
             self._disc(points[-1], 4.0, color)
 
-    def _caption(self, trail: Sequence[Sequence[float]], step: int, over: bool, lost: bool) -> str:
+    def _caption(self, trail: np.ndarray, step: int, over: bool, lost: bool) -> str:
         """Returns the caption. In more than two dimensions, it names the coordinates in which the ball left the box."""
         if not lost:
             return f"held for {step} steps" if over and step else f"step {step}"
-        left = [f"x{i + 1}" for i, x in enumerate(trail[-1]) if abs(x) > self.wall]
+        left = [f"x{i + 1}" for i in np.flatnonzero(np.abs(trail[-1]) > WALL)]
         return f"lost in step {step}" + (f" by {', '.join(left)}" if self.dimension > 2 else "")
 
     def _draw_caption(self, said: str, step: int, ink: Color, color: Color) -> None:
-        self._text(said, (self.left, 30), ink, "left", self.large_font)
-        self._text(f"of {self.n_steps}", (self.right, 30), FAINT, "right")
-        self._rectangle((self.left, 50), (self.right, 55), GRID)
-        filled = self.left + (self.right - self.left) * min(step / self.n_steps, 1.0)
-        self._rectangle((self.left, 50), (filled, 55), color)
+        left, right = self.main.left, self.main.right
+        self._text(said, (left, 30), ink, "left", self.large_font)
+        self._text(f"of {self.n_steps}", (right, 30), FAINT, "right")
+        self._rectangle((left, 50), (right, 55), GRID)
+        self._rectangle((left, 50), (left + (right - left) * min(step / self.n_steps, 1.0), 55), color)
 
     def _rectangle(self, corner: Point, opposite: Point, color: Color) -> None:
         left, top = round(corner[0] * FINE), round(corner[1] * FINE)
         width, height = round(opposite[0] * FINE) - left, round(opposite[1] * FINE) - top
         self.pygame.draw.rect(self.surface, color, (left, top, width, height))
 
-    def _line(self, start: Sequence[float], end: Sequence[float], color: Color, width: float) -> None:
-        """Draws a line as a polygon, because wide lines of pygame have slanted ends. Thin lines have round ends."""
-        along = np.subtract(end, start)
-        length = float(np.hypot(*along))
-        if length > 0.0:
-            across = np.array([-along[1], along[0]]) * (0.5 * width / length)
-            self._polygon([start + across, end + across, end - across, start - across], color)
-        if width < 2.0:
-            self._disc(start, 0.5 * width, color)
-            self._disc(end, 0.5 * width, color)
+    def _line(self, start: Point, end: Point, color: Color, width: float) -> None:
+        self._lines([start, end], color, width)
 
-    def _polygon(self, points: Sequence[Any], color: Color) -> None:
-        self.pygame.draw.polygon(self.surface, color, [(float(x) * FINE, float(y) * FINE) for x, y in points])
+    def _lines(self, points: Sequence[Point], color: Color, width: float) -> None:
+        fine = [(x * FINE, y * FINE) for x, y in points]
+        self.pygame.draw.lines(self.surface, color, False, fine, max(round(width * FINE), 1))
 
-    def _disc(self, center: Sequence[float], radius: float, color: Color) -> None:
-        self.pygame.draw.circle(
-            self.surface, color, (float(center[0]) * FINE, float(center[1]) * FINE), max(radius * FINE, 1.0)
-        )
+    def _disc(self, center: Point, radius: float, color: Color) -> None:
+        self.pygame.draw.circle(self.surface, color, (center[0] * FINE, center[1] * FINE), max(radius * FINE, 1.0))
 
     def _text(self, text: str, place: Point, color: Color, side: str, font: Any = None) -> None:
         """Writes ``text``, vertically centered. ``place`` is its ``side``: ``"left"``, ``"right"`` or ``"center"``."""

@@ -21,7 +21,7 @@ from rejeu.envs.registry import make_env
 from rejeu.envs.rendering import make_rendering_env, natural_fps
 from rejeu.envs.validation import id_of
 from rejeu.interrupt import Interrupt
-from rejeu.play.game import Act, Game, Pace, Player
+from rejeu.play.game import Act, Game, Player
 from rejeu.play.keys import KeyMap, full_name, keys_for
 from rejeu.play.recording import Recording
 from rejeu.play.window import Window
@@ -147,11 +147,10 @@ def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:
         for player in game.players:
             player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action, which would delay the game
         window.open(game, keys)
-        pace = Pace(fps)
         while not game.closed:
             stop.check()
             turn(window, game)
-            pace.wait()
+            window.wait(fps)
 
 
 def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[int, int | None]:

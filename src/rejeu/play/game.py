@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -18,9 +17,6 @@ from rejeu.play.recording import Recording
 
 Act = Callable[[Any, frozenset[str], int], Any]
 """Maps the observation, the held keys and the step of the episode (from 0) to an action, or None to wait."""
-
-MAX_DELAY = 0.25
-"""Maximum delay in seconds that is caught up by faster steps."""
 
 
 @dataclass
@@ -171,32 +167,3 @@ class Game:
             return
         self.seed += 1
         self.begin()
-
-
-class Pace:
-    """Keeps a constant rate.
-
-    Args:
-        rate: calls per second.
-        clock: returns the time in seconds.
-        sleep: waits for a number of seconds.
-    """
-
-    def __init__(
-        self,
-        rate: float,
-        clock: Callable[[], float] = time.perf_counter,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self.period = 1.0 / rate
-        self._clock, self._sleep = clock, sleep
-        self._due = clock()
-
-    def wait(self) -> None:
-        """Waits until the next call is due. Delays longer than ``MAX_DELAY`` are not caught up."""
-        self._due += self.period
-        left = self._due - self._clock()
-        if left > 0:
-            self._sleep(left)
-        elif left < -MAX_DELAY:
-            self._due -= left

@@ -82,6 +82,7 @@ class Window:
                 f"cannot open a window: SDL finds no display ({driver}); rejeu record RUN writes a video without a display"
             )
         pygame.font.init()
+        self.clock = pygame.time.Clock()
         self.canvas: Any = None
         """The surface at its natural size."""
         self._screen: Any = None
@@ -132,6 +133,10 @@ class Window:
             left += size[0] + MARGIN
         self._draw_legend(game)
         self._present()
+
+    def wait(self, fps: float) -> None:
+        """Waits until the next of ``fps`` steps per second is due; delays are not caught up."""
+        self.clock.tick(fps)
 
     def close(self) -> None:
         """Closes the window."""
