@@ -63,6 +63,7 @@ if TYPE_CHECKING:
         OrnsteinUhlenbeckActionNoise as OrnsteinUhlenbeckActionNoise,
     )
     from rejeu.exploration.parameter_space import ParameterNoise as ParameterNoise
+    from rejeu.export.numpy_policy import load_policy as load_policy
     from rejeu.reporting import plots as plots
     from rejeu.reporting.comparison import compare as compare
     from rejeu.reporting.evaluation import Evaluation as Evaluation
@@ -88,6 +89,7 @@ _MODULES = {
     "rejeu.sb3.common.monitor": "Monitor",
     "rejeu.envs.wrappers": "TimeLimitTerminates",
     "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
+    "rejeu.export.numpy_policy": "load_policy",
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",
     "rejeu.exploration.parameter_space": "ParameterNoise",
     "rejeu.reporting": "plots",

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, Transition
-from rejeu.spaces import Leaf
+from rejeu.spaces import Leaf, groups
 from rejeu.validation import coerce, flag, nested, number
 
 MAX_COUNT = 2.0**23
@@ -118,23 +118,6 @@ class State(eqx.Module):
 
     learner: Any
     statistics: Statistics
-
-
-def groups(leaves: tuple[Leaf, ...]) -> list[int | None]:
-    """Returns the index of each leaf's moments, None for leaves that are not normalized.
-
-    The achieved and the desired goal share theirs: hindsight replaces one by the other, and their difference must keep its
-    meaning.
-    """
-    found: dict[str, int] = {}
-    result: list[int | None] = []
-    for leaf in leaves:
-        if leaf.kind != "continuous":
-            result.append(None)
-            continue
-        name = "goal" if leaf.path in ("achieved_goal", "desired_goal") else f"leaf {leaf.path}"
-        result.append(found.setdefault(name, len(found)))
-    return result
 
 
 class Normalizer(NamedTuple):

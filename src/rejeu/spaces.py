@@ -86,6 +86,23 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
     )
 
 
+def groups(leaves: tuple[Leaf, ...]) -> list[int | None]:
+    """Returns the index of each leaf's moments in the statistics of normalization, None for leaves that are not normalized.
+
+    The achieved and the desired goal share theirs: hindsight replaces one by the other, and their difference must keep its
+    meaning.
+    """
+    found: dict[str, int] = {}
+    result: list[int | None] = []
+    for leaf in leaves:
+        if leaf.kind != "continuous":
+            result.append(None)
+            continue
+        name = "goal" if leaf.path in ("achieved_goal", "desired_goal") else f"leaf {leaf.path}"
+        result.append(found.setdefault(name, len(found)))
+    return result
+
+
 def structure(space: spaces.Space) -> Any:
     """Returns the tree structure of one observation of ``space``."""
     import jax  # here, so that worker processes start without it

@@ -24,6 +24,12 @@ OBSERVATIONS: dict[str, gym.Space] = {
             "switches": spaces.MultiDiscrete([2, 3]),
         }
     ),
+    "small Dict": spaces.Dict(
+        {
+            "nested": spaces.Tuple([spaces.Box(0, 255, (4, 4, 1), np.uint8), spaces.Discrete(3, start=-1)]),
+            "speed": spaces.Box(-np.inf, np.inf, (3,), np.float64),
+        }
+    ),
     "large CNN": spaces.Box(0, 255, (4, 40, 40), np.uint8),
 }
 ACTIONS: dict[str, gym.Space] = {
@@ -65,7 +71,7 @@ class Still(gym.Env[Any, Any]):
 
 def agent_of(name: str, action: str, observation: str = "MLP", **settings: Any) -> agents.Agent:
     """Returns an agent with random weights; with statistics of a few observations if it normalizes."""
-    policy = "MultiInputPolicy" if observation == "Dict" else "MlpPolicy"
+    policy = "MultiInputPolicy" if "Dict" in observation else "MlpPolicy"
     small = SMALL.get(name, {"policy_kwargs": {"net_arch": [16, 16]}})
     with shared_learners():
         agent = agents.AGENTS[name](policy, Still(observation, action), seed=0, **{**small, **settings})

@@ -16,11 +16,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from safetensors import SafetensorError
 
-from rejeu.core import PyTree
 from rejeu.errors import CheckpointError
 from rejeu.hardware import physical_memory
 from rejeu.io import atomic, tensors
@@ -39,6 +37,7 @@ CHECKSUMS = "checksums"
 RESERVED = ("schema", "kind", CHECKSUMS)
 
 Header = dict[str, Any]
+PyTree = Any
 
 
 def _from_1(header: Header) -> Header:
@@ -174,6 +173,8 @@ def match(expected: PyTree, found: Mapping[str, Any], path: str | Path) -> None:
         found: arrays or specs by name.
         path: of their file, for the message.
     """
+    import jax  # here and below, so that a policy in NumPy starts without it
+
     keys = names(expected)
     for key, leaf in zip(keys, jax.tree.leaves(expected), strict=True):
         if key not in found:
@@ -296,13 +297,15 @@ def require_finite(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
 
 def names(tree: PyTree) -> list[str]:
     """Returns the dotted path of each leaf of a tree, such as ``actor.torso.layers.0.weight``."""
-    return [
-        jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_leaves_with_path(tree)
-    ]
+    from jax.tree_util import keystr, tree_leaves_with_path
+
+    return [keystr(path, simple=True, separator=".") for path, _ in tree_leaves_with_path(tree)]
 
 
 def tree_to_arrays(tree: PyTree) -> dict[str, np.ndarray]:
     """Returns the leaves of a tree by name, on the host."""
+    import jax
+
     return dict(zip(names(tree), map(np.asarray, jax.tree.leaves(tree)), strict=True))
 
 
@@ -312,5 +315,7 @@ def arrays_to_tree(expected: PyTree, arrays: Mapping[str, np.ndarray], path: str
     Raises:
         CheckpointError: unless names, shapes and dtypes are the same, naming the first that is not.
     """
+    import jax
+
     match(expected, arrays, path)
     return jax.tree.unflatten(jax.tree.structure(expected), [arrays[key] for key in names(expected)])

@@ -1,0 +1,272 @@
+"""The deterministic policy of a model file in NumPy, for processes without JAX."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, MultiBinary, MultiDiscrete
+
+from rejeu import spaces
+from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
+from rejeu.runs.folder import find_model
+from rejeu.spaces import Leaf
+
+Function = Callable[[np.ndarray], np.ndarray]
+GELU = math.sqrt(2 / math.pi)
+ACTIVATIONS: dict[str, Function] = {
+    "relu": lambda x: np.maximum(x, 0.0),
+    "tanh": np.tanh,
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0.0))),
+    "gelu": lambda x: 0.5 * x * (1.0 + np.tanh(GELU * (x + 0.044715 * x * x * x))),
+    "silu": lambda x: x / (1.0 + np.exp(-x)),
+    "leaky_relu": lambda x: np.where(x >= 0, x, 0.01 * x),
+    "leakyrelu": lambda x: np.where(x >= 0, x, 0.01 * x),
+    "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
+}
+ACTORS = {"PPO": "network", "A2C": "network", "MaskablePPO": "network", "DQN": "network", "PQN": "network"} | {
+    "QRDQN": "network.outputs",
+    **dict.fromkeys(("SAC", "TQC", "CrossQ", "TD3", "DDPG"), "actor"),
+}
+"""Where the policy's network is in the state of each algorithm."""
+WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
+
+class NumpyPolicy:
+    """The deterministic policy of an agent with fully connected layers."""
+
+    def __init__(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], largest: int) -> None:
+        """Builds the policy from the header and the arrays of a model file."""
+        config, name = header["config"], header["algorithm"]
+        self.observation_space = spaces.rebuild(header["observation_space"], largest)
+        self.action_space = spaces.rebuild(header["action_space"], largest)
+        self._leaves = spaces.leaves(self.observation_space)
+        is_normalized = config.get("normalize") is not None
+        self._arrays = {key.removeprefix("learner."): array for key, array in arrays.items()}
+        scaled = self._normalizations(config["normalize"]) if is_normalized else [None] * len(self._leaves)
+        self._encoders = [encoder(leaf, scale) for leaf, scale in zip(self._leaves, scaled, strict=True)]
+        self._shape = config["policy_kwargs"]
+        prefix = ACTORS[name]
+        hidden = self._torso(f"{prefix}.torso")
+        if f"{prefix}.value_head.weight" in self._arrays and f"{prefix}.advantage_head.weight" in self._arrays:
+            value, advantage = (
+                [*self._layers(f"{prefix}.{part}"), self._linear(f"{prefix}.{part}_head")]
+                for part in ("value", "advantage")
+            )
+            hidden.append(lambda x: joined(applied(value, x), applied(advantage, x)))
+        else:
+            hidden.append(self._linear(f"{prefix}.head"))
+        if name == "QRDQN":
+            hidden.append(lambda x: x.reshape(*x.shape[:-1], -1, config["n_quantiles"]).mean(axis=-1))
+        self._steps = hidden
+        self.takes_masks = name == "MaskablePPO"
+        is_squashed = name in ("SAC", "TQC", "CrossQ", "TD3", "DDPG") or self._shape.get("squash_output", False)
+        self._choose = chooser(self.action_space, is_squashed)
+        self._scale = spaces.action_scaler(self.action_space)
+        zero = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._leaves]
+        self._act(zero, None)  # shapes that do not fit raise here
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+        action_masks: Any = None,
+    ) -> tuple[np.ndarray, Any]:
+        """Returns the actions of the agent's ``predict(deterministic=True)``, and ``state``.
+
+        Args:
+            observation: one observation, or a batch with a leading axis.
+            state: returned unchanged.
+            episode_start: ignored; there is no memory.
+            deterministic: must be True.
+            action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, for MaskablePPO; None allows all.
+
+        Raises:
+            ValueError: if the shapes do not match, or ``deterministic`` is False.
+        """
+        if not deterministic:
+            raise ValueError("a policy in NumPy is deterministic; leave out deterministic=False, or use rejeu.load")
+        if action_masks is not None and not self.takes_masks:
+            raise ValueError("this policy takes no action_masks")
+        given = spaces.parts(self.observation_space, observation)
+        arrays = [np.asarray(one, leaf.dtype) for one, leaf in zip(given, self._leaves, strict=True)]
+        is_single = arrays[0].ndim == len(self._leaves[0].shape)
+        for array, leaf in zip(arrays, self._leaves, strict=True):
+            if array.shape[0 if is_single else 1 :] != leaf.shape:
+                where = f" of {leaf.path!r}" if leaf.path else ""
+                raise ValueError(
+                    f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it"
+                )
+        action = self._act([one[None] for one in arrays] if is_single else arrays, action_masks)
+        return (action[0] if is_single else action), state
+
+    def _act(self, arrays: list[np.ndarray], masks: Any) -> np.ndarray:
+        parts = [encode(array) for encode, array in zip(self._encoders, arrays, strict=True)]
+        x = applied(self._steps, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1))
+        if masks is not None:
+            x = np.where(np.asarray(masks, bool), x, np.float32(-1e9))
+        return self._scale(self._choose(x))
+
+    def _normalizations(self, settings: Mapping[str, Any]) -> list[Function | None]:
+        """Returns what normalizes each leaf; None for leaves that are not."""
+        found: list[Function | None] = []
+        for group in spaces.groups(self._leaves):
+            moments = [self._arrays.get(f"statistics.obs.{group}.{one}") for one in ("mean", "variance", "n_seen")]
+            if group is None or not settings["norm_obs"] or moments[2] is None or moments[2] == 0:
+                found.append(None)
+                continue
+            found.append(standardizer(moments[0], moments[1], settings["epsilon"], settings["clip_obs"]))
+        return found
+
+    def _torso(self, prefix: str) -> list[Function]:
+        """Returns the hidden layers: a stack, branches, or SimBa."""
+        if f"{prefix}.embedding.weight" not in self._arrays:
+            parts = (prefix, f"{prefix}.state", f"{prefix}.common", f"{prefix}.last")
+            return [step for part in parts for step in self._layers(part)]
+        steps, i = [self._linear(f"{prefix}.embedding")], 0
+        while f"{prefix}.blocks.{i}.expand.weight" in self._arrays:
+            inner = [
+                self._norm(f"{prefix}.blocks.{i}.norm"),
+                self._linear(f"{prefix}.blocks.{i}.expand"),
+                ACTIVATIONS[self._shape["activation_fn"]],
+                self._linear(f"{prefix}.blocks.{i}.contract"),
+            ]
+            steps.append(residual(inner))
+            i += 1
+        return [*steps, self._norm(f"{prefix}.norm")]
+
+    def _layers(self, prefix: str) -> list[Function]:
+        """Returns a stack of layers; empty if there are none."""
+        steps: list[Function] = []
+        is_renormalized = f"{prefix}.norms.0.n_batches" in self._arrays
+        if is_renormalized:
+            steps.append(self._norm(f"{prefix}.norms.0"))
+        i = 0
+        while f"{prefix}.layers.{i}.weight" in self._arrays:
+            norm = (
+                [self._norm(f"{prefix}.norms.{i + is_renormalized}")]
+                if f"{prefix}.norms.0.scale" in self._arrays
+                else []
+            )
+            activation = [ACTIVATIONS[self._shape["activation_fn"]]]
+            steps += [self._linear(f"{prefix}.layers.{i}")]
+            steps += activation + norm if is_renormalized else norm + activation
+            i += 1
+        return steps
+
+    def _linear(self, prefix: str) -> Function:
+        weight, bias = self._arrays[f"{prefix}.weight"], self._arrays[f"{prefix}.bias"]
+        return lambda x: x @ weight + bias
+
+    def _norm(self, prefix: str) -> Function:
+        """Returns a layer norm, or a batch renormalization by its running statistics."""
+        scale, offset = self._arrays[f"{prefix}.scale"], self._arrays[f"{prefix}.offset"]
+        if f"{prefix}.n_batches" in self._arrays:
+            factor = scale / np.sqrt(self._arrays[f"{prefix}.variance"] + np.float32(1e-3))
+            shift = offset - self._arrays[f"{prefix}.mean"] * factor
+            return lambda x: x * factor + shift
+
+        def normalized(x: np.ndarray) -> np.ndarray:
+            centered = x - x.mean(axis=-1, keepdims=True)
+            return (
+                centered / np.sqrt(np.square(centered).mean(axis=-1, keepdims=True) + np.float32(1e-5)) * scale + offset
+            )
+
+        return normalized
+
+
+def applied(steps: list[Function], x: np.ndarray) -> np.ndarray:
+    """Returns ``x`` after all steps."""
+    for step in steps:
+        x = step(x)
+    return x
+
+
+def residual(steps: list[Function]) -> Function:
+    """Returns the function that adds the steps' output to its input."""
+    return lambda x: x + applied(steps, x)
+
+
+def joined(value: np.ndarray, advantage: np.ndarray) -> np.ndarray:
+    """Returns ``V + A - mean A``, the values of all actions."""
+    return value + advantage - advantage.mean(axis=-1, keepdims=True)
+
+
+def standardizer(mean: Any, variance: Any, epsilon: float, limit: float) -> Function:
+    """Returns the function that standardizes observations and clips them to ``limit``."""
+    factor = (1.0 / np.sqrt(variance + np.float32(epsilon))).astype(np.float32)
+    low, high = np.float32(-limit), np.float32(limit)
+    return lambda x: np.minimum(np.maximum((x - mean) * factor, low), high)
+
+
+def encoder(leaf: Leaf, scale: Function | None) -> Function:
+    """Returns the function from a batch of a leaf to its features, ``(batch, leaf.n_features)``."""
+    if leaf.kind == "categorical":
+        pairs = [np.arange(start, start + n) for start, n in zip(leaf.starts, leaf.sizes, strict=True)]
+        hot = lambda x: [x.reshape(len(x), -1)[:, i : i + 1] == values for i, values in enumerate(pairs)]  # noqa: E731
+        return lambda x: np.concatenate(hot(x), axis=-1).astype(np.float32)
+    size = leaf.n_features
+    if leaf.kind == "image":
+        return lambda x: x.reshape(-1, size).astype(np.float32) / np.float32(255.0)
+    if scale is None:
+        return lambda x: x.reshape(-1, size).astype(np.float32)
+    return lambda x: scale(x.astype(np.float32)).reshape(-1, size)
+
+
+def chooser(space: Any, is_squashed: bool) -> Function:
+    """Returns the function from the network's outputs to an action in the range of algorithms."""
+    if isinstance(space, Box):
+        n = math.prod(space.shape)
+        return (lambda x: np.tanh(x[..., :n])) if is_squashed else (lambda x: x[..., :n])
+    if isinstance(space, MultiBinary):
+        return lambda x: x > 0
+    if isinstance(space, MultiDiscrete):
+        ends = np.cumsum(space.nvec.ravel())[:-1]
+        return lambda x: np.stack([part.argmax(axis=-1) for part in np.split(x, ends, axis=-1)], axis=-1)
+    return lambda x: x.argmax(axis=-1)
+
+
+def load_policy(path: str | Path) -> NumpyPolicy:
+    """Returns the deterministic policy of a model file, which acts with NumPy alone; JAX is not imported.
+
+    For fully connected networks of every algorithm but RecurrentPPO. No code from the file is run.
+
+    Args:
+        path: of a model file, or of a run folder, whose best model is taken.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if the file is damaged, or its policy has images, memory or modules of the user's own.
+
+    >>> import rejeu
+    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=0)
+    >>> path = agent.save("pendulum")
+    >>> action, _ = rejeu.load_policy(path).predict(agent.observation_space.sample())
+    >>> action.shape
+    (1,)
+    """
+    model = find_model(Path(path), "best") if Path(path).is_dir() else path
+    to_do = "export it with rejeu export --to onnx"
+    with checkpoint.opened(model, "agent") as file:
+        name = file.header.get("algorithm")
+        prefix = ACTORS.get(name) if isinstance(name, str) else None
+        prefixes = [f"{before}{prefix}." for before in ("", "learner.")]
+        if prefix is None or any(key.startswith(f"{one}encoder.") for one in prefixes for key in file.specs):
+            raise CheckpointError(
+                f"{file.path}: the policy of {str(name)[:40]} has images, memory or modules of your own, which NumPy cannot "
+                f"act with; {to_do}"
+            )
+        arrays = {key: array for one in (*prefixes, "statistics.obs.") for key, array in file.read(one).items()}
+        checkpoint.require_finite(arrays, file.path)
+        try:
+            return NumpyPolicy(file.header, arrays, max(spaces.MAX_NUMBERS, file.room))
+        except WRONG as error:
+            raise CheckpointError(
+                f"{file.path}: its policy is damaged, or has other than fully connected layers ({error}); {to_do}"
+            ) from None
