@@ -1,8 +1,8 @@
 """Schedules: hyperparameters as functions of the progress of a run.
 
 A schedule is called with ``progress`` in [0, 1], a Python number or a traced array, and returns the value.
-:class:`Linear` and :class:`Exponential` are saved with a model. Any other function that JAX can trace is a schedule too; a
-file mentions its name only, so it must be given again to ``load``::
+:class:`Linear`, :class:`Exponential` and :class:`Table` are saved with a model. Any other function that JAX can trace is a
+schedule too; a file mentions its name only, so it must be given again to ``load``::
 
     rejeu.SAC("MlpPolicy", env, learning_rate=lambda progress: 3e-4 * jnp.cos(progress * jnp.pi / 2))
 """
@@ -69,11 +69,39 @@ class Exponential:
         return self.start * (self.end / self.start) ** done
 
 
+@dataclass(frozen=True)
+class Table:
+    """Values at equal steps of the progress from 0 to 1, joined by straight lines: any function, as data.
+
+    >>> Table((1.0, 0.5, 0.0))(0.25)
+    0.75
+    """
+
+    values: tuple[float, ...]
+    """The values, two or more."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", tuple(map(float, self.values)))
+        if len(self.values) < 2 or not all(map(math.isfinite, self.values)):
+            raise ValueError(f"a schedule needs two values or more, all finite; got {self.values!s:.80}")
+
+    def __call__(self, progress: Any) -> Any:
+        place = _clip(progress) * (len(self.values) - 1)
+        if isinstance(place, int | float):
+            below = min(int(place), len(self.values) - 2)
+            return self.values[below] + (place - below) * (self.values[below + 1] - self.values[below])
+        return jnp.interp(place, jnp.arange(len(self.values)), jnp.array(self.values, jnp.float32))
+
+
 ROUNDING = 1e-6
 """Relative error by which the end of a schedule may fall below its limit, such as the end of a cosine."""
 Schedule = Callable[[Any], Any]
-"""A function from the progress in [0, 1] to a value: :class:`Linear`, :class:`Exponential` or one of your own."""
-SCHEDULES: dict[str, type[Linear] | type[Exponential]] = {"linear": Linear, "exponential": Exponential}
+"""A function from the progress in [0, 1] to a value: one of ``SCHEDULES`` or one of your own."""
+SCHEDULES: dict[str, type[Linear] | type[Exponential] | type[Table]] = {
+    "linear": Linear,
+    "exponential": Exponential,
+    "table": Table,
+}
 
 
 def at(value: float | Schedule, progress: Any) -> Any:
@@ -99,7 +127,7 @@ def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
 
 
 def _parse(name: str, value: Any) -> float | Schedule:
-    if isinstance(value, Linear | Exponential):
+    if isinstance(value, Linear | Exponential | Table):
         return value
     if isinstance(value, bool):
         raise TypeError(f"{name}={value!r} must be a number or a schedule")
@@ -111,8 +139,11 @@ def _parse(name: str, value: Any) -> float | Schedule:
         if isinstance(value, str) and value.startswith("lin_"):
             return Linear(float(value.removeprefix("lin_")))
         if isinstance(value, Mapping) and value.get("schedule") in SCHEDULES:
-            fields = {key: float(number) for key, number in value.items() if key != "schedule"}
-            return SCHEDULES[value["schedule"]](**fields)
+            given = {key: part for key, part in value.items() if key != "schedule"}
+            if value["schedule"] == "table":
+                return Table(**given)
+            kind: Any = SCHEDULES[value["schedule"]]
+            return kind(**{key: float(number) for key, number in given.items()})
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}={value!r} is not a schedule: {error}") from None
     if callable(value):

@@ -167,15 +167,19 @@ def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) 
     return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
 
 
-def check_policy(policy: str, space: spaces.Space) -> None:
-    """Raises ``ValueError`` if there is no such policy, or if it does not fit the observations of ``space``."""
+def check_policy(policy: str, space: spaces.Space, normalize_images: bool = True) -> None:
+    """Raises ``ValueError`` if there is no such policy, or if it does not fit the observations of ``space``.
+
+    Without ``normalize_images`` arrays of three axes are images, whatever their type.
+    """
     if policy not in POLICIES:
         raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
     if policy == "MlpPolicy" and isinstance(space, spaces.Dict):
         raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
     if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict | spaces.Tuple):
         raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
-    if policy == "CnnPolicy" and not any(leaf.kind == "image" for leaf in leaves(space)):
+    images = [leaf.kind == "image" or (len(leaf.shape) == 3 and not normalize_images) for leaf in leaves(space)]
+    if policy == "CnnPolicy" and not any(images):
         raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
 
 

@@ -63,11 +63,6 @@ MISTAKES = {
         ValueError,
         r"hindsight replay needs .*compute_reward.* WithoutReward has none; add it, or use replay_buffer_class=None",
     ),
-    "batch larger than the buffer": (
-        sac(Counter(), batch_size=512, buffer_size=100),
-        ValueError,
-        "batch_size=512 must not exceed buffer_size=100; try",
-    ),
     "buffer larger than the memory": (
         sac(Counter(), buffer_size=10**12),
         MemoryError,

@@ -131,7 +131,7 @@ def test_the_best_model_is_kept_and_loads_under_either_suffix(tmp_path):
     evaluate = EvalCallback(Walk(1), eval_freq=5, n_eval_episodes=2, best_model_save_path=tmp_path / "best", verbose=0)
     agent = dqn().learn(10, callback=evaluate)
     assert evaluate.best_mean_reward == evaluate.last_mean_reward == 11.0
-    assert [path.name for path in (tmp_path / "best").iterdir()] == ["best_model.safetensors"]
+    assert [path.name for path in (tmp_path / "best").iterdir()] == ["best_model.zip"]
     for name in ("best_model", "best_model.zip", "best_model.safetensors"):
         loaded = rejeu.DQN.load(tmp_path / "best" / name)
         assert loaded.num_timesteps == 5
@@ -195,7 +195,9 @@ def test_checkpoints_hold_all_that_learning_needs(tmp_path):
     callback = CheckpointCallback(4, tmp_path, "dqn", save_replay_buffer=True, save_vecnormalize=True)
     agent = dqn(env).learn(16, callback=callback)
     names = {
-        f"dqn_{kind}{step}_steps.safetensors" for step in (8, 16) for kind in ("", "replay_buffer_", "vecnormalize_")
+        f"dqn_{kind}{step}_steps{'.pkl' if kind else '.zip'}"
+        for step in (8, 16)
+        for kind in ("", "replay_buffer_", "vecnormalize_")
     }
     assert {path.name for path in tmp_path.iterdir()} == names
     env = VecNormalize.load(tmp_path / "dqn_vecnormalize_16_steps.pkl", make_vec_env(Walk, 2))

@@ -109,13 +109,10 @@ def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("module", "names"),
     [
-        ("", ["HerReplayBuffer"]),
-        (".her", ["HerReplayBuffer", "GoalSelectionStrategy"]),
+        (".her", ["GoalSelectionStrategy"]),
         (".her.goal_selection_strategy", ["GoalSelectionStrategy"]),
-        (".her.her_replay_buffer", ["HerReplayBuffer"]),
         (".common.noise", ["NormalActionNoise", "OrnsteinUhlenbeckActionNoise"]),
         (".common.evaluation", ["evaluate_policy"]),
-        (".common.buffers", ["ReplayBuffer"]),
     ],
 )
 def test_paths_lead_to_the_same_objects(module, names):

@@ -184,7 +184,7 @@ def test_the_callback_of_the_documentation_that_keeps_the_best_by_training_rewar
     timesteps = 90
     model.learn(total_timesteps=timesteps, callback=callback)
     assert callback.best_mean_reward < 0
-    assert os.path.exists("tmp/best_model.safetensors")
+    assert os.path.exists("tmp/best_model.zip")
 
     from matplotlib import pyplot
 
@@ -206,7 +206,7 @@ def test_seeds_and_schedules():
     assert agent.config.learning_rate == rejeu.Linear(1e-3, 1e-4, 0.5)
     assert get_linear_fn(1.0, 0.1, 0.5) == LinearSchedule(1.0, 0.1, 0.5)
     assert [LinearSchedule(1.0, 0.0, 0.5)(x) for x in (1.0, 0.75, 0.5, 0.0)] == [1.0, 0.5, 0.0, 0.0]
-    assert get_schedule_fn(3e-4) == 3e-4
+    assert get_schedule_fn(3e-4)(0.5) == 3e-4
 
 
 def count_down(x):
@@ -225,12 +225,18 @@ def test_every_function_given_as_a_schedule_takes_the_remaining_progress(schedul
             assert [float(at(given, progress)) for progress in (0.0, 0.5, 1.0)] == pytest.approx([1e-3, 5e-4, 0.0])
 
 
-def test_files_name_schedules_that_are_code_and_contain_those_that_are_not(in_tmp_path):
+def test_files_contain_functions_given_as_schedules_as_tables(in_tmp_path):
     from rejeu.sb3.common.utils import LinearSchedule
 
-    sb3.DQN("MlpPolicy", Walk(), learning_rate=count_down, policy_kwargs={"net_arch": [4]}).save("code")
-    with pytest.raises(rejeu.CheckpointError, match="count_down"):
-        sb3.DQN.load("code")
+    curved = lambda remaining: 1e-3 * float(np.sqrt(remaining)) if remaining > 0.5 else 1e-4  # noqa: E731 - not for JAX
+    sb3.DQN("MlpPolicy", Walk(), learning_rate=curved, policy_kwargs={"net_arch": [4]}).save("code")
+    loaded = sb3.DQN.load("code")
+    for remaining in (1.0, 0.9, 0.6, 0.3, 0.0):
+        assert loaded.learning_rate(remaining) == pytest.approx(curved(remaining))
+        assert float(at(rejeu.load("code").config.learning_rate, np.float32(1 - remaining))) == pytest.approx(
+            curved(remaining), rel=1e-5
+        )
+    assert sb3.DQN("MlpPolicy", Walk(), learning_rate=lambda _: 0.5).learning_rate == 0.5
     sb3.DQN("MlpPolicy", Walk(), learning_rate=LinearSchedule(1e-3, 0, 1), policy_kwargs={"net_arch": [4]}).save("line")
     assert rejeu.load("line").config.learning_rate == rejeu.Linear(1e-3, 0.0)
 
@@ -262,7 +268,7 @@ def test_evaluation_checkpoints_and_stopping_together(in_tmp_path):
     assert model.num_timesteps == 150
     model = SAC.load("./logs/best_model/best_model.zip")
     assert model.predict(eval_env.reset(), deterministic=True)[0].shape == (1, 1)
-    assert os.path.exists("./logs/rl_model_100_steps.safetensors")
+    assert os.path.exists("./logs/rl_model_100_steps.zip")
     assert np.load("./logs/results/evaluations.npz")["results"].shape == (1, 5)
 
 

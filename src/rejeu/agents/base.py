@@ -99,6 +99,8 @@ class BaseAgent(ABC):
     """Whether its policy takes masks of the allowed actions."""
     algorithm: ClassVar[Any]
     """What has ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
+    policy_name: str
+    """The argument ``policy``."""
     device: str
     """Where it computes: ``"auto"``, ``"cpu"`` or ``"gpu"``."""
     on_device: bool | None = None
@@ -195,7 +197,7 @@ class BaseAgent(ABC):
         self.set_outputs(verbose, log, tensorboard_log)
         self.made_from_id = isinstance(env, str)
         vector = self.make_envs(env, 1, seed=self.seed)
-        spaces.check_policy(policy, vector.observation_space)
+        spaces.check_policy(policy, vector.observation_space, self.config.policy_kwargs.normalize_images)
         self.build(vector.observation_space, vector.action_space)
         xla.start_device(self.n_threads(vector.n_envs))
         self.start_run(vector)
@@ -212,7 +214,7 @@ class BaseAgent(ABC):
     ) -> None:
         """Sets what does not depend on the environment; raises ``ValueError`` for an invalid value."""
         contract.check_config(config)
-        self.policy, self.config = policy, config
+        self.policy_name, self.config = policy, config
         self.seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else whole_seed(seed)
         self.stats_window_size = whole("stats_window_size", stats_window_size, least=1)
         self.success_threshold = None if success_threshold is None else number("success_threshold", success_threshold)
@@ -325,6 +327,11 @@ class BaseAgent(ABC):
     def name(self) -> str:
         """The algorithm's name."""
         return self.algorithm.Config.name
+
+    @property
+    def policy(self) -> Any:
+        """The name of its policy."""
+        return self.policy_name
 
     @property
     def env(self) -> VectorEnv | None:

@@ -95,7 +95,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         config = configs.rebuild(kind, said, configs.own_changes(said, changes))
         largest = max(spaces.MAX_NUMBERS, room)
         observation_space = spaces.rebuild(saved.observation_space, largest)
-        spaces.check_policy(saved.policy, observation_space)
+        spaces.check_policy(saved.policy, observation_space, config.policy_kwargs.normalize_images)
         action_space = spaces.rebuild(saved.action_space, largest)
     except MissingObjectError:
         raise
@@ -150,7 +150,7 @@ def header(agent: BaseAgent) -> dict[str, Any]:
     return {
         "algorithm": agent.name,
         "config": configs.to_json(agent.config),
-        "policy": agent.policy,
+        "policy": agent.policy_name,
         "observation_space": spaces.describe(agent.observation_space),
         "action_space": spaces.describe(agent.action_space),
         "env_id": run.env.env_id if run.env is not None else agent.trained_on and agent.trained_on[0],
@@ -271,7 +271,7 @@ def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
     others = {key: value for key, value in given.items() if key not in OUTPUTS}
     agent.configure(config=saved.config, **{key: getattr(saved.header, key) for key in ARGUMENTS} | others)
     agent.set_outputs(**outputs)
-    spaces.check_policy(agent.policy, saved.observation_space)
+    spaces.check_policy(agent.policy_name, saved.observation_space, agent.config.policy_kwargs.normalize_images)
 
 
 def _restore_counters(agent: BaseAgent, saved: AgentHeader) -> None:

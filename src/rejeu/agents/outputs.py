@@ -67,7 +67,7 @@ def run_config(agent: BaseAgent, call: TrainingCall) -> dict[str, Any]:
         "env_id": agent.env.env_id,
         "n_envs": agent.n_envs,
         "backend": agent.env.backend,
-        "policy": agent.policy,
+        "policy": agent.policy_name,
         "seed": agent.seed,
         "total_timesteps": call.n_steps,
         "episodes": call.n_episodes,

@@ -161,7 +161,7 @@ def sibling(agent: A, env: Any, seed: int) -> A:
     """Returns an agent with the same settings and compiled functions, other environments and another seed."""
     other = object.__new__(type(agent))
     other.configure(
-        agent.policy,
+        agent.policy_name,
         agent.config,
         seed,
         agent.stats_window_size,

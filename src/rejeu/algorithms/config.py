@@ -59,8 +59,9 @@ class AlgorithmConfig:
     """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
     it and saves what was learned from, or ``"skip"`` that update and count it."""
     optimizer: Any = "adam"
-    """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, an Optax
-    optimizer such as ``optax.lamb``, or one that was created with the learning rate 1, which is then ``learning_rate``."""
+    """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, a dict of
+    such a name and settings (``{"name": "adamw", "weight_decay": 0.01}``), an Optax optimizer such as ``optax.lamb``, or
+    one that was created with the learning rate 1, which is then ``learning_rate``."""
     policy_kwargs: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
     (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``), or modules of your own
@@ -105,7 +106,8 @@ class OffPolicyConfig(AlgorithmConfig):
     learning_starts: int = 100
     """Environment steps with uniformly random actions before learning starts."""
     batch_size: int = 256
-    """Transitions per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
+    """Transitions per gradient step, drawn with replacement. Larger batches reduce the variance of the gradient at a higher
+    cost."""
     tau: float = 0.005
     """Coefficient of the soft update of the target network (Polyak averaging), in (0, 1]."""
     train_freq: int | tuple[int, Literal["step", "episode"]] = 1
@@ -149,11 +151,6 @@ class OffPolicyConfig(AlgorithmConfig):
         assign(self, action_noise=action_noises.parse(self.action_noise))
         coerce(self, "replay_buffer_class", buffer_name)
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
-        if self.batch_size > self.buffer_size:
-            raise ValueError(
-                f"batch_size={self.batch_size} must not exceed buffer_size={self.buffer_size}; "
-                f"try buffer_size={max(10 * self.batch_size, 10_000)} or batch_size={self.buffer_size}"
-            )
 
     @property
     def hindsight(self) -> HindsightConfig | None:
@@ -216,8 +213,8 @@ def with_widths(config: C, obs_leaves: tuple[Leaf, ...]) -> C:
     These depend on the observation, whose leaves are given.
     """
     kind: Any = type(config)
-    widths = kind.hidden_layers_on_images if reads_image(obs_leaves) else kind.hidden_layers
     shape = config.policy_kwargs  # type: ignore[attr-defined]
+    widths = kind.hidden_layers_on_images if reads_image(obs_leaves, shape) else kind.hidden_layers
     said = settled(vars(shape), widths)
     return dataclasses.replace(config, policy_kwargs=dataclasses.replace(shape, **said)) if said else config  # type: ignore
 
@@ -246,6 +243,8 @@ def value_to_json(value: Any) -> Any:
         return schedules.to_json(value)
     if type(value) in action_noises.NOISES.values():
         return action_noises.to_json(value)
+    if isinstance(value, optimizers.Named):
+        return {"name": value.name, **dict(value.settings)}
     if is_own(value):
         return {OWN: optimizers.name(value)}
     if dataclasses.is_dataclass(value):

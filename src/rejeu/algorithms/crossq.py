@@ -201,6 +201,8 @@ def check_shape(shape: PolicyConfig) -> None:
     given = {
         "layer_norm": shape.layer_norm,
         "cnn_layer_norm": shape.cnn_layer_norm,
+        "cnn_features": shape.cnn_features is not None,
+        "normalize_images": not shape.normalize_images,
         "encoder": shape.encoder is not None,
         "head": shape.head is not None,
         "architecture": shape.architecture != "mlp",

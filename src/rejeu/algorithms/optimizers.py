@@ -12,9 +12,9 @@ is created with the learning rate 1 and used in the same way::
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import optax
 
@@ -44,15 +44,44 @@ OPTIMIZERS: dict[str, Callable[..., optax.GradientTransformation]] = {
 """The values of ``optimizer`` by name; those that are variants of Adam take an algorithm's settings ``b1`` and ``eps``."""
 
 
+class Named(NamedTuple):
+    """An optimizer by its name, with settings that a file contains."""
+
+    name: str
+    settings: tuple[tuple[str, Any], ...]
+    """Arguments of the Optax transformation (``b1``, ``b2``, ``eps``, ``decay``), and ``weight_decay`` and ``momentum``."""
+
+    def make(self, **adam: float) -> optax.GradientTransformation:
+        """Returns the transformation; ``adam`` are the algorithm's settings of Adam, which its own replace."""
+        settings = dict(self.settings)
+        weight_decay, momentum = settings.pop("weight_decay", 0.0), settings.pop("momentum", 0.0)
+        rule = {"rmsprop": optax.scale_by_rms, "lion": optax.scale_by_lion, "adamw": optax.scale_by_adam}.get(
+            self.name, OPTIMIZERS[self.name]
+        )
+        is_adam = self.name in ("adam", "adamw", "nadam", "radam", "amsgrad")
+        steps = [rule(**(adam | settings if is_adam else settings))]
+        steps += [optax.trace(momentum)] if momentum else []
+        decays = [optax.add_decayed_weights(weight_decay)] if weight_decay else []
+        return optax.chain(*steps, *decays) if self.name in ("adamw", "lion") else optax.chain(*decays, *steps)
+
+
 def parse(key: str, value: Any) -> Any:
     """Returns the setting ``optimizer``, checked.
 
     Raises:
         ValueError: for an unknown name.
-        TypeError: for anything but a name, an Optax transformation or a function that returns one.
+        TypeError: for anything but a name, a dict of a name and settings, an Optax transformation or a function that returns
+            one.
     """
     if isinstance(value, optax.GradientTransformation):
         return value
+    if isinstance(value, Named):
+        return value
+    if isinstance(value, Mapping) and isinstance(value.get("name"), str):
+        settings = tuple((name, setting) for name, setting in value.items() if name != "name")
+        named = Named(parse(key, value["name"]), settings)
+        named.make()  # raises for a setting that it does not have
+        return named
     if isinstance(value, str):
         if value.lower() not in OPTIMIZERS:
             raise ValueError(
@@ -82,6 +111,8 @@ def make(optimizer: Any, max_norm: float | None = None, max_value: float | None 
 
 
 def _unlimited(optimizer: Any, **adam: float) -> optax.GradientTransformation:
+    if isinstance(optimizer, Named):
+        return optimizer.make(**adam)
     if isinstance(optimizer, str):
         return Elementwise(*OPTIMIZERS[optimizer](**adam))
     given = optimizer if isinstance(optimizer, optax.GradientTransformation) else optimizer(1.0)

@@ -28,9 +28,11 @@ from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
     Config as SACConfig,
+    SdeActor,
     State,
     exploit,
     explore,
+    explorer_of,
     initial_state,
     metrics_of,
     policy,
@@ -107,7 +109,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         )
 
     values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+    actor = lambda state: state.actor  # noqa: E731
+    return Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values)
 
 
 def action_quantiles(critics: QNetwork, obs: PyTree, action: Array) -> Array:
@@ -126,7 +129,7 @@ def truncate(quantiles: Array, n_kept: int) -> Array:
 
 
 def td_target(
-    actor: Network, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array, n_kept: int
+    actor: Network | SdeActor, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array, n_kept: int
 ) -> Array:
     """Returns samples of the return that the critics should predict, ``(batch, n_kept)``."""
     next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
@@ -140,7 +143,9 @@ def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[A
     return jnp.sum(weighted_mean(quantile_huber_loss(quantiles, target), batch.weight)), quantiles
 
 
-def actor_loss(actor: Network, critics: QNetwork, alpha: Array, obs: PyTree, key: Array) -> tuple[Array, Array]:
+def actor_loss(
+    actor: Network | SdeActor, critics: QNetwork, alpha: Array, obs: PyTree, key: Array
+) -> tuple[Array, Array]:
     """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)``.
 
     The value of an action is the mean of all quantiles, none left out.

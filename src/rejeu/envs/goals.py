@@ -62,12 +62,13 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
     first eight rows. If the results agree, it is treated as vectorized from then on. Otherwise it is called row by row.
 
     Raises:
-        BadEnvironmentError: by the returned function, if ``function`` does not return a number for a single goal.
+        BadEnvironmentError: by the returned function, if ``function`` returns neither a number nor an array of one for a
+            single goal.
     """
     vectorized: bool | None = None
 
     def by_row(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        rows = [function(a, d, {}) for a, d in zip(achieved, desired, strict=True)]
+        rows = [one_number(function(a, d, {})) for a, d in zip(achieved, desired, strict=True)]
         if any(row is None or np.shape(row) != () for row in rows):
             wrong = next(row for row in rows if row is None or np.shape(row) != ())
             name = getattr(function, "__name__", "the function of goals")
@@ -88,6 +89,11 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
         return by_row(achieved, desired)
 
     return call
+
+
+def one_number(value: Any) -> Any:
+    """Returns an array of one number as that number; anything else unchanged."""
+    return np.asarray(value).reshape(()) if np.shape(value) == (1,) else value
 
 
 def _whole(

@@ -49,8 +49,8 @@ MIGRATIONS: dict[int, Callable[[Header], Header]] = {1: _from_1}
 """For each older schema, a pure function from its header to a header of the next schema."""
 
 
-def resolve(path: str | Path) -> Path:
-    """Returns the path with ``.safetensors`` added if it has no suffix, as Stable-Baselines3 adds ``.zip``.
+def resolve(path: str | Path, suffix: str = SUFFIX) -> Path:
+    """Returns the path with ``suffix`` added if it has none, as Stable-Baselines3 adds ``.zip``.
 
     Raises:
         ValueError: if it does not name a file, as ``""``, ``"."`` and ``"/"`` do not.
@@ -58,7 +58,7 @@ def resolve(path: str | Path) -> Path:
     if (given := Path(path)).name in ("", ".."):
         raise ValueError(f"{str(path)!r} is not the path of a file; give one, such as 'model{SUFFIX}'")
     path = given
-    return path if path.suffix else path.with_name(path.name + SUFFIX)
+    return path if path.suffix else path.with_name(path.name + suffix)
 
 
 def write(path: str | Path, kind: str, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Path:
@@ -130,8 +130,9 @@ class Contents:
 def opened(path: str | Path, kind: str) -> Iterator[Contents]:
     """Opens a file of that ``kind``; headers of older schemas are converted to the current one.
 
-    Instead of a missing ``model.zip``, ``model.safetensors`` is opened. No array is read: a loader first compares
-    ``specs`` with what it expects (:func:`match`), so that a file cannot make it read more than the model needs.
+    Instead of a missing ``model.zip``, ``model.safetensors`` is opened, and the other way round. No array is read: a loader
+    first compares ``specs`` with what it expects (:func:`match`), so that a file cannot make it read more than the model
+    needs.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -198,8 +199,9 @@ def within(found: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 def _existing(path: str | Path) -> Path:
     """Returns the path of an existing file, as :func:`opened` looks for it."""
     path = resolve(path)
-    if path.suffix in FOREIGN and not path.exists() and path.with_suffix(SUFFIX).exists():
-        path = path.with_suffix(SUFFIX)
+    if path.suffix in (SUFFIX, *FOREIGN) and not path.exists():
+        others = (path.with_suffix(suffix) for suffix in (SUFFIX, *FOREIGN))
+        path = next((other for other in others if other.exists()), path)
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not path.is_file():

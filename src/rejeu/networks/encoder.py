@@ -81,8 +81,12 @@ class CNN(eqx.Module):
     linear: Linear
     norms: tuple[LayerNorm, ...]
     """Over the channels of each layer; empty without layer norm."""
+    scale: float = eqx.field(static=True)
+    """What pixels are divided by."""
 
-    def __init__(self, key: Array, shape: tuple[int, ...], kind: Convolutions, layer_norm: bool = False) -> None:
+    def __init__(
+        self, key: Array, shape: tuple[int, ...], kind: Convolutions, layer_norm: bool = False, scale: float = 255.0
+    ) -> None:
         *layer_keys, linear_key = jax.random.split(key, len(kind.layers) + 1)
         height, width, channels = image_shape(shape)
         layers = []
@@ -93,6 +97,7 @@ class CNN(eqx.Module):
         self.linear = Linear(linear_key, height * width * channels, kind.n_outputs)
         widths = (*(n_filters for n_filters, _, _ in kind.layers), kind.n_outputs)
         self.norms = tuple(map(LayerNorm, widths)) if layer_norm else ()
+        self.scale = scale
 
     def __call__(self, x: Array) -> Array:
         """Maps images ``(batch, ...)`` of 0 to 255 to features ``(batch, n_outputs)``, ``CHUNK`` images at a time."""
@@ -100,7 +105,7 @@ class CNN(eqx.Module):
 
     def features(self, x: Array) -> Array:
         """Returns the features of all images at once."""
-        x = channels_last(x).astype(jnp.float32) / 255.0
+        x = channels_last(x).astype(jnp.float32) / self.scale
         for i, layer in enumerate(self.layers):
             x = jax.nn.relu(self.normalized(i, layer(x)))
         return jax.nn.relu(self.normalized(-1, self.linear(x.reshape(x.shape[0], -1))))
@@ -131,32 +136,37 @@ class Encoder(eqx.Module):
     leaves: tuple[Leaf, ...] = eqx.field(static=True)
     images: tuple[CNN, ...]
     """In the order of the leaves that are images."""
+    shape: PolicyConfig = eqx.field(static=True)
 
-    def __init__(self, leaves: tuple[Leaf, ...], key: Array | None = None, layer_norm: bool = False) -> None:
-        """Builds an encoder of these leaves; the key is needed only for images, which ``layer_norm`` is for too.
+    def __init__(self, leaves: tuple[Leaf, ...], key: Array | None = None, shape: PolicyConfig | None = None) -> None:
+        """Builds an encoder of these leaves; the key is needed only for images, which the settings ``shape`` are for too.
 
         Raises:
             TypeError: if there are images and no key.
         """
-        self.leaves = leaves
+        self.leaves, self.shape = leaves, PolicyConfig() if shape is None else shape
         images: list[CNN] = []
         for leaf in leaves:
-            if (kind := convolutions(leaf)) is not None:
+            if (kind := convolutions(leaf, self.shape)) is not None:
                 if key is None:
                     raise TypeError("Encoder(leaves, key): the encoder of an image has weights and needs a key")
-                images.append(CNN(jax.random.fold_in(key, len(images)), leaf.shape, kind, layer_norm))
+                scale = 255.0 if self.shape.normalize_images else 1.0
+                image_key = jax.random.fold_in(key, len(images))
+                images.append(CNN(image_key, leaf.shape, kind, self.shape.cnn_layer_norm, scale))
         self.images = tuple(images)
 
     @property
     def n_features(self) -> int:
         """Length of the feature vector."""
-        return sum(n_features(leaf) for leaf in self.leaves)
+        kinds = [convolutions(leaf, self.shape) for leaf in self.leaves]
+        pairs = zip(self.leaves, kinds, strict=True)
+        return sum(leaf.n_features if kind is None else kind.n_outputs for leaf, kind in pairs)
 
     def __call__(self, obs: PyTree) -> Array:
         """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
         images = iter(self.images)
         parts = [
-            encode_leaf(leaf, x) if convolutions(leaf) is None else next(images)(x)
+            encode_leaf(leaf, x, self.shape) if convolutions(leaf, self.shape) is None else next(images)(x)
             for leaf, x in zip(self.leaves, jax.tree.leaves(obs), strict=True)
         ]
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
@@ -194,23 +204,26 @@ def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> A
     """Returns the encoder of these leaves: rejeu's own, or the module of the user's."""
     if shape.encoder is not None:
         return OwnEncoder(key, leaves, find_encoder(shape.encoder))
-    return Encoder(leaves, key, shape.cnn_layer_norm)
+    return Encoder(leaves, key, shape)
 
 
-def reads_image(leaves: tuple[Leaf, ...]) -> bool:
+def reads_image(leaves: tuple[Leaf, ...], shape: PolicyConfig | None = None) -> bool:
     """Returns whether an observation is one image, or one stack of images, that convolutions read.
 
     A Dict or Tuple is not.
     """
-    return len(leaves) == 1 and not leaves[0].path and convolutions(leaves[0]) is not None
+    return len(leaves) == 1 and not leaves[0].path and convolutions(leaves[0], shape) is not None
 
 
-def convolutions(leaf: Leaf) -> Convolutions | None:
-    """Returns the convolutions for an observation, None if it is not an image or is too small."""
-    if leaf.dtype != "uint8" or len(leaf.shape) not in (3, 4):
+def convolutions(leaf: Leaf, shape: PolicyConfig | None = None) -> Convolutions | None:
+    """Returns the convolutions for an observation with the settings ``shape``, None if it is no image or too small."""
+    is_scaled = shape is not None and not shape.normalize_images and leaf.kind != "categorical"
+    if (leaf.dtype != "uint8" and not is_scaled) or len(leaf.shape) not in (3, 4):
         return None
     side = min(image_shape(leaf.shape)[:2])
-    return NATURE if side >= 36 else SMALL if side >= 8 else None
+    kind = NATURE if side >= 36 else SMALL if side >= 8 else None
+    width = None if shape is None else shape.cnn_features
+    return kind if kind is None or width is None else kind._replace(n_outputs=width)
 
 
 def image_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
@@ -239,13 +252,7 @@ def channels_last(x: Array) -> Array:
     return jnp.moveaxis(x, 1, 3) if min(x.shape[1:]) == x.shape[1] else x
 
 
-def n_features(leaf: Leaf) -> int:
-    """Returns the number of features of an observation leaf."""
-    kind = convolutions(leaf)
-    return leaf.n_features if kind is None else kind.n_outputs
-
-
-def encode_leaf(leaf: Leaf, x: Array) -> Array:
+def encode_leaf(leaf: Leaf, x: Array, shape: PolicyConfig) -> Array:
     """Returns ``(batch, leaf.n_features)``: flattened numbers, pixels in [0, 1], or one-hot vectors."""
     x = x.reshape(x.shape[0], -1)
     if leaf.kind == "categorical":
@@ -255,4 +262,4 @@ def encode_leaf(leaf: Leaf, x: Array) -> Array:
         ]
         return jnp.concatenate(parts, axis=-1)
     x = x.astype(jnp.float32)
-    return x / 255.0 if leaf.kind == "image" else x
+    return x / 255.0 if leaf.kind == "image" and shape.normalize_images else x

@@ -42,6 +42,11 @@ class PolicyConfig:
     """Normalize each hidden layer before its nonlinearity: steadier critics, above all at high learning rates."""
     cnn_layer_norm: bool = False
     """Normalize the layers of the CNN of an image likewise, each pixel over its channels."""
+    cnn_features: int | None = None
+    """Width of the layer after the convolutions of each image. None: 512, or 256 for images below 36 pixels."""
+    normalize_images: bool = True
+    """Divide ``uint8`` images by 255. False takes them as they are, and reads arrays of three axes of any type as images,
+    for environments that scale them."""
     architecture: Literal["mlp", "simba"] = "mlp"
     """``simba``: residual blocks with layer norm (arXiv 2410.09754) in place of plain layers; ``net_arch`` then holds
     one number a block, all equal, and is made from ``n_blocks`` and ``width`` where it is None."""
@@ -79,7 +84,8 @@ class PolicyConfig:
         coerce(self, BRANCHES, layer_widths)
         coerce(self, ("n_blocks", "width"), whole, least=1)
         coerce(self, "activation_fn", activation_name)
-        coerce(self, ("layer_norm", "cnn_layer_norm"), flag)
+        coerce(self, ("layer_norm", "cnn_layer_norm", "normalize_images"), flag)
+        coerce(self, "cnn_features", whole, least=1, optional=True)
         coerce(self, "architecture", choice, among=("mlp", "simba"))
         self._check_shape()
 

@@ -14,8 +14,8 @@ import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -256,21 +256,23 @@ class TensorBoard:
         Raises:
             OSError: if writing fails; the file is not changed.
         """
+        with self.event(step) as summary:
+            for name, value in metrics.items():
+                summary.value.add(tag=name, simple_value=value)
+
+    @contextmanager
+    def event(self, step: int) -> Iterator[Any]:
+        """Yields a summary of TensorBoard's, and writes what was put into it."""
         event = self._event(wall_time=time.time(), step=step)
-        for name, value in metrics.items():
-            event.summary.value.add(tag=name, simple_value=value)
+        yield event.summary
         self._append(event)
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the configuration as a table, in TensorBoard's tab "Text"."""
         cells = [(name, str(value).replace("|", "\\|")) for name, value in flat(config)]
         table = "\n".join(["| name | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in cells)])
-        event = self._event(wall_time=time.time(), step=0)
-        value = event.summary.value.add(tag="config/text_summary")
-        value.metadata.plugin_data.plugin_name = "text"
-        value.tensor.dtype = 7  # DT_STRING
-        value.tensor.string_val.append(table.encode())
-        self._append(event)
+        with self.event(0) as summary:
+            add_text(summary, "config", table)
 
     def write_video(self, step: int, path: Path) -> None:
         """Does nothing, because TensorBoard shows no videos."""
@@ -282,6 +284,14 @@ class TensorBoard:
         record = io.BytesIO()
         self._record_writer(record).write(event.SerializeToString())
         atomic.append(self.path, record.getvalue())
+
+
+def add_text(summary: Any, name: str, text: str) -> None:
+    """Adds a text in Markdown to a summary of TensorBoard's."""
+    value = summary.value.add(tag=f"{name}/text_summary")
+    value.metadata.plugin_data.plugin_name = "text"
+    value.tensor.dtype = 7  # DT_STRING
+    value.tensor.string_val.append(text.encode())
 
 
 def import_tensorboard() -> tuple[Any, Any]:

@@ -11,11 +11,14 @@ A function given as a schedule is called with the remaining progress here, from 
 
 import importlib
 import sys
+from collections.abc import Mapping
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rejeu.buffers.hindsight import HerReplayBuffer
     from rejeu.sb3.algorithms import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
+    from rejeu.sb3.common.buffers import HerReplayBuffer
+    from rejeu.sb3.common.utils import get_system_info
 
 __all__ = [
     "A2C",
@@ -30,6 +33,7 @@ __all__ = [
     "HerReplayBuffer",
     "MaskablePPO",
     "RecurrentPPO",
+    "get_system_info",
 ]
 
 
@@ -37,12 +41,21 @@ def __getattr__(name: str) -> Any:
     """Imports an algorithm when it is first used, so that worker processes need not."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = "rejeu.buffers.hindsight" if name == "HerReplayBuffer" else "rejeu.sb3.algorithms"
-    return getattr(importlib.import_module(module), name)
+    elsewhere = {"HerReplayBuffer": "rejeu.sb3.common.buffers", "get_system_info": "rejeu.sb3.common.utils"}
+    return getattr(importlib.import_module(elsewhere.get(name, "rejeu.sb3.algorithms")), name)
 
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+def define(path: str, names: Mapping[str, Any]) -> None:
+    """Makes names importable from the module ``path``, which has no file of its own. Its parents must exist."""
+    module = ModuleType(path, f"Part of {path.split('.')[1]}'s API.")
+    module.__dict__.update(names, __all__=[*names], __path__=[])
+    sys.modules[path] = module
+    parent, _, last = path.rpartition(".")
+    setattr(sys.modules[parent], last, module)
 
 
 def alias(module: str, *names: str) -> None:

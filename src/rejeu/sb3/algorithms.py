@@ -1,37 +1,655 @@
-"""The algorithms with Stable-Baselines3's schedules: functions of the progress that remains, which runs from 1 to 0."""
+"""The algorithms with Stable-Baselines3's arguments, attributes and methods.
+
+They are the agents of :mod:`rejeu` and learn alike. Functions given as schedules take the remaining progress, from 1 to 0.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+import dataclasses
+import inspect
+import os
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar, Self
 
-from rejeu import agents
-from rejeu.sb3.common.utils import of_progress
+import gymnasium as gym
+import jax
+import numpy as np
 
-if TYPE_CHECKING:
-    from rejeu.agents import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
+from rejeu import agents, schedules, validation
+from rejeu.agents import Agent
+from rejeu.agents.base import AGENT_ARGUMENTS
+from rejeu.agents.off_policy import OffPolicyAgent
+from rejeu.algorithms.config import REPLAY_BUFFERS
+from rejeu.callbacks.base import Callback, TrainingCallback
+from rejeu.io import checkpoint
+from rejeu.reporting import logging
+from rejeu.sb3 import policy as policies
+from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
+from rejeu.sb3.common.env_util import make_vec_env
+from rejeu.sb3.common.noise import VectorizedActionNoise
+from rejeu.sb3.common.torch_layers import encoder_of, register_again
+from rejeu.sb3.policy import BasePolicy
 
 __all__ = ["A2C", "DDPG", "DQN", "PPO", "QRDQN", "SAC", "TD3", "TQC", "CrossQ", "MaskablePPO", "RecurrentPPO"]
 
 SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "critic_learning_rate", "beta")
 """The hyperparameters that can be schedules."""
+WITHOUT_EFFECT = (
+    "_init_setup_model",
+    "optimize_memory_usage",
+    "use_sde_at_warmup",
+    "rollout_buffer_class",
+    "rollout_buffer_kwargs",
+    "monitor_wrapper",
+    "support_multi_env",
+)
+"""Arguments that mean nothing here and are accepted with any value."""
+NEUTRAL: dict[str, tuple[Any, ...]] = {
+    "use_sde": (False,),
+    "sde_sample_freq": (-1,),
+    "squash_output": (False, True),
+    "use_expln": (False,),
+    "full_std": (True,),
+    "clip_mean": (2.0,),
+    "log_std_init": (0.0, -3, -2),
+    "share_features_extractor": (False,),
+    "n_critics": (1,),
+    "ortho_init": (True, False),
+    "n_lstm_layers": (1,),
+    "lstm_kwargs": (None, {}),
+    "enable_critic_lstm": (True,),
+}
+"""Settings that some algorithms do not have, with the values that they would have there."""
+OPTIMIZERS = {
+    "Adam": "adam",
+    "AdamW": "adamw",
+    "NAdam": "nadam",
+    "RAdam": "radam",
+    "RMSprop": "rmsprop",
+    "RMSpropTFLike": "rmsprop",
+    "SGD": "sgd",
+}
+"""Optimizers by the names of PyTorch's classes."""
+OFF_POLICY = ("learning_rate", "buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq")
+POSITIONAL = {
+    "PPO": ("learning_rate", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range"),
+    "A2C": ("learning_rate", "n_steps", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
+}
+"""Arguments after ``policy`` and ``env`` by position."""
 
 
-def converted(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns keyword arguments of an agent whose schedules are functions of the progress."""
-    result = {key: of_progress(value) if key in SCHEDULED else value for key, value in settings.items()}
-    if isinstance(result.get("priorities"), Mapping):
-        result["priorities"] = converted(result["priorities"])
-    return result
+def unsupported(name: str, value: Any, what: str = "has no effect") -> None:
+    """Warns that a setting of Stable-Baselines3 is not followed."""
+    warnings.warn(f"{name}={value!r} {what} in rejeu; see docs/coming-from-sb3.md", UserWarning, stacklevel=5)
 
 
-def with_remaining_progress(kind: Any) -> Any:
-    """Returns the subclass of an agent whose schedules that are functions take the remaining progress."""
-    doc = f":class:`rejeu.{kind.__name__}`; functions given as schedules take the remaining progress."
-    attributes = {"__module__": __name__, "__doc__": doc, "converted": staticmethod(converted)}
-    return type(kind)(kind.__name__, (kind,), attributes)
+def optimizer_of(kind: Any, settings: Mapping[str, Any]) -> Any:
+    """Returns the setting ``optimizer`` for a class of PyTorch's or of Optax, and its arguments."""
+    name = OPTIMIZERS.get(getattr(kind, "__name__", ""))
+    if name is None:
+        return kind if kind is not None else {"name": "adam", **settings} if settings else None
+    renamed = {"alpha": "decay"}
+    given = {renamed.get(key, key): value for key, value in settings.items() if key not in ("lr", "betas", "centered")}
+    if "betas" in settings:
+        given["b1"], given["b2"] = settings["betas"]
+    if given.pop("amsgrad", False):
+        name = "amsgrad"
+    return {"name": name, **given} if given else name
 
 
-if not TYPE_CHECKING:
-    for name in __all__:
-        globals()[name] = with_remaining_progress(getattr(agents, name))
+def layers_of(net_arch: Any) -> Any:
+    """Returns ``net_arch`` as rejeu takes it."""
+    if isinstance(net_arch, list | tuple) and net_arch and isinstance(net_arch[-1], Mapping):
+        warnings.warn(
+            "net_arch=[dict(...)] is net_arch=dict(...) since Stable-Baselines3 1.8", UserWarning, stacklevel=6
+        )
+        net_arch = net_arch[-1]
+    if isinstance(net_arch, Mapping):
+        others = ("qf",) if "qf" in net_arch else ("vf",)
+        return {key: list(net_arch.get(key, ())) for key in ("pi", *others)}
+    return list(net_arch)
+
+
+class Original(Agent):
+    """An agent with Stable-Baselines3's arguments, attributes and methods. Abstract.
+
+    Hyperparameters are attributes (``model.gamma``) that can be set, which compiles the agent again.
+    """
+
+    replaced_buffer: Any = None
+    """What was assigned to ``replay_buffer``; None: the agent's own is shown."""
+    exploration_rate_set: float | None = None
+    """What was assigned to ``exploration_rate``."""
+    has_own_logger: bool = False
+    """Whether :meth:`set_logger` was called."""
+    policy_object: BasePolicy | None = None
+    """What ``policy`` returns."""
+    STORED: ClassVar[tuple[str, ...]] = ("replay_buffer", "policy", "exploration_rate")
+    """Properties that can be set."""
+
+    def __init__(self, policy: Any, env: Any, *args: Any, **settings: Any) -> None:
+        """Takes the arguments of Stable-Baselines3's class of this name, and those of rejeu's.
+
+        Args:
+            policy: name or class of the policy.
+            env: id, environment or vector environment.
+            args: the first hyperparameters by position.
+            settings: hyperparameters.
+        """
+        settings |= zip(POSITIONAL.get(self.name, OFF_POLICY), args, strict=False)
+        made = None
+        if isinstance(policy, type):
+            env, policy, made = self._prepared(policy, env, settings)
+        name = policy.replace("LstmPolicy", "Policy") if isinstance(policy, str) else policy
+        super().__init__(name, env, **settings)
+        self.device = utils.Device(self.device)
+        if made is not None:
+            made.model, made.observation_space, made.action_space = self, self.observation_space, self.action_space
+            self.policy_object = made
+
+    @staticmethod
+    def _prepared(kind: type[Any], env: Any, settings: dict[str, Any]) -> tuple[Any, str, BasePolicy | None]:
+        """Returns the environment, the name of the policy and the policy, for a class of policies."""
+        if not issubclass(kind, BasePolicy):
+            raise TypeError(f"policy={kind.__name__} must be a name, or a class derived from BasePolicy")
+        made = None
+        env = make_vec_env(env) if isinstance(env, str) else env
+        space = getattr(env, "single_observation_space", env.observation_space)
+        if kind.__init__ is not BasePolicy.__init__:
+            action_space = getattr(env, "single_action_space", env.action_space)
+            rate = utils.FloatSchedule(settings.get("learning_rate", 3e-4))
+            made = kind(space, action_space, rate, **(settings.get("policy_kwargs") or {}))
+            settings["policy_kwargs"] = made.settings
+        elif kind.__module__ != policies.__name__:
+            made = kind(space, env.action_space)
+        by_space = "MultiInputPolicy" if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else "MlpPolicy"
+        return env, kind.policy_name or by_space, made
+
+    @classmethod
+    def converted(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns keyword arguments of the constructor or of ``load`` as rejeu's agent takes them."""
+        known = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
+        result: dict[str, Any] = {}
+        for key, value in settings.items():
+            if key in WITHOUT_EFFECT or (key not in known and value in NEUTRAL.get(key, ())):
+                continue
+            result[key] = utils.of_progress(value) if key in SCHEDULED else value
+        if isinstance(result.get("priorities"), Mapping):
+            result["priorities"] = {key: utils.of_progress(value) for key, value in result["priorities"].items()}
+        if isinstance(noise := result.get("action_noise"), VectorizedActionNoise):
+            result["action_noise"] = noise.base_noise
+        if isinstance(frequency := result.get("train_freq"), tuple):
+            result["train_freq"] = tuple(getattr(part, "value", part) for part in frequency)
+        if "device" in result:
+            result["device"] = "auto" if result["device"] is None else str(result["device"])
+        cls._convert_buffer(result)
+        if isinstance(result.get("policy_kwargs"), Mapping):
+            shape, others = cls._shape_of(result["policy_kwargs"])
+            result = others | result | {"policy_kwargs": shape}
+        return result
+
+    @staticmethod
+    def _convert_buffer(settings: dict[str, Any]) -> None:
+        """Replaces the settings of a replay buffer by rejeu's."""
+        kind, given = settings.get("replay_buffer_class"), dict(settings.get("replay_buffer_kwargs") or {})
+        if isinstance(kind, type) and issubclass(kind, buffers.ReplayBuffer):
+            if kind.__name__ not in REPLAY_BUFFERS and kind.__module__ != buffers.__name__:
+                raise TypeError(
+                    f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.buffers.ReplayBuffer, "
+                    "which stores every observation once; the classes of rejeu.sb3.common.buffers are for use by hand"
+                )
+            if kind is buffers.NStepReplayBuffer:
+                settings["n_steps"] = given.pop("n_steps", settings.get("n_steps", 3))
+                settings["gamma"] = given.pop("gamma", settings.get("gamma", 0.99))
+            settings["replay_buffer_class"] = "HerReplayBuffer" if kind is buffers.HerReplayBuffer else "ReplayBuffer"
+        if given.pop("handle_timeout_termination", True) is False:
+            unsupported("handle_timeout_termination", False, "is not followed: time limits are never terminal")
+        if given.pop("copy_info_dict", False):
+            unsupported("copy_info_dict", True, "is not followed: rewards are computed from the goals alone")
+        given.pop("optimize_memory_usage", None)
+        if "replay_buffer_kwargs" in settings:
+            settings["replay_buffer_kwargs"] = given or None
+
+    @classmethod
+    def _shape_of(cls, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Returns ``policy_kwargs`` as rejeu takes them, and the hyperparameters that they contain."""
+        config = cls.algorithm.Config
+        fields, known = (validation.field_names(kind) for kind in (config.policy_kwargs_class, config))
+        shape: dict[str, Any] = {}
+        others: dict[str, Any] = {}
+        for key, value in given.items():
+            if key in ("features_extractor_class", "optimizer_class", "features_extractor_kwargs", "optimizer_kwargs"):
+                continue
+            if key == "net_arch" and value is not None:
+                shape[key] = layers_of(value)
+            elif key == "activation_fn" and value is not None:
+                shape[key] = {"LeakyReLU": "leaky_relu"}.get(getattr(value, "__name__", ""), value)
+            elif key == "log_std_init" and "sde_log_std_init" in known:
+                others["sde_log_std_init"] = value
+            elif key in fields:
+                shape[key] = value
+            elif key in known:
+                others[key] = value
+            elif key not in NEUTRAL:
+                shape[key] = value  # an error that suggests a name
+            elif value not in NEUTRAL[key]:
+                unsupported(key, value)
+        normalizes = given.get("normalize_images", True)
+        settings = given.get("features_extractor_kwargs") or {}
+        shape |= encoder_of(given.get("features_extractor_class"), settings, normalizes)
+        optimizer = optimizer_of(given.get("optimizer_class"), given.get("optimizer_kwargs") or {})
+        return {key: value for key, value in shape.items() if value is not None}, others | (
+            {} if optimizer is None else {"optimizer": optimizer}
+        )
+
+    @property
+    def policy(self) -> BasePolicy:
+        """The policy, with the networks as its parts."""
+        if self.policy_object is None:
+            is_off_policy = isinstance(self, OffPolicyAgent)
+            self.policy_object = (POLICIES[self.name] if is_off_policy else policies.ActorCriticPolicy).of(self)
+        return self.policy_object
+
+    @policy.setter
+    def policy(self, value: Any) -> None:
+        self.policy_object = value
+
+    def __getattr__(self, name: str) -> Any:
+        """Returns a hyperparameter, or a network of the policy."""
+        config = self.__dict__.get("config")
+        if config is None:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        if name in ("clip_range", "clip_range_vf") and hasattr(config, name):
+            value = getattr(config, name)
+            return None if value is None else utils.FloatSchedule(utils.of_remaining(value))
+        if name in validation.field_names(type(config)):
+            value = getattr(config, name)
+            return utils.of_remaining(value) if name in SCHEDULED and callable(value) else value
+        if name in policies.NETWORKS:
+            return getattr(self.policy, name)
+        if name in ("log_ent_coef", "ent_coef_tensor") and hasattr(self.learner.shapes, "log_alpha"):
+            log_alpha = np.asarray(self.state.log_alpha)
+            if name == "log_ent_coef":
+                return log_alpha if config.learns_temperature else None
+            return np.exp(log_alpha)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Sets an attribute; a hyperparameter also in the compiled functions."""
+        config = self.__dict__.get("config")
+        if config is None or name in self.STORED or name not in validation.field_names(type(config)):
+            object.__setattr__(self, name, value)
+            return
+        self.config = dataclasses.replace(config, **self.converted({name: value}))
+        if "learner" in self.__dict__ and "run" in self.__dict__:
+            self.build(self.observation_space, self.action_space)
+
+    @property
+    def lr_schedule(self) -> utils.FloatSchedule:
+        """The learning rate as a function of the remaining progress."""
+        return utils.FloatSchedule(utils.of_remaining(self.config.learning_rate))
+
+    @property
+    def exploration_rate(self) -> float:
+        """Epsilon of DQN and QR-DQN now; 0 before the first step."""
+        if self.exploration_rate_set is not None:
+            return self.exploration_rate_set
+        if not hasattr(self.config, "exploration_final_eps"):
+            raise AttributeError(f"{self.name} has no exploration_rate")
+        if self.run.step == 0:
+            return 0.0
+        config = self.config
+        line = schedules.Linear(
+            config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction
+        )
+        return float(line(1.0 - self._current_progress_remaining))
+
+    @exploration_rate.setter
+    def exploration_rate(self, value: float) -> None:
+        self.exploration_rate_set = float(value)
+
+    @property
+    def replay_buffer(self) -> Any:
+        """The replay buffer with Stable-Baselines3's attributes; ``run.replay`` is the one that batches are drawn from."""
+        if not isinstance(self, OffPolicyAgent) or "replay_buffer_deleted" in self.__dict__:
+            raise AttributeError(f"{self.name} has no replay buffer")
+        if self.replaced_buffer is not None:
+            return self.replaced_buffer
+        is_her = self.config.hindsight is not None
+        kind = buffers.HerReplayBuffer if is_her else buffers.ReplayBuffer
+        if isinstance(self.observation_space, gym.spaces.Dict) and not is_her:
+            kind = buffers.DictReplayBuffer
+        if self.config.n_steps > 1 and not is_her:
+            kind = buffers.NStepReplayBuffer
+        shown = kind.of(self)
+        shown.__dict__.update(n_steps=self.config.n_steps, gamma=self.config.gamma)
+        return shown
+
+    @replay_buffer.setter
+    def replay_buffer(self, value: Any) -> None:
+        self.__dict__.pop("replay_buffer_deleted", None)
+        if isinstance(value, buffers.ReplayBuffer) and value.core is not self.run.replay:
+            self.run.replay = self.make_buffer(self.run.env)
+            self.replaced_buffer = None
+            order = [*range(value.pos, value.buffer_size), *range(value.pos)] if value.full else range(value.pos)
+            own = self.replay_buffer
+            for i in order:
+                infos = [{"TimeLimit.truncated": bool(timeout)} for timeout in value.timeouts[i]]
+                obs, following = (
+                    buffers.by_leaf(lambda leaf, i=i: leaf[i], part)
+                    for part in (value.observations, value.next_observations)
+                )
+                own.add(obs, following, value.actions[i], value.rewards[i], value.dones[i], infos)
+
+    @replay_buffer.deleter
+    def replay_buffer(self) -> None:
+        self.__dict__["replay_buffer_deleted"] = True
+
+    @property
+    def rollout_buffer(self) -> buffers.RolloutBuffer:
+        """A copy of the steps since the last update, without values and log-probabilities.
+
+        Raises:
+            AttributeError: for an agent with a replay buffer.
+        """
+        core = self.run.replay
+        if isinstance(self, OffPolicyAgent):
+            raise AttributeError(f"{self.name} has no rollout buffer")
+        shown = buffers.RolloutBuffer(core.n_steps, self.observation_space, self.action_space, n_envs=core.n_envs)
+        rollout = core.rollout()
+        shown.observations, shown.rewards = jax.tree.map(np.copy, rollout.obs), rollout.reward.copy()
+        shown.actions = np.array(rollout.action).reshape(core.n_steps, core.n_envs, -1)
+        shown.episode_starts[0], shown.episode_starts[1:] = rollout.started, rollout.ended[:-1]
+        shown.pos, shown.full = core.length, core.full
+        return shown
+
+    @property
+    def _last_obs(self) -> Any:
+        return self.run.obs
+
+    @property
+    def _last_episode_starts(self) -> np.ndarray:
+        return self.run.ended
+
+    @property
+    def _n_updates(self) -> int:
+        return self.run.n_updates
+
+    @property
+    def _episode_num(self) -> int:
+        return self.run.episode
+
+    @property
+    def _vec_normalize_env(self) -> Any:
+        return self.get_vec_normalize_env()
+
+    @property
+    def _current_progress_remaining(self) -> float:
+        call = self.training_call
+        return 1.0 if call is None else 1.0 - float(call.progress(self.run.step, self.run.episode))
+
+    @property
+    def _logger(self) -> Any:
+        return self.logger
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seeds Python, NumPy, the batches and the next reset of the environments; None does nothing."""
+        if seed is not None:
+            utils.set_random_seed(seed)
+            self.run.rng, self.run.seed = np.random.default_rng(seed), seed
+            self.run.key = jax.random.key_data(jax.random.key(seed))
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> tuple[np.ndarray, Any]:
+        """Returns actions in the environment's range, and the next state of a recurrent policy; see :meth:`Agent.predict`.
+
+        DQN and QR-DQN act at random with the probability ``exploration_rate`` unless ``deterministic``. Images may have their
+        channels first or last.
+
+        Raises:
+            ValueError: if the observation has the wrong structure or shape, such as what ``env.reset()`` of Gymnasium returns.
+        """
+        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+            raise ValueError(
+                "predict got a tuple (obs, info): you are mixing Gym API with SB3 VecEnv API; give it obs only, of "
+                "obs, info = env.reset()"
+            )
+        if isinstance(self.observation_space, gym.spaces.Box):
+            observation = _like(self.observation_space, observation)
+        explores = hasattr(self.config, "exploration_final_eps") and not deterministic
+        action, memory = super().predict(observation, state, episode_start, deterministic or explores, action_masks)
+        if explores and self.run.rng.random() < self.exploration_rate:
+            sampled = [self.action_space.sample() for _ in range(np.size(action))]
+            action = np.asarray(sampled, action.dtype).reshape(np.shape(action))
+        return np.asarray(action), memory
+
+    def learn(
+        self,
+        total_timesteps: int | None = None,
+        callback: Any = None,
+        log_interval: int | None = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        use_masking: bool = True,
+        **limits: Any,
+    ) -> Self:
+        """Trains, and returns the agent; see :meth:`Agent.learn`.
+
+        Functions as ``callback`` are called with ``(locals, globals)``; only ``False`` stops training.
+
+        Raises:
+            ValueError: with ``use_masking=False``: use PPO.
+        """
+        if not use_masking:
+            raise ValueError("use_masking=False: MaskablePPO needs masks; use PPO for environments without")
+        given = [] if callback is None else [*callback] if isinstance(callback, list | tuple) else [callback]
+        interval = 2**62 if log_interval is None else log_interval
+        if not self.has_own_logger:
+            folder = tb_log_name or self.name
+            only = {*self.log} <= {"tensorboard"}
+            self.logger = self._default_logger(folder, reset_num_timesteps) if only else logging.Logger()
+        self.exploration_rate_set = None
+        callbacks = [as_callback(one) for one in given]
+        flags = (reset_num_timesteps, progress_bar)
+        return super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
+
+    def _default_logger(self, name: str, is_new: bool) -> loggers.Logger:
+        """Returns the logger of ``verbose`` and ``tensorboard_log``; a run that continues keeps its folder."""
+        kinds = ["stdout"] * (self.verbose >= 1)
+        folder = os.getenv("SB3_LOGDIR")
+        if self.tensorboard_log is not None:
+            root = Path(self.tensorboard_log)
+            k = utils.get_latest_run_id(root, name) + is_new
+            folder, kinds = str(root / f"{name}_{max(k, 1)}"), [*kinds, "tensorboard"]
+        formats = [loggers.make_output_format(kind, folder or ".") for kind in kinds]
+        logger = loggers.Logger(folder, formats)
+        if not formats:  # statistics that nothing shows need not be computed
+            logger.outputs = []
+        return logger
+
+    def set_logger(self, logger: Any) -> None:
+        """Replaces the logger for all further training."""
+        super().set_logger(logger)
+        self.has_own_logger = True
+
+    def save(self, path: Any, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> Any:
+        """Writes the model to exactly this path, or to a file object; ``.zip`` is added to a path without a suffix.
+
+        The file is rejeu's, whatever its suffix: arrays and JSON. ``exclude`` and ``include`` are accepted with a warning,
+        because a file holds what was learned and the hyperparameters, and nothing else.
+        """
+        if exclude or include:
+            unsupported("exclude" if exclude else "include", [*(exclude or include or ())])
+        return written(super().save, path, ".zip")
+
+    def save_replay_buffer(self, path: Any) -> Any:
+        """Writes the replay buffer to exactly this path, or to a file object; ``.pkl`` is added to a path without a suffix."""
+        return written(super().save_replay_buffer, path, ".pkl")  # type: ignore[misc]
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """Replaces the replay buffer by a saved one; see :meth:`rejeu.OffPolicyAgent.load_replay_buffer`."""
+        self.__dict__.pop("replay_buffer_deleted", None)
+        with readable(path, ".pkl") as found:
+            super().load_replay_buffer(found)  # type: ignore[misc]
+
+    @classmethod
+    def load(
+        cls,
+        path: Any,
+        env: Any = None,
+        device: Any = "auto",
+        custom_objects: Mapping[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """Returns the agent of a model file.
+
+        Args:
+            path: as given to :meth:`save`, or a file object.
+            env: environments to continue training in.
+            device: ``"auto"``, ``"cpu"`` or ``"cuda"``.
+            custom_objects: hyperparameters that replace the saved ones; other names are ignored.
+            print_system_info: print the versions of packages.
+            force_reset: accepted; new episodes start with the next ``learn``.
+            kwargs: hyperparameters and arguments that replace the saved ones.
+        """
+        if print_system_info:
+            utils.get_system_info()
+        known = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
+        objects = {key: value for key, value in (custom_objects or {}).items() if key in known}
+        has_gpu = utils.Device(str(device)).type == "cuda" and utils.get_device(device).type == "cuda"
+        with readable(path, ".zip") as found:
+            shape = checkpoint.read_header(found, "agent").get("config", {}).get("policy_kwargs")
+            register_again(shape.get("encoder") if isinstance(shape, dict) else None)
+            place = str(device) if has_gpu or str(device) in ("auto", "cpu") else "auto"
+            agent = load_agent(cls, found, env, {**objects, "device": place, **kwargs})
+        agent.device = utils.Device(agent.device)
+        return agent
+
+
+def load_agent(kind: type[Original], path: Path, env: Any, changes: Mapping[str, Any]) -> Any:
+    """Returns the agent of a file by :meth:`Agent.load`."""
+    return Agent.__dict__["load"].method.__get__(None, kind)(path, env, **changes)
+
+
+def name_in(path: Any) -> str:
+    """Returns the name of the algorithm in a model file."""
+    with readable(path, ".zip") as found:
+        return str(checkpoint.read_header(found, "agent").get("algorithm"))
+
+
+def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
+    """Writes to a path, to which ``suffix`` is added if it has none, or to a file object; returns the path."""
+    if not isinstance(path, str | Path):
+        with tempfile.TemporaryDirectory() as folder:
+            path.write(write(Path(folder) / f"file{suffix}").read_bytes())
+        return None
+    return write(checkpoint.resolve(path, suffix))
+
+
+@contextmanager
+def readable(path: Any, suffix: str) -> Iterator[Path]:
+    """Yields a path that can be opened: the given one, or with ``suffix``; the content of a file object as a file."""
+    if isinstance(path, str | Path):
+        given = Path(path)
+        with_suffix = checkpoint.resolve(given, suffix)
+        yield with_suffix if with_suffix.is_file() and not given.is_file() else given
+        return
+    path.seek(0)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / f"file{suffix}"
+        copy.write_bytes(path.read())
+        yield copy
+
+
+def as_callback(callback: Any) -> Callback:
+    """Returns a function of ``(locals, globals)`` as a callback; one of ``(agent, progress)`` unchanged."""
+    if isinstance(callback, TrainingCallback) or not inspect.isroutine(callback):
+        return callback
+    is_own = [*inspect.signature(callback).parameters][:1] == ["agent"]
+    return callback if is_own else base_callback.ConvertCallback(callback)
+
+
+def _like(space: gym.spaces.Box, observation: Any) -> np.ndarray:
+    """Returns an image whose channels are at the other end than the space has them in its order."""
+    array = np.asarray(observation)
+    if len(space.shape) != 3 or array.shape[-3:] == space.shape:
+        return array
+    for source, target in ((-3, -1), (-1, -3)):
+        if (moved := np.moveaxis(array, source, target)).shape[-3:] == space.shape:
+            return moved
+    return array
+
+
+class A2C(Original, agents.A2C):
+    """:class:`rejeu.A2C` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class DDPG(Original, agents.DDPG):
+    """:class:`rejeu.DDPG` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class DQN(Original, agents.DQN):
+    """:class:`rejeu.DQN` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class PPO(Original, agents.PPO):
+    """:class:`rejeu.PPO` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class SAC(Original, agents.SAC):
+    """:class:`rejeu.SAC` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class TD3(Original, agents.TD3):
+    """:class:`rejeu.TD3` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class QRDQN(Original, agents.QRDQN):
+    """:class:`rejeu.QRDQN` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class TQC(Original, agents.TQC):
+    """:class:`rejeu.TQC` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class CrossQ(Original, agents.CrossQ):
+    """:class:`rejeu.CrossQ` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class RecurrentPPO(Original, agents.RecurrentPPO):
+    """:class:`rejeu.RecurrentPPO` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class MaskablePPO(Original, agents.MaskablePPO):
+    """:class:`rejeu.MaskablePPO` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+def load_any(path: Any, device: Any) -> Any:
+    """Returns the agent of a model file, whatever its algorithm."""
+    return globals()[name_in(path)].load(path, device=device)
+
+
+policies.BaseModel.load_agent = staticmethod(load_any)
+POLICIES: dict[str, type[BasePolicy]] = {
+    "DQN": policies.DQNPolicy,
+    "QRDQN": policies.DQNPolicy,
+    "TD3": policies.TD3Policy,
+    "DDPG": policies.TD3Policy,
+    "SAC": policies.SACPolicy,
+    "TQC": policies.SACPolicy,
+    "CrossQ": policies.SACPolicy,
+}
+"""Classes of the policies of off-policy agents."""

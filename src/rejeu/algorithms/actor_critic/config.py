@@ -42,6 +42,9 @@ class ActorCriticConfig(PolicyConfig):
     """Learn the standard deviation; False keeps it at ``log_std_init``."""
     state_dependent_std: bool = False
     """Compute the standard deviation from the observation rather than learn one for all."""
+    use_expln: bool = False
+    """With ``use_sde``: let the standard deviation grow linearly and not exponentially where its parameter is positive
+    (arXiv 2005.05719), so that it stays bounded."""
     squash_output: bool = False
     """Squash Box actions into their bounds by tanh, where otherwise they are clipped."""
 
@@ -52,7 +55,14 @@ class ActorCriticConfig(PolicyConfig):
             assign(self, qf=self.vf)
         PolicyConfig.__post_init__(self)
         assign(self, vf=self.qf)
-        flags = ("share_features_extractor", "share_layers", "ortho_init", "learn_std", "state_dependent_std")
+        flags = (
+            "share_features_extractor",
+            "share_layers",
+            "ortho_init",
+            "learn_std",
+            "state_dependent_std",
+            "use_expln",
+        )
         coerce(self, (*flags, "squash_output"), flag)
         coerce(self, "log_std_init", number)
         if self.state_dependent_std and not self.learn_std:
@@ -128,7 +138,7 @@ class OnPolicyConfig(RolloutConfig):
 def check_value_rate(config: OnPolicyConfig, obs_leaves: tuple[Leaf, ...]) -> None:
     """Raises ``ValueError`` if the value has an optimizer of its own and its convolutions are the policy's too."""
     shape = config.policy_kwargs
-    learns = shape.encoder is not None or any(convolutions(leaf) for leaf in obs_leaves)
+    learns = shape.encoder is not None or any(convolutions(leaf, shape) for leaf in obs_leaves)
     shared = shape.share_features_extractor and learns
     if config.critic_learning_rate is not None and shared:
         raise ValueError(

@@ -127,6 +127,11 @@ class ActorCritic(eqx.Module):
         self.log_std = jnp.full(std_shape, shape.log_std_init, jnp.float32) if has_log_std else None
         self.action, self.shape = action, shape
 
+    @property
+    def use_expln(self) -> bool:
+        """Whether state-dependent noise grows linearly; see :func:`sde_std`."""
+        return self.shape.use_expln
+
     def policy(self, obs: PyTree) -> Distribution:
         """Returns the distribution of actions at observations ``(batch, ...)``, which may be :class:`Masked`."""
         obs, mask = unmasked(obs)
@@ -160,7 +165,9 @@ class ActorCritic(eqx.Module):
                 outputs, log_std = jnp.split(outputs, 2, axis=-1)
                 log_std = jnp.clip(log_std, *LOG_STD_RANGE)
             else:
-                log_std = self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden)
+                log_std = (
+                    self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden, self.use_expln)
+                )
                 if not self.shape.learn_std:
                     log_std = jax.lax.stop_gradient(log_std)
             return (TanhNormal if self.shape.squash_output else Normal)(outputs, log_std)
@@ -179,14 +186,26 @@ def unmasked(obs: PyTree) -> tuple[PyTree, Array | None]:
     return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)
 
 
-def sde_log_std(log_std: Array, hidden: Array) -> Array:
+def sde_std(log_std: Array, use_expln: bool = False) -> Array:
+    """Returns the standard deviations of the matrix of state-dependent noise.
+
+    They are ``exp(log_std)``; with ``use_expln`` ``log(1 + log_std) + 1`` where ``log_std`` is positive, which continues
+    the exponential smoothly.
+    """
+    if not use_expln:
+        return jnp.exp(log_std)
+    positive = jnp.maximum(log_std, 0.0)
+    return jnp.where(log_std > 0.0, jnp.log1p(positive) + 1.0, jnp.exp(jnp.minimum(log_std, 0.0)))
+
+
+def sde_log_std(log_std: Array, hidden: Array, use_expln: bool = False) -> Array:
     """Returns the log standard deviation of state-dependent noise at hidden layers ``(batch, width)``.
 
-    The noise is ``hidden @ E`` with a matrix ``E`` of independent normals of standard deviations ``exp(log_std)`` (Raffin et
+    The noise is ``hidden @ E`` with a matrix ``E`` of independent normals of standard deviations :func:`sde_std` (Raffin et
     al. 2020, "Smooth Exploration for Robotic Reinforcement Learning", arXiv 2005.05719, equation 8). No gradient reaches
     the hidden layer this way.
     """
-    variance = jnp.square(jax.lax.stop_gradient(hidden)) @ jnp.exp(2.0 * log_std)
+    variance = jnp.square(jax.lax.stop_gradient(hidden)) @ jnp.square(sde_std(log_std, use_expln))
     return 0.5 * jnp.log(variance + SDE_EPSILON)
 
 
@@ -196,26 +215,27 @@ def sde_explorer(n_steps: int) -> Explorer:
     An episode that continues after an update keeps its matrix with -1, which was drawn with the standard deviation from
     before the update, while the update's log-probabilities use the new one.
 
+    The actor is an :class:`ActorCritic` or another module with ``log_std (width, action_dim)``, ``hidden``,
+    ``distribution`` and ``use_expln``.
+
     The carry is each environment's matrix ``(n_envs, width, action_dim)`` and its age in steps ``int32 (n_envs,)``.
     """
 
-    def init(actor: ActorCritic, n_envs: int) -> tuple[Array, Array]:
-        assert actor.log_std is not None
+    def init(actor: Any, n_envs: int) -> tuple[Array, Array]:
         return jnp.zeros((n_envs, *actor.log_std.shape), jnp.float32), jnp.zeros((n_envs,), jnp.int32)
 
     def act(
-        carry: tuple[Array, Array], actor: ActorCritic, obs: PyTree, ended: Array, key: Array, clock: Clock
+        carry: tuple[Array, Array], actor: Any, obs: PyTree, ended: Array, key: Array, clock: Clock
     ) -> tuple[Array, tuple[Array, Array]]:
         matrix, age = carry
-        assert actor.log_std is not None
         due = ended if n_steps == -1 else ended | (age % n_steps == 0)
-        fresh = jnp.exp(actor.log_std)[None] * jax.random.normal(key, matrix.shape, matrix.dtype)
+        fresh = sde_std(actor.log_std, actor.use_expln)[None] * jax.random.normal(key, matrix.shape, matrix.dtype)
         matrix = jnp.where(due[:, None, None], fresh, matrix)
         hidden = actor.hidden(obs)
-        mean = actor.distribution(hidden, None).mean  # type: ignore[union-attr]
-        action = mean + jnp.einsum("nh,nhd->nd", hidden, matrix)
+        distribution = actor.distribution(hidden, None)
+        action = distribution.mean + jnp.einsum("nh,nhd->nd", hidden, matrix)
         age = jnp.where(ended, 0, age) + 1
-        return jnp.tanh(action) if actor.shape.squash_output else action, (matrix, age)
+        return jnp.tanh(action) if isinstance(distribution, TanhNormal) else action, (matrix, age)
 
     return Explorer(init, act)
 

@@ -31,12 +31,14 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
+from rejeu.algorithms.actor_critic.network import sde_explorer, sde_log_std
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import (
     AVERAGED,
     TD_ERROR,
     Algorithm,
     Clock,
+    Explorer,
     Metrics,
     Optimizer,
     PyTree,
@@ -51,16 +53,18 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import TanhNormal
-from rejeu.networks import Network, QNetwork, action_values, values_by_critics
+from rejeu.networks import Network, QNetwork, action_values, make_encoder, make_head, make_torso, values_by_critics
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import coerce, number, whole
+from rejeu.validation import coerce, flag, number, whole
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
 
 
+SDE_MEAN = 2.0
+"""Largest mean of a policy with gSDE before squashing."""
 HIDDEN_LAYERS = (256, 256)
 """Default widths of actor and critics."""
 ALPHA_OPTIMIZER = optimizers.make("adam")
@@ -102,18 +106,64 @@ class Config(EntropyConfig):
 
     target_update_interval: int = 1
     """Gradient steps between two updates of the target critics."""
+    use_sde: bool = False
+    """Explore by state-dependent noise (gSDE, arXiv 2005.05719), which is kept for many steps and gives smooth motion. Box
+    actions only, without ``action_noise``."""
+    sde_sample_freq: int = -1
+    """Steps after which that noise is resampled; -1: in every episode."""
+    sde_log_std_init: float = -3.0
+    """Logarithm of the standard deviations of that noise at the start."""
 
     name: ClassVar[str] = "SAC"
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
         coerce(self, "target_update_interval", whole, least=1)
+        coerce(self, "use_sde", flag)
+        coerce(self, "sde_sample_freq", whole, least=-1)
+        coerce(self, "sde_log_std_init", number)
+        if self.sde_sample_freq == 0:
+            raise ValueError("sde_sample_freq=0 would sample no noise; use 1 or more, or -1 for once per episode")
+        if self.use_sde and self.action_noise is not None:
+            raise ValueError("use_sde=True explores by itself; leave action_noise out")
+
+
+class SdeActor(eqx.Module):
+    """Maps an observation to a mean action, and to noise that its last hidden layer scales (gSDE)."""
+
+    encoder: Any
+    torso: Any
+    head: Any
+    log_std: Array
+    """``(width, action_dim)``."""
+    use_expln: bool = eqx.field(static=True, default=False)
+
+    def __init__(self, key: Array, obs_leaves: tuple[Leaf, ...], action_dim: int, config: Config) -> None:
+        shape = config.policy_kwargs
+        encoder_key, torso_key, head_key = jax.random.split(key, 3)
+        self.encoder = make_encoder(encoder_key, obs_leaves, shape)
+        widths = shape.actor_widths(HIDDEN_LAYERS)
+        self.torso, width = make_torso(torso_key, self.encoder.n_features, None, widths, shape)
+        self.head = make_head(head_key, width, action_dim, shape)
+        self.log_std = jnp.full((width, action_dim), config.sde_log_std_init, jnp.float32)
+
+    def hidden(self, obs: PyTree) -> Array:
+        """Returns the last hidden layer at observations ``(batch, ...)``."""
+        return self.torso(self.encoder(obs))
+
+    def distribution(self, hidden: Array, mask: Array | None = None) -> TanhNormal:
+        """Returns the distribution of actions that the last hidden layer ``(batch, width)`` asks for.
+
+        As in Stable-Baselines3, the mean before squashing stays within :data:`SDE_MEAN`.
+        """
+        mean = jnp.clip(self.head(hidden), -SDE_MEAN, SDE_MEAN)
+        return TanhNormal(mean, sde_log_std(self.log_std, hidden, self.use_expln))
 
 
 class State(eqx.Module):
     """Everything that SAC learns; every leaf is an array."""
 
-    actor: Network
+    actor: Network | SdeActor
     critics: Any
     """All critics, stacked along a leading axis."""
     target_critics: Any = eqx.field(metadata=AVERAGED)
@@ -157,7 +207,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target, target_entropy, config
         )
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values_by_critics)
+    actor = lambda state: state.actor  # noqa: E731
+    return Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values_by_critics)
+
+
+def explorer_of(config: Config) -> Explorer | None:
+    """Returns exploration by state-dependent noise if the configuration uses it, else None."""
+    return sde_explorer(config.sde_sample_freq) if config.use_sde else None
 
 
 def initial_state(
@@ -165,13 +221,20 @@ def initial_state(
     obs_leaves: tuple[Leaf, ...],
     n_outputs: int,
     make_critic: Callable[[Array], Any],
-    config: EntropyConfig,
+    config: Config,
     optimizer: Optimizer,
 ) -> State:
-    """Returns the state before the first update: an actor of ``n_outputs``, and ``config.n_critics`` critics."""
+    """Returns the state before the first update: an actor of ``n_outputs``, and ``config.n_critics`` critics.
+
+    With gSDE the actor has half as many outputs, the means.
+    """
     actor_key, critics_key, update_key = jax.random.split(key, 3)
     shape = config.policy_kwargs
-    actor = Network(actor_key, obs_leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape)
+    actor: Network | SdeActor
+    if config.use_sde:
+        actor = SdeActor(actor_key, obs_leaves, n_outputs // 2, config)
+    else:
+        actor = Network(actor_key, obs_leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape)
     critics = ensemble(make_critic, critics_key, config.n_critics)
     log_alpha, alpha_optimizer = initial_alpha(config)
     return State(
@@ -189,7 +252,7 @@ def initial_state(
 
 def temperature_and_targets(
     state: State,
-    actor: tuple[Network, PyTree],
+    actor: tuple[Network | SdeActor, PyTree],
     critics: tuple[Any, PyTree],
     log_prob: Array,
     target_entropy: float,
@@ -225,23 +288,27 @@ def temperature_and_targets(
     )
 
 
-def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
+def explore(actor: Network | SdeActor, obs: PyTree, key: Array, clock: Clock) -> Array:
     """Returns actions sampled from the policy, ``(batch, action_dim)``."""
     return policy(actor, obs).sample(key)
 
 
-def exploit(actor: Network, obs: PyTree) -> Array:
+def exploit(actor: Network | SdeActor, obs: PyTree) -> Array:
     """Returns the squashed means of the policy, ``(batch, action_dim)``."""
     return policy(actor, obs).mode()
 
 
-def policy(actor: Network, obs: PyTree) -> TanhNormal:
+def policy(actor: Network | SdeActor, obs: PyTree) -> TanhNormal:
     """Returns the distribution of actions in [-1, 1] at ``obs``."""
+    if isinstance(actor, SdeActor):
+        return actor.distribution(actor.hidden(obs))
     mean, log_std = jnp.split(actor(obs), 2, axis=-1)
     return TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
 
 
-def td_target(actor: Network, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array) -> Array:
+def td_target(
+    actor: Network | SdeActor, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array
+) -> Array:
     """Returns the TD targets, ``(batch,)`` (arXiv 1812.05905, equations 2 and 5)."""
     next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
     next_value = jnp.min(action_values(target_critics, batch.next_obs, next_action), axis=0)
@@ -254,7 +321,9 @@ def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[A
     return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
 
 
-def actor_loss(actor: Network, critics: QNetwork, alpha: Array, obs: PyTree, key: Array) -> tuple[Array, Array]:
+def actor_loss(
+    actor: Network | SdeActor, critics: QNetwork, alpha: Array, obs: PyTree, key: Array
+) -> tuple[Array, Array]:
     """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)`` (equation 7)."""
     action, log_prob = policy(actor, obs).sample_and_log_prob(key)
     value = jnp.min(action_values(critics, obs, action), axis=0)

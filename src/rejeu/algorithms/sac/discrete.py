@@ -40,7 +40,13 @@ TARGET_ENTROPY_SHARE = 0.3
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
-    """Returns SAC for Discrete actions."""
+    """Returns SAC for Discrete actions.
+
+    Raises:
+        ValueError: with gSDE.
+    """
+    if config.use_sde:
+        raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
     obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
     target_entropy = config.entropy_target(TARGET_ENTROPY_SHARE * math.log(n_actions))
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)

@@ -20,7 +20,6 @@ from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.envs.masks import make_masked
 from rejeu.io import atomic
-from rejeu.io.checkpoint import SUFFIX
 from rejeu.sb3.common.base_callback import (
     BaseCallback,
     CallbackList,
@@ -42,6 +41,7 @@ __all__ = [
     "EvalCallback",
     "EventCallback",
     "EveryNTimesteps",
+    "LogEveryNTimesteps",
     "ProgressBarCallback",
     "StopTrainingOnMaxEpisodes",
     "StopTrainingOnNoModelImprovement",
@@ -50,13 +50,13 @@ __all__ = [
 
 
 class CheckpointCallback(BaseCallback):
-    """Saves the agent every ``save_freq`` calls to ``save_path/{name_prefix}_{steps}_steps.safetensors``.
+    """Saves the agent every ``save_freq`` calls to ``save_path/{name_prefix}_{steps}_steps.zip``.
 
     Args:
         save_freq: calls between two checkpoints: ``n_envs`` times as many environment steps.
         save_path: folder; created if missing.
         name_prefix: prefix of the file names.
-        save_replay_buffer: also save the replay buffer, as ``{name_prefix}_replay_buffer_{steps}_steps.safetensors``.
+        save_replay_buffer: also save the replay buffer, as ``{name_prefix}_replay_buffer_{steps}_steps.pkl``.
         save_vecnormalize: also save the statistics of ``VecNormalize``, as ``{name_prefix}_vecnormalize_...``.
         verbose: 2 prints each path.
     """
@@ -88,7 +88,8 @@ class CheckpointCallback(BaseCallback):
 
     def _write(self, save: Callable[[Path], Any], kind: str) -> None:
         """Saves one file, or warns. It is not written later: the next one has another name."""
-        path = self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{SUFFIX}"
+        suffix = ".pkl" if kind else ".zip"
+        path = self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{suffix}"
         is_saved = self.model.failed_writes.attempt(str(path), lambda: save(path), retry=False)
         if is_saved and self.verbose >= 2:
             print(f"Saved {path}")
@@ -111,7 +112,7 @@ class EvalCallback(EventCallback):
         eval_freq: calls between two evaluations: ``n_envs`` times as many environment steps.
         log_path: folder for ``evaluations.npz`` with ``timesteps (n,)``, ``results (n, episodes)``, ``ep_lengths`` and,
             if the environment reports it, ``successes``. None writes no file.
-        best_model_save_path: folder for ``best_model.safetensors``. None saves none.
+        best_model_save_path: folder for ``best_model.zip``. None saves none.
         deterministic: use the mode of the policy; False samples actions.
         render: render the environment.
         verbose: 1 prints each result.
@@ -207,7 +208,7 @@ class EvalCallback(EventCallback):
             if self.verbose >= 1:
                 print("New best mean reward!")
             if self.best_model_save_path is not None:
-                path = Path(self.best_model_save_path) / f"best_model{SUFFIX}"
+                path = Path(self.best_model_save_path) / "best_model.zip"
                 self.model.failed_writes.attempt(f"best model {path}", self.model.snapshot(path))
             if self.callback_on_new_best is not None:
                 continues = self.callback_on_new_best.on_step()
@@ -293,6 +294,22 @@ class EveryNTimesteps(EventCallback):
             return True
         self.last_time_trigger = self.num_timesteps
         return self._on_event()
+
+
+class LogEveryNTimesteps(EveryNTimesteps):
+    """Writes a row of statistics every ``n_steps`` environment steps; give ``learn`` ``log_interval=None`` for no others.
+
+    Args:
+        n_steps: number of steps, over all environments.
+    """
+
+    def __init__(self, n_steps: int) -> None:
+        super().__init__(n_steps, ConvertCallback(self._log))
+
+    def _log(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        for name, value in self.model.statistics().items():
+            self.logger.record(name, value)
+        self.logger.dump(self.num_timesteps)
 
 
 class ProgressBarCallback(BaseCallback):

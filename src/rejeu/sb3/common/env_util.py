@@ -10,12 +10,13 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.envs.registry import make_env
+from rejeu.sb3.common.atari_wrappers import AtariWrapper
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, is_wrapped, unwrap_wrapper
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
 from rejeu.validation import whole
 
-__all__ = ["is_wrapped", "make_vec_env", "unwrap_wrapper"]
+__all__ = ["is_wrapped", "make_atari_env", "make_vec_env", "unwrap_wrapper"]
 
 
 def make_vec_env(
@@ -74,6 +75,23 @@ def make_vec_env(
     venv = (DummyVecEnv if vec_env_cls is None else vec_env_cls)(makers, **(vec_env_kwargs or {}))
     venv.seed(seed)
     return venv
+
+
+def make_atari_env(
+    env_id: str | Callable[..., gym.Env],
+    n_envs: int = 1,
+    seed: int | None = None,
+    start_index: int = 0,
+    monitor_dir: str | Path | None = None,
+    wrapper_kwargs: Mapping[str, Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    vec_env_cls: Callable[..., VecEnv] | None = None,
+    vec_env_kwargs: Mapping[str, Any] | None = None,
+    monitor_kwargs: Mapping[str, Any] | None = None,
+) -> VecEnv:
+    """Returns a vector environment of Atari games in ``AtariWrapper``s; see :func:`make_vec_env`."""
+    kinds = (vec_env_cls, vec_env_kwargs, monitor_kwargs, wrapper_kwargs)
+    return make_vec_env(env_id, n_envs, seed, start_index, monitor_dir, AtariWrapper, env_kwargs, *kinds)
 
 
 @dataclass(frozen=True)

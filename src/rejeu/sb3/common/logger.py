@@ -1,5 +1,444 @@
-"""Logging of training statistics."""
+"""Logging of training statistics with Stable-Baselines3's classes.
 
-from rejeu.reporting.logging import Logger, configure
+A logger collects values until ``dump`` writes them to its output formats. Training calls ``dump`` with every row of
+statistics.
+"""
 
-__all__ = ["Logger", "configure"]
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import sys
+import tempfile
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from rejeu.reporting import logging
+from rejeu.reporting.logging import TensorBoard, add_text, open_log
+from rejeu.runs.config import LOGS
+
+__all__ = [
+    "DEBUG",
+    "DISABLED",
+    "ERROR",
+    "INFO",
+    "WARN",
+    "CSVOutputFormat",
+    "Figure",
+    "FormatUnsupportedError",
+    "HParam",
+    "HumanOutputFormat",
+    "Image",
+    "JSONOutputFormat",
+    "KVWriter",
+    "Logger",
+    "TensorBoardOutputFormat",
+    "Video",
+    "configure",
+    "make_output_format",
+    "read_csv",
+    "read_json",
+]
+
+DEBUG, INFO, WARN, ERROR, DISABLED = 10, 20, 30, 40, 50
+
+
+class Video:
+    """Frames ``(batch, time, channels, height, width)`` for TensorBoard, at ``fps`` a second."""
+
+    def __init__(self, frames: Any, fps: float) -> None:
+        self.frames, self.fps = frames, fps
+
+
+class Figure:
+    """A figure of Matplotlib for TensorBoard; ``close`` closes it afterwards."""
+
+    def __init__(self, figure: Any, close: bool) -> None:
+        self.figure, self.close = figure, close
+
+
+class Image:
+    """An image for TensorBoard, with axes in the order of ``dataformats``, such as ``"CHW"``."""
+
+    def __init__(self, image: Any, dataformats: str) -> None:
+        self.image, self.dataformats = image, dataformats
+
+
+class HParam:
+    """Hyperparameters, and the names of metrics, for TensorBoard's page of hyperparameters."""
+
+    def __init__(self, hparam_dict: Mapping[str, Any], metric_dict: Mapping[str, float | None]) -> None:
+        if not metric_dict:
+            raise Exception(
+                "`metric_dict` must not be empty list to display hyperparameters to the HPARAMS tensorboard tab."
+            )
+        self.hparam_dict, self.metric_dict = hparam_dict, metric_dict
+
+
+class FormatUnsupportedError(NotImplementedError):
+    """A format cannot show a value."""
+
+    def __init__(self, unsupported_formats: Sequence[str], value_description: str) -> None:
+        formats = ", ".join(unsupported_formats)
+        super().__init__(
+            f"{formats} cannot show a {value_description}; exclude it: record(..., exclude={tuple(unsupported_formats)})"
+        )
+
+
+class KVWriter(ABC):
+    """Writes rows of values by name. Abstract."""
+
+    names: tuple[str, ...] = ()
+    """Names of the format in ``exclude``."""
+
+    @abstractmethod
+    def write_row(self, row: Mapping[str, Any], step: int) -> None:
+        """Writes a row, without what is excluded."""
+
+    def write(self, key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], step: int = 0) -> None:
+        """Writes a row.
+
+        Args:
+            key_values: the values.
+            key_excluded: names of the formats that leave a value out, by the name of the value.
+            step: environment step.
+
+        Raises:
+            FormatUnsupportedError: for a value that the format cannot show.
+        """
+        excluded = {key: key_excluded.get(key) or () for key in key_values}
+        row = {key: value for key, value in key_values.items() if not {*self.names} & {*np.atleast_1d(excluded[key])}}
+        for value in row.values():
+            if isinstance(value, Video | Figure | Image | HParam) and "tensorboard" not in self.names:
+                raise FormatUnsupportedError(self.names, type(value).__name__.lower())
+        self.write_row(row, step)
+
+    def close(self) -> None:  # noqa: B027 - not every output needs it
+        """Closes the output."""
+
+
+class HumanOutputFormat(KVWriter):
+    """Prints rows as tables.
+
+    Args:
+        filename_or_file: path, or what has ``write`` and ``flush``.
+        max_length: longest key or value, in characters.
+    """
+
+    names = ("stdout", "log")
+
+    def __init__(self, filename_or_file: Any, max_length: int = 36) -> None:
+        self.max_length = max_length
+        self._owns = isinstance(filename_or_file, str | Path)
+        self.file: TextIO = open(filename_or_file, "w", encoding="utf-8") if self._owns else filename_or_file  # noqa: SIM115
+        if not hasattr(self.file, "write"):
+            raise ValueError(f"Expected file or str, got {filename_or_file}")
+
+    def write_row(self, row: Mapping[str, Any], step: int) -> None:
+        shown: dict[tuple[str, str], str] = {}
+        group = ""
+        for key, value in sorted(row.items()):
+            if "/" in key:
+                group = key[: key.index("/") + 1]
+                shown[group, self._truncated(group)] = ""
+            name = f"{'':3}{key[len(group) :]}" if group and key.startswith(group) else key
+            text = f"{value:<8.3g}" if isinstance(value, float) else str(value)
+            if (group, self._truncated(name)) in shown:
+                raise ValueError(
+                    f"Key '{key}' truncated to '{self._truncated(name)}' that already exists; raise max_length"
+                )
+            shown[group, self._truncated(name)] = self._truncated(text)
+        if not shown:
+            warnings.warn("Tried to write empty key-value dict", stacklevel=2)
+            return
+        widths = max(len(name) for _, name in shown), max(map(len, shown.values()))
+        dashes = "-" * (sum(widths) + 7)
+        lines = [f"| {name:<{widths[0]}} | {value:<{widths[1]}} |" for (_, name), value in shown.items()]
+        self.file.write("\n".join([dashes, *lines, dashes]) + "\n")
+        self.file.flush()
+
+    def _truncated(self, text: str) -> str:
+        return text if len(text) <= self.max_length else f"{text[: self.max_length - 3]}..."
+
+    def write_sequence(self, sequence: Sequence[str]) -> None:
+        """Prints words in one line."""
+        self.file.write(" ".join(sequence) + "\n")
+        self.file.flush()
+
+    def close(self) -> None:
+        if self._owns:
+            self.file.close()
+
+
+class JSONOutputFormat(KVWriter):
+    """Appends rows to a file of JSON lines; arrays become lists."""
+
+    names = ("json",)
+
+    def __init__(self, filename: str | Path) -> None:
+        self.file = open(filename, "w", encoding="utf-8")  # noqa: SIM115
+
+    def write_row(self, row: Mapping[str, Any], step: int) -> None:
+        plain = {key: value if isinstance(value, str) else np.asarray(value).tolist() for key, value in row.items()}
+        if plain:
+            self.file.write(json.dumps(plain) + "\n")
+            self.file.flush()
+
+    def close(self) -> None:
+        self.file.close()
+
+
+class CSVOutputFormat(KVWriter):
+    """Appends rows to a CSV file, which gets a column for each new name."""
+
+    names = ("csv",)
+
+    def __init__(self, filename: str | Path) -> None:
+        self.file = open(filename, "w+", encoding="utf-8", newline="")  # noqa: SIM115
+        self.keys: list[str] = []
+
+    def write_row(self, row: Mapping[str, Any], step: int) -> None:
+        if new := sorted({*row} - {*self.keys}):
+            self.file.seek(0)
+            old = [*csv.reader(self.file)][1:]
+            self.keys += new
+            self.file.seek(0)
+            self.file.truncate()
+            csv.writer(self.file, lineterminator="\n").writerows([self.keys, *(one + [""] * len(new) for one in old)])
+        if row:
+            text = ["" if row.get(key) is None else row[key] for key in self.keys]
+            csv.writer(self.file, lineterminator="\n").writerow(text)
+            self.file.flush()
+
+    def close(self) -> None:
+        self.file.close()
+
+
+class TensorBoardOutputFormat(KVWriter):
+    """Writes rows for TensorBoard: numbers, texts, arrays as histograms, images, figures, videos and hyperparameters.
+
+    Raises:
+        MissingExtra: if TensorBoard is not installed.
+    """
+
+    names = ("tensorboard",)
+
+    def __init__(self, folder: str | Path) -> None:
+        self.writer = TensorBoard(folder)
+
+    def write_row(self, row: Mapping[str, Any], step: int) -> None:
+        with self.writer.event(step) as summary:
+            for key, value in row.items():
+                _add(summary, key, value)
+
+
+def _add(summary: Any, key: str, value: Any) -> None:
+    """Adds a value to a summary of TensorBoard's."""
+    if isinstance(value, HParam):
+        from tensorboard.plugins.hparams import api_pb2, summary as hparams
+
+        metrics = [api_pb2.MetricInfo(name=api_pb2.MetricName(tag=name)) for name in value.metric_dict]
+        settings = {
+            name: one if isinstance(one, bool | int | float | str) else str(one)
+            for name, one in value.hparam_dict.items()
+        }
+        summary.MergeFrom(hparams.experiment_pb(hparam_infos=[], metric_infos=metrics))
+        summary.MergeFrom(hparams.session_start_pb(hparams=settings))
+    elif isinstance(value, Figure):
+        image = io.BytesIO()
+        value.figure.savefig(image, format="png")
+        summary.value.add(tag=key).image.encoded_image_string = image.getvalue()
+        if value.close:
+            from matplotlib import pyplot
+
+            pyplot.close(value.figure)
+    elif isinstance(value, Image):
+        axes = [value.dataformats.index(axis) for axis in "HWC" if axis in value.dataformats]
+        _add_image(summary, key, [np.asarray(value.image).transpose(axes)])
+    elif isinstance(value, Video):
+        _add_image(summary, key, [*np.asarray(value.frames)[0].transpose(0, 2, 3, 1)], value.fps)
+    elif isinstance(value, str):
+        add_text(summary, key, value)
+    elif np.ndim(value) or (hasattr(value, "dtype") and not isinstance(value, np.generic)):
+        if not isinstance(value, list | tuple):
+            _add_histogram(summary, key, np.asarray(value, np.float64).ravel())
+    else:
+        summary.value.add(tag=key, simple_value=float(value))
+
+
+def _add_image(summary: Any, key: str, frames: Sequence[np.ndarray], fps: float = 1.0) -> None:
+    """Adds an image, or several as an animation, each ``(height, width, channels)``: bytes, or numbers in [0, 1]."""
+    from PIL import Image as Pillow
+
+    pixels = [frame if frame.dtype == np.uint8 else (frame * 255).clip(0, 255).astype(np.uint8) for frame in frames]
+    first, *others = [Pillow.fromarray(one[..., 0] if one.ndim == 3 and one.shape[-1] == 1 else one) for one in pixels]
+    image = io.BytesIO()
+    if others:
+        first.save(image, "gif", save_all=True, append_images=others, duration=1000 / fps, loop=0)
+    else:
+        first.save(image, "png")
+    summary.value.add(tag=key).image.encoded_image_string = image.getvalue()
+
+
+def _add_histogram(summary: Any, key: str, values: np.ndarray) -> None:
+    counts, edges = np.histogram(values, bins=30)
+    histogram = summary.value.add(tag=key).histo
+    histogram.min, histogram.max, histogram.num = values.min(), values.max(), values.size
+    histogram.sum, histogram.sum_squares = values.sum(), np.square(values).sum()
+    histogram.bucket_limit.extend(edges[1:].tolist())
+    histogram.bucket.extend(counts.tolist())
+
+
+class _Rows:
+    """The sink of an agent's rows that is a logger: it records them and calls ``dump``."""
+
+    def __init__(self, logger: Logger) -> None:
+        self.logger = logger
+
+    def __str__(self) -> str:
+        return "the logger"
+
+    def write(self, step: int, metrics: Mapping[str, Any]) -> None:
+        for key, value in metrics.items():
+            self.logger.record(key, value, self.logger.exclusions.pop(key, None))
+        self.logger.dump(step)
+
+    def close(self) -> None:
+        """Does nothing: the user closes the logger."""
+
+
+class Logger(logging.Logger):
+    """Collects values until they are written.
+
+    Args:
+        folder: folder of its files.
+        output_formats: what it writes to.
+    """
+
+    def __init__(self, folder: str | Path | None, output_formats: Sequence[KVWriter]) -> None:
+        super().__init__(folder, [_Rows(self)])
+        self.output_formats = [*output_formats]
+        self.level = INFO
+        self.name_to_excluded: dict[str, Any] = {}
+        self.exclusions: dict[str, Any] = {}
+        """What :meth:`take` took from ``name_to_excluded``."""
+
+    def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+        """Records a value for the next row, and replaces an earlier one.
+
+        Args:
+            key: name, ``group/name``.
+            value: a number, text, array, :class:`Figure`, :class:`Image`, :class:`Video` or :class:`HParam`.
+            exclude: formats that leave it out.
+        """
+        self.name_to_value[key], self.name_to_excluded[key] = value, exclude
+
+    def record_mean(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+        """Records the mean of the values since the last row; None is ignored."""
+        super().record_mean(key, value, exclude)
+        self.name_to_excluded[key] = exclude
+
+    def take(self) -> dict[str, Any]:
+        """Returns and clears the recorded values."""
+        self.exclusions, self.name_to_excluded = self.name_to_excluded, {}
+        return super().take()
+
+    def dump(self, step: int = 0) -> None:
+        """Writes the recorded values as a row, and clears them."""
+        row = self.take()
+        if self.level < DISABLED:
+            for output in self.output_formats:
+                output.write(row, self.exclusions, step)
+
+    def log(self, *args: Any, level: int = INFO) -> None:
+        """Prints words to the formats that are tables."""
+        for output in self.output_formats if self.level <= level else ():
+            if isinstance(output, HumanOutputFormat):
+                output.write_sequence([str(word) for word in args])
+
+    def debug(self, *args: Any) -> None:
+        """Prints at the level DEBUG."""
+        self.log(*args, level=DEBUG)
+
+    def info(self, *args: Any) -> None:
+        """Prints at the level INFO."""
+        self.log(*args, level=INFO)
+
+    def warn(self, *args: Any) -> None:
+        """Prints at the level WARN."""
+        self.log(*args, level=WARN)
+
+    def error(self, *args: Any) -> None:
+        """Prints at the level ERROR."""
+        self.log(*args, level=ERROR)
+
+    def set_level(self, level: int) -> None:
+        """Sets the lowest level that is printed."""
+        self.level = level
+
+    def close(self) -> None:
+        """Closes the outputs."""
+        for output in self.output_formats:
+            output.close()
+
+
+def make_output_format(_format: str, log_dir: str | Path, log_suffix: str = "") -> KVWriter:
+    """Returns a format by its name: ``"stdout"``, ``"log"``, ``"json"``, ``"csv"`` or ``"tensorboard"``.
+
+    Raises:
+        ValueError: for another name.
+    """
+    folder = Path(log_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    if _format == "stdout":
+        return HumanOutputFormat(sys.stdout)
+    if _format == "log":
+        return HumanOutputFormat(folder / f"log{log_suffix}.txt")
+    if _format == "json":
+        return JSONOutputFormat(folder / f"progress{log_suffix}.json")
+    if _format == "csv":
+        return CSVOutputFormat(folder / f"progress{log_suffix}.csv")
+    if _format == "tensorboard":
+        return TensorBoardOutputFormat(folder)
+    raise ValueError(f"Unknown format specified: {_format}")
+
+
+def configure(folder: str | Path | None = None, format_strings: Sequence[str] | None = None) -> Logger:
+    """Returns a logger for ``model.set_logger``.
+
+    Args:
+        folder: of its files; None: ``$SB3_LOGDIR``, or a new folder of temporary files.
+        format_strings: any of ``"stdout"``, ``"log"``, ``"json"``, ``"csv"``, ``"tensorboard"``, and of the trackers
+            ``"wandb"``, ``"mlflow"`` and ``"trackio"``; None: ``$SB3_LOG_FORMAT``, or the first three and ``"csv"``.
+
+    Raises:
+        ValueError: for another format.
+    """
+    name = time.strftime("SB3-%Y-%m-%d-%H-%M-%S")
+    folder = folder or os.getenv("SB3_LOGDIR") or str(Path(tempfile.gettempdir()) / name)
+    kinds = format_strings or os.getenv("SB3_LOG_FORMAT", "stdout,log,csv").split(",")
+    trackers = [kind for kind in kinds if kind in LOGS and kind not in ("csv", "json", "tensorboard")]
+    formats = [make_output_format(kind, folder) for kind in kinds if kind and kind not in trackers]
+    logger = Logger(str(folder), formats)
+    logger.outputs += [open_log(kind, Path(folder)) for kind in trackers]
+    return logger
+
+
+def read_json(filename: str | Path) -> list[dict[str, Any]]:
+    """Returns the rows of a file of JSON lines."""
+    return [json.loads(line) for line in Path(filename).read_text(encoding="utf-8").splitlines()]
+
+
+def read_csv(filename: str | Path) -> list[dict[str, str]]:
+    """Returns the rows of a CSV file, as text."""
+    with Path(filename).open(encoding="utf-8", newline="") as file:
+        return [*csv.DictReader(file)]

@@ -1,7 +1,4 @@
-"""Names of the policies. The observation space determines the network."""
+"""Policies; see :mod:`rejeu.sb3.policy`."""
 
-MlpPolicy = "MlpPolicy"
-CnnPolicy = "CnnPolicy"
-MultiInputPolicy = "MultiInputPolicy"
-
-__all__ = ["CnnPolicy", "MlpPolicy", "MultiInputPolicy"]
+from rejeu.sb3.policy import *  # noqa: F403
+from rejeu.sb3.policy import __all__ as __all__

@@ -1,13 +1,52 @@
-"""Random seeds and schedules."""
+"""Seeds, schedules, devices, and checks of observations and spaces."""
 
+from __future__ import annotations
+
+import glob
+import os
+import platform
 import random
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import jax
 import numpy as np
+from gymnasium import spaces
 
 from rejeu import schedules
-from rejeu.schedules import Exponential, Linear
+from rejeu.schedules import Exponential, Linear, Table
+
+__all__ = [
+    "ConstantSchedule",
+    "Device",
+    "FloatSchedule",
+    "LinearSchedule",
+    "Tensor",
+    "check_for_correct_spaces",
+    "check_shape_equal",
+    "constant_fn",
+    "explained_variance",
+    "get_device",
+    "get_latest_run_id",
+    "get_linear_fn",
+    "get_schedule_fn",
+    "get_system_info",
+    "is_vectorized_observation",
+    "obs_as_tensor",
+    "polyak_update",
+    "safe_mean",
+    "set_random_seed",
+    "should_collect_more_steps",
+    "zip_strict",
+]
+
+TABLE_INTERVALS = 1_000
+"""Intervals of the table by which a file contains a function given as a schedule."""
 
 
 def set_random_seed(seed: int, using_cuda: bool = False) -> None:
@@ -17,6 +56,37 @@ def set_random_seed(seed: int, using_cuda: bool = False) -> None:
     """
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - the global generator is what is meant
+
+
+@dataclass(frozen=True)
+class ConstantSchedule:
+    """The same value throughout the run."""
+
+    val: float
+
+    def __call__(self, _: float) -> float:
+        return self.val
+
+
+class FloatSchedule:
+    """A number, or a function of the remaining progress, as a function of the remaining progress that returns a float.
+
+    >>> FloatSchedule(0.2)(0.5), FloatSchedule(lambda remaining: 3 * remaining)(0.5)
+    (0.2, 1.5)
+    """
+
+    def __init__(self, value_schedule: Any) -> None:
+        if isinstance(value_schedule, FloatSchedule):
+            value_schedule = value_schedule.value_schedule
+        self.value_schedule: Any = (
+            value_schedule if callable(value_schedule) else ConstantSchedule(float(value_schedule))
+        )
+
+    def __call__(self, progress_remaining: float) -> float:
+        return float(self.value_schedule(progress_remaining))
+
+    def __repr__(self) -> str:
+        return f"FloatSchedule({self.value_schedule})"
 
 
 @dataclass(frozen=True)
@@ -38,7 +108,7 @@ class LinearSchedule:
         return self.to_linear()(1.0 - progress_remaining)
 
     def to_linear(self) -> Linear:
-        """Returns the same line as a function of the progress, which a model file contains."""
+        """Returns the same line as a function of the progress."""
         return Linear(self.start, self.end, self.end_fraction)
 
 
@@ -47,23 +117,177 @@ def get_linear_fn(start: float, end: float, end_fraction: float) -> LinearSchedu
     return LinearSchedule(start, end, end_fraction)
 
 
-def get_schedule_fn(value_schedule: Any) -> Any:
-    """Returns a number or a schedule in the form that agents accept."""
-    return value_schedule if callable(value_schedule) else schedules.parse("value_schedule", value_schedule)
+def constant_fn(val: float) -> ConstantSchedule:
+    """Returns a schedule that is constant."""
+    return ConstantSchedule(val)
+
+
+def get_schedule_fn(value_schedule: Any) -> FloatSchedule:
+    """Returns a number or a function of the remaining progress as a function of the remaining progress."""
+    return FloatSchedule(value_schedule)
 
 
 def of_progress(value: Any) -> Any:
-    """Returns a schedule of the remaining progress as one of the progress; anything else unchanged."""
+    """Returns a schedule of the remaining progress as one of the progress, as data; anything else unchanged.
+
+    A function becomes a table of its values at every thousandth of the run, which a model file contains.
+    """
+    if isinstance(value, FloatSchedule):
+        value = value.value_schedule
+    if isinstance(value, ConstantSchedule):
+        return float(value.val)
     if isinstance(value, LinearSchedule):
         return value.to_linear()
-    if isinstance(value, Linear | Exponential) or not callable(value):
+    if isinstance(value, Linear | Exponential | Table) or not callable(value):
         return value
-
-    def schedule(progress: Any) -> Any:
-        return value(1.0 - progress)
-
-    schedule.__name__ = getattr(value, "__name__", type(value).__name__)  # by which a model file mentions it
-    return schedule
+    values = [float(value(1.0 - i / TABLE_INTERVALS)) for i in range(TABLE_INTERVALS + 1)]
+    return values[0] if len(set(values)) == 1 else Table(tuple(values))
 
 
-__all__ = ["LinearSchedule", "get_linear_fn", "get_schedule_fn", "set_random_seed"]
+def of_remaining(value: Any) -> Any:
+    """Returns a number or schedule of the progress as a function of the remaining progress: the inverse of the above."""
+    if isinstance(value, Linear):
+        return LinearSchedule(value.start, value.end, value.fraction)
+    return (lambda remaining: schedules.at(value, 1.0 - remaining)) if callable(value) else ConstantSchedule(value)
+
+
+class Device(str):
+    """The name of a device, with the attribute ``type`` that scripts read."""
+
+    @property
+    def type(self) -> str:
+        """``"cpu"`` or ``"cuda"``; of ``"auto"`` JAX's default."""
+        name = jax.default_backend() if self == "auto" else str(self)
+        return "cuda" if name in ("gpu", "cuda") else "cpu"
+
+
+def get_device(device: Any = "auto") -> Device:
+    """Returns the device of a name; ``"auto"`` and ``"cuda"`` are the CPU where JAX has no GPU."""
+    return Device("cuda" if jax.default_backend() == "gpu" and Device(device).type == "cuda" else "cpu")
+
+
+class Tensor(np.ndarray):
+    """A NumPy array with the methods of PyTorch's tensors that scripts end their expressions with."""
+
+    @classmethod
+    def of(cls, array: Any) -> Tensor:
+        """Returns an array, or a JAX array, as one of this class."""
+        return np.asarray(array).view(cls)
+
+    @property
+    def device(self) -> Device:  # type: ignore[override]
+        """The CPU."""
+        return Device("cpu")
+
+    def numpy(self) -> np.ndarray:
+        """Returns a plain array."""
+        return self.view(np.ndarray)
+
+    def detach(self) -> Tensor:
+        """Returns itself."""
+        return self
+
+    def cpu(self) -> Tensor:
+        """Returns itself."""
+        return self
+
+    def to(self, *args: Any, **kwargs: Any) -> Tensor:
+        """Returns itself."""
+        return self
+
+
+def explained_variance(y_pred: np.ndarray, y_true: np.ndarray) -> float:
+    """Returns ``1 - Var(y_true - y_pred) / Var(y_true)``, NaN if ``y_true`` is constant."""
+    variance = float(np.var(y_true))
+    return float("nan") if variance == 0 else float(1.0 - np.var(y_true - y_pred) / variance)
+
+
+def get_latest_run_id(log_path: str | Path = "", log_name: str = "") -> int:
+    """Returns the highest k of the folders ``{log_name}_{k}`` in ``log_path``, 0 if there is none."""
+    name = re.compile(re.escape(log_name) + r"_(\d+)")
+    found = (
+        name.fullmatch(os.path.basename(path)) for path in glob.glob(os.path.join(glob.escape(str(log_path)), "*"))
+    )
+    return max((int(match[1]) for match in found if match), default=0)
+
+
+def check_for_correct_spaces(env: Any, observation_space: gym.Space, action_space: gym.Space) -> None:
+    """Raises ``ValueError`` if the spaces of an environment are others."""
+    for kind, own in (("Observation", observation_space), ("Action", action_space)):
+        if own != (other := getattr(env, f"{kind.lower()}_space")):
+            raise ValueError(f"{kind} spaces do not match: {own} != {other}")
+
+
+def check_shape_equal(space1: gym.Space, space2: gym.Space) -> None:
+    """Raises ``AssertionError`` if two spaces, or the parts of two Dict spaces, have different shapes."""
+    if isinstance(space1, spaces.Dict) and isinstance(space2, spaces.Dict):
+        if space1.spaces.keys() != space2.spaces.keys():
+            raise AssertionError(f"spaces must have the same keys: {list(space1)} != {list(space2)}")
+        for key in space1.spaces:
+            check_shape_equal(space1[key], space2[key])
+    elif isinstance(space1, spaces.Box) and space1.shape != space2.shape:
+        raise AssertionError(f"spaces must have the same shape: {space1.shape} != {space2.shape}")
+
+
+def is_vectorized_observation(observation: Any, observation_space: gym.Space) -> bool:
+    """Returns whether an observation is a batch of observations of the space.
+
+    Raises:
+        ValueError: if it is neither a batch nor a single one, or some parts of a Dict are batches and others not.
+    """
+    if isinstance(observation_space, spaces.Dict):
+        parts = [is_vectorized_observation(observation[key], part) for key, part in observation_space.spaces.items()]
+        if len(set(parts)) > 1:
+            raise ValueError(f"some parts of the observation are batches and others are not: {observation_space}")
+        return parts[0]
+    if not isinstance(observation_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        raise ValueError(
+            f"the observation must be of a Box, Discrete, MultiDiscrete, MultiBinary or Dict space, not {observation_space}"
+        )
+    shape, expected = np.shape(observation), observation_space.shape or ()
+    if shape == expected:
+        return False
+    if shape[1:] == expected and len(shape) == len(expected) + 1:
+        return True
+    raise ValueError(
+        f"Unexpected observation shape {shape} for {type(observation_space).__name__} environment, please use {expected} "
+        f"or (n_env, {', '.join(map(str, expected))}) for the observation shape"
+    )
+
+
+def safe_mean(arr: Any) -> float:
+    """Returns the mean, NaN of nothing."""
+    return float("nan") if len(arr) == 0 else float(np.mean(arr))
+
+
+def zip_strict(*iterables: Iterable[Any]) -> Iterator[Any]:
+    """Returns ``zip(*iterables, strict=True)``."""
+    return zip(*iterables, strict=True)
+
+
+def polyak_update(params: Iterable[np.ndarray], target_params: Iterable[np.ndarray], tau: float) -> None:
+    """Moves arrays, in place, by the share ``tau`` of the way to others."""
+    for value, target in zip(params, target_params, strict=True):
+        target += np.asarray(tau * (value - target), target.dtype)
+
+
+def obs_as_tensor(obs: Any, device: Any = "auto") -> Any:
+    """Returns observations as arrays, which is what stands for tensors here."""
+    return {key: Tensor.of(part) for key, part in obs.items()} if isinstance(obs, Mapping) else Tensor.of(obs)
+
+
+def should_collect_more_steps(train_freq: Any, num_collected_steps: int, num_collected_episodes: int) -> bool:
+    """Returns whether fewer steps or episodes than ``train_freq`` says have been taken."""
+    unit = getattr(train_freq.unit, "value", train_freq.unit)
+    return (num_collected_steps if unit == "step" else num_collected_episodes) < train_freq.frequency
+
+
+def get_system_info(print_info: bool = True) -> tuple[dict[str, str], str]:
+    """Returns the versions of Python and of the packages that matter, as a dict and as text."""
+    names = ("rejeu", "jax", "numpy", "gymnasium")
+    info = {"OS": f"{platform.platform()} {platform.version()}", "Python": platform.python_version()}
+    info |= {name: metadata.version(name) for name in names} | {"GPU Enabled": str(jax.default_backend() == "gpu")}
+    text = "".join(f"- {key}: {value}\n" for key, value in info.items())
+    if print_info:
+        print(text)
+    return info, text

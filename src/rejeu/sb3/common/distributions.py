@@ -1,0 +1,185 @@
+"""Distributions of actions with Stable-Baselines3's methods, in NumPy, over those of :mod:`rejeu.distributions`.
+
+Random numbers come from NumPy's global generator, which ``set_random_seed`` seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+
+from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
+from rejeu.sb3.common.preprocessing import get_action_dim
+from rejeu.sb3.common.utils import Tensor
+
+__all__ = [
+    "BernoulliDistribution",
+    "CategoricalDistribution",
+    "DiagGaussianDistribution",
+    "Distribution",
+    "MultiCategoricalDistribution",
+    "SquashedDiagGaussianDistribution",
+    "kl_divergence",
+    "make_proba_distribution",
+]
+
+
+def half_widths(space: spaces.Space) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns the centers and half widths of Box actions, None for others."""
+    if not isinstance(space, spaces.Box):
+        return None
+    return (space.high + space.low).ravel() / 2, (space.high - space.low).ravel() / 2
+
+
+class Distribution:
+    """A distribution of actions.
+
+    Args:
+        distribution: of actions in the algorithm's range.
+        widths: centers and half widths of the environment's range; None: it is the same.
+    """
+
+    def __init__(self, distribution: Any = None, widths: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        self.distribution, self.widths = distribution, widths
+
+    def _own(self, actions: Any) -> Any:
+        actions = np.asarray(actions)
+        return actions if self.widths is None else (actions - self.widths[0]) / self.widths[1]
+
+    def _shown(self, actions: Any) -> np.ndarray:
+        actions = np.asarray(actions)
+        return Tensor.of(actions if self.widths is None else actions * self.widths[1] + self.widths[0])
+
+    def _log_width(self) -> float:
+        return 0.0 if self.widths is None else float(np.sum(np.log(self.widths[1])))
+
+    def log_prob(self, actions: Any) -> np.ndarray:
+        """Returns the log-probabilities or densities of actions, ``(batch,)``, in nats."""
+        return Tensor.of(self.distribution.log_prob(self._own(actions))) - self._log_width()
+
+    def entropy(self) -> np.ndarray | None:
+        """Returns the entropy, ``(batch,)``, in nats; None for a squashed Gaussian, which has no closed form."""
+        if isinstance(self.distribution, TanhNormal):
+            return None
+        return Tensor.of(self.distribution.entropy()) + self._log_width()
+
+    def sample(self) -> np.ndarray:
+        """Returns random actions."""
+        return self._shown(self.distribution.sample(jax.random.key(np.random.randint(2**31))))  # noqa: NPY002
+
+    def mode(self) -> np.ndarray:
+        """Returns the most likely actions; of a Gaussian the means."""
+        return self._shown(self.distribution.mode())
+
+    def get_actions(self, deterministic: bool = False) -> np.ndarray:
+        """Returns the most likely or random actions."""
+        return self.mode() if deterministic else self.sample()
+
+
+class DiagGaussianDistribution(Distribution):
+    """Independent normal distributions.
+
+    Args:
+        action_dim: number of components.
+    """
+
+    kind: Any = Normal
+
+    def __init__(self, action_dim: int) -> None:
+        super().__init__()
+        self.action_dim = action_dim
+
+    def proba_distribution(self, mean_actions: Any, log_std: Any) -> Self:
+        """Sets the parameters, and returns itself."""
+        mean, log_std = (jnp.asarray(np.asarray(part, np.float32)) for part in (mean_actions, log_std))
+        self.distribution = self.kind(mean, jnp.broadcast_to(log_std, mean.shape))
+        return self
+
+
+class SquashedDiagGaussianDistribution(DiagGaussianDistribution):
+    """Independent normal distributions squashed by tanh."""
+
+    kind = TanhNormal
+
+
+class CategoricalDistribution(Distribution):
+    """One choice among ``action_dim``."""
+
+    def __init__(self, action_dim: int) -> None:
+        super().__init__()
+        self.action_dim = action_dim
+
+    def _made(self, logits: Any) -> Any:
+        return Categorical(logits)
+
+    def proba_distribution(self, action_logits: Any) -> Self:
+        """Sets the parameters, and returns itself."""
+        self.distribution = self._made(jnp.asarray(np.asarray(action_logits, np.float32)))
+        return self
+
+
+class MultiCategoricalDistribution(CategoricalDistribution):
+    """Several choices, each among its own number."""
+
+    def __init__(self, action_dims: Sequence[int]) -> None:
+        super().__init__(sum(action_dims))
+        self.action_dims = list(action_dims)
+
+    def _made(self, logits: Any) -> Any:
+        ends = np.cumsum(self.action_dims)[:-1].tolist()
+        return MultiCategorical(tuple(Categorical(part) for part in jnp.split(logits, ends, axis=-1)))
+
+
+class BernoulliDistribution(CategoricalDistribution):
+    """Independent bits."""
+
+    def _made(self, logits: Any) -> Any:
+        return Bernoulli(logits)
+
+
+def make_proba_distribution(action_space: spaces.Space, use_sde: bool = False, dist_kwargs: Any = None) -> Distribution:
+    """Returns a distribution for an action space.
+
+    Raises:
+        NotImplementedError: for other spaces, and for gSDE, which is part of the policies here.
+    """
+    if use_sde or not isinstance(
+        action_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+    ):
+        raise NotImplementedError(f"no distribution for {action_space} with use_sde={use_sde}")
+    if isinstance(action_space, spaces.Box):
+        return DiagGaussianDistribution(get_action_dim(action_space))
+    if isinstance(action_space, spaces.Discrete):
+        return CategoricalDistribution(int(action_space.n))
+    if isinstance(action_space, spaces.MultiDiscrete):
+        return MultiCategoricalDistribution(action_space.nvec.tolist())
+    return BernoulliDistribution(get_action_dim(action_space))
+
+
+def kl_divergence(dist_true: Distribution, dist_pred: Distribution) -> np.ndarray:
+    """Returns ``KL(true || pred)`` in nats, of each component where there are several.
+
+    Raises:
+        TypeError: if the distributions are of different kinds.
+    """
+    p, q = dist_true.distribution, dist_pred.distribution
+    if type(p) is not type(q):
+        raise TypeError(f"the distributions are of different kinds: {type(p).__name__} and {type(q).__name__}")
+    if isinstance(p, Normal | TanhNormal):
+        variance = jnp.exp(2 * (p.log_std - q.log_std))
+        return np.asarray(
+            0.5 * (variance + jnp.square((p.mean - q.mean) / jnp.exp(q.log_std)) - 1) + q.log_std - p.log_std
+        )
+    if isinstance(p, Categorical):
+        log_p, log_q = jax.nn.log_softmax(p.logits), jax.nn.log_softmax(q.logits)
+        return np.asarray(jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1))
+    if isinstance(p, MultiCategorical):
+        parts = zip(p.parts, q.parts, strict=True)
+        return np.stack([kl_divergence(Distribution(a), Distribution(b)) for a, b in parts], axis=-1).sum(axis=-1)
+    log = lambda b, sign: jax.nn.log_sigmoid(sign * b.logits)  # noqa: E731
+    return np.asarray(sum(jnp.exp(log(p, sign)) * (log(p, sign) - log(q, sign)) for sign in (1, -1)))

@@ -1,0 +1,179 @@
+"""Feature extractors: the names of Stable-Baselines3's, and those of one's own as ``equinox`` modules.
+
+An extractor of one's own is a subclass of :class:`BaseFeaturesExtractor` with the constructor that Stable-Baselines3 calls,
+and with a ``key`` for its random weights if it takes one::
+
+    class Features(BaseFeaturesExtractor):
+        linear: eqx.nn.Linear
+
+        def __init__(self, observation_space, features_dim=32, *, key):
+            super().__init__(observation_space, features_dim)
+            self.linear = eqx.nn.Linear(observation_space.shape[0], features_dim, key=key)
+
+        def forward(self, observations):
+            return jax.nn.relu(self.linear(observations))
+
+    PPO("MlpPolicy", env, policy_kwargs={"features_extractor_class": Features})
+
+``forward`` takes one observation, or a batch of them, as float32: images in [0, 1] with the channels first, choices one-hot.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.core import PyTree
+from rejeu.networks import ENCODERS, register_encoder
+from rejeu.networks.layers import own_module
+from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, preprocess_obs
+from rejeu.spaces import Leaf
+
+__all__ = ["BaseFeaturesExtractor", "CombinedExtractor", "FlattenExtractor", "NatureCNN"]
+
+PREFIX = "sb3:"
+"""How the names of encoders that are extractors begin."""
+
+
+class BaseFeaturesExtractor(eqx.Module):
+    """Maps observations to features. Abstract: subclasses implement ``forward``.
+
+    Args:
+        observation_space: accepted.
+        features_dim: number of features.
+    """
+
+    _features_dim: int = eqx.field(static=True)
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 0) -> None:
+        self._features_dim = features_dim
+
+    @property
+    def features_dim(self) -> int:
+        """The number of features."""
+        return self._features_dim
+
+    def forward(self, observations: Any) -> Array:
+        """Returns the features of one observation, or of a batch."""
+        raise NotImplementedError(f"{type(self).__name__} does not define forward")
+
+    def __call__(self, observations: Any) -> Array:
+        return self.forward(observations)
+
+
+class FlattenExtractor(BaseFeaturesExtractor):
+    """Observations as they are, in one vector."""
+
+    def forward(self, observations: Any) -> Array:
+        return jnp.ravel(observations)
+
+
+class NatureCNN(BaseFeaturesExtractor):
+    """The name of rejeu's own convolutions; ``features_dim`` is the width of the layer after them."""
+
+
+class CombinedExtractor(BaseFeaturesExtractor):
+    """The name of rejeu's own encoder of a Dict; ``cnn_output_dim`` is the width for each image."""
+
+
+class Prepared(eqx.Module):
+    """An extractor that is given observations as they come."""
+
+    extractor: Any
+    leaves: tuple[Leaf, ...] = eqx.field(static=True)
+    normalize_images: bool = eqx.field(static=True)
+
+    def __call__(self, obs: PyTree) -> Array:
+        """Maps a batch of observations to a batch of features."""
+        return self.extractor(prepared(obs, self.leaves, self.normalize_images))
+
+
+def prepared(obs: PyTree, leaves: tuple[Leaf, ...], normalize_images: bool) -> Any:
+    """Returns a batch of observations as extractors take them: a dict by path, or the only part as it is."""
+    parts = {}
+    for leaf in leaves:
+        x = obs[leaf.path] if leaf.path else obs
+        parts[leaf.path] = preprocess_obs(jnp.moveaxis(x, -1, 1) if _moves(leaf) else x, _space(leaf), normalize_images)
+    return parts[""] if list(parts) == [""] else parts
+
+
+def _moves(leaf: Leaf) -> bool:
+    space = spaces.Box(0, 255, leaf.shape, np.uint8)
+    return leaf.kind == "image" and is_image_space(space) and not is_image_space_channels_first(space)
+
+
+def _space(leaf: Leaf) -> spaces.Space:
+    if leaf.kind == "image":
+        return spaces.Box(0, 255, (leaf.shape[-1], *leaf.shape[:-1]) if _moves(leaf) else leaf.shape, np.uint8)
+    if leaf.kind == "categorical":
+        return spaces.MultiDiscrete(list(leaf.sizes)) if leaf.shape else spaces.Discrete(leaf.sizes[0])
+    return spaces.MultiBinary(leaf.shape) if leaf.kind == "binary" else spaces.Box(-np.inf, np.inf, leaf.shape)
+
+
+def space_of(leaves: tuple[Leaf, ...]) -> spaces.Space:
+    """Returns the space that an extractor is told: a Dict by path, or the space of the only leaf; images channels first."""
+    parts: dict[str, spaces.Space] = {leaf.path: _space(leaf) for leaf in leaves}
+    return parts[""] if list(parts) == [""] else spaces.Dict(parts)
+
+
+def encoder_of(extractor: Any, settings: Mapping[str, Any], normalize_images: bool = True) -> dict[str, Any]:
+    """Returns the ``policy_kwargs`` of rejeu that stand for a feature extractor and its arguments.
+
+    Raises:
+        TypeError: for a class that is no ``equinox.Module``, such as one of PyTorch.
+    """
+    known = {
+        None: ("features_dim", "cnn_output_dim"),
+        NatureCNN: ("features_dim",),
+        CombinedExtractor: ("cnn_output_dim",),
+    }
+    if isinstance(extractor, str):
+        return {"encoder": extractor}
+    if extractor in known:
+        widths = [settings[key] for key in known[extractor] if key in settings]
+        return {"cnn_features": widths[0]} if widths else {}
+    if not (isinstance(extractor, type) and issubclass(extractor, eqx.Module)):
+        raise TypeError(
+            f"features_extractor_class={extractor!r} must be a subclass of BaseFeaturesExtractor, which is an equinox.Module "
+            "here, not a PyTorch module; rewrite its layers with equinox.nn"
+        )
+    name = f"{PREFIX}{extractor.__name__} {json.dumps([dict(settings), normalize_images], default=repr)}"
+    _register(name, extractor, settings, normalize_images)
+    return {"encoder": name}
+
+
+def _register(name: str, extractor: type[eqx.Module], settings: Mapping[str, Any], normalize_images: bool) -> None:
+    @register_encoder(name)
+    def make(key: Array, leaves: tuple[Leaf, ...]) -> Any:
+        takes_key = "key" in inspect.signature(extractor).parameters
+        module = extractor(space_of(leaves), **settings, **({"key": key} if takes_key else {}))
+        zeros = {leaf.path: np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves}
+        batch = prepared(zeros.get("", zeros), leaves, normalize_images)
+        example = jax.tree.map(lambda x: x[0], batch)
+        return Prepared(own_module(extractor.__name__, module, example)[0], leaves, normalize_images)
+
+
+def register_again(name: Any) -> None:
+    """Makes the extractor that a model file names known again, if a class of that name is defined. Imports nothing."""
+    if not isinstance(name, str) or not name.startswith(PREFIX) or name in ENCODERS:
+        return
+    title, _, settings = name.removeprefix(PREFIX).partition(" ")
+    for extractor in subclasses(BaseFeaturesExtractor):
+        if extractor.__name__ == title:
+            _register(name, extractor, *json.loads(settings))
+
+
+def subclasses(kind: type[Any]) -> Iterator[type[Any]]:
+    """Yields the subclasses of a class, and theirs."""
+    for one in kind.__subclasses__():
+        yield one
+        yield from subclasses(one)

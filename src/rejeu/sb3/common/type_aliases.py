@@ -1,0 +1,76 @@
+"""Types of what buffers and training return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.callbacks.base import Callback
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
+
+GymEnv = gym.Env | VecEnv
+GymObs = Any
+GymResetReturn = tuple[Any, dict[str, Any]]
+GymStepReturn = tuple[Any, float, bool, bool, dict[str, Any]]
+AtariResetReturn = tuple[np.ndarray, dict[str, Any]]
+AtariStepReturn = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
+TensorDict = dict[str, np.ndarray]
+TensorIndex = Any
+MaybeCallback = Callback | list[Callback] | None
+PolicyPredictor = Any
+Schedule = Callable[[float], float]
+
+
+class RolloutBufferSamples(NamedTuple):
+    """A minibatch of a rollout; every array has a leading batch axis."""
+
+    observations: Any
+    actions: np.ndarray
+    old_values: np.ndarray
+    old_log_prob: np.ndarray
+    advantages: np.ndarray
+    returns: np.ndarray
+
+
+class ReplayBufferSamples(NamedTuple):
+    """A batch of transitions; every array has a leading batch axis."""
+
+    observations: Any
+    actions: np.ndarray
+    next_observations: Any
+    dones: np.ndarray
+    """``(batch, 1)``, 1 where the MDP terminated."""
+    rewards: np.ndarray
+    """``(batch, 1)``."""
+    discounts: np.ndarray | None = None
+    """``(batch, 1)``, of n-step returns."""
+
+
+DictRolloutBufferSamples = RolloutBufferSamples
+DictReplayBufferSamples = ReplayBufferSamples
+
+
+class RolloutReturn(NamedTuple):
+    """What one collection of experience did."""
+
+    episode_timesteps: int
+    n_episodes: int
+    continue_training: bool
+
+
+class TrainFrequencyUnit(Enum):
+    """What ``train_freq`` counts."""
+
+    STEP = "step"
+    EPISODE = "episode"
+
+
+class TrainFreq(NamedTuple):
+    """After how many steps or episodes an update follows."""
+
+    frequency: int
+    unit: TrainFrequencyUnit

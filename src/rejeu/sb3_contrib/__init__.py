@@ -1,0 +1,186 @@
+"""sb3-contrib's API at its own module paths.
+
+To port a script, replace ``sb3_contrib`` by ``rejeu.sb3_contrib`` in its imports.
+
+>>> from rejeu.sb3_contrib import TQC
+>>> from rejeu.sb3_contrib.common.wrappers import TimeFeatureWrapper
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from rejeu.sb3 import define
+from rejeu.sb3.algorithms import QRDQN, TQC, CrossQ, MaskablePPO, RecurrentPPO
+from rejeu.sb3.common import distributions
+from rejeu.sb3.common.callbacks import EvalCallback
+from rejeu.sb3.common.envs import InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete
+from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
+from rejeu.sb3.common.policies import ActorCriticPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
+
+__all__ = ["QRDQN", "TQC", "CrossQ", "MaskablePPO", "RecurrentPPO"]
+
+
+class ActionMasker(gym.Wrapper):
+    """Gives an environment the method ``action_masks``.
+
+    Args:
+        env: the environment.
+        action_mask_fn: function of the environment that returns the mask, or the name of a method.
+    """
+
+    def __init__(self, env: gym.Env, action_mask_fn: str | Callable[[Any], Any]) -> None:
+        super().__init__(env)
+        self._mask = (
+            env.get_wrapper_attr(action_mask_fn) if isinstance(action_mask_fn, str) else lambda: action_mask_fn(env)
+        )
+
+    def action_masks(self) -> np.ndarray:
+        """Returns which actions are allowed, ``bool (n,)``."""
+        return np.asarray(self._mask(), bool)
+
+
+class TimeFeatureWrapper(gym.Wrapper):
+    """Adds the remaining share of an episode's time, from 1 to 0, to the observations.
+
+    Args:
+        env: an environment with Box observations, or a Dict with a Box ``observation``.
+        max_steps: steps of an episode, where no ``TimeLimit`` says.
+        test_mode: always show 1.
+    """
+
+    def __init__(self, env: gym.Env, max_steps: int = 1000, test_mode: bool = False) -> None:
+        super().__init__(env)
+        self._max_steps = getattr(env.spec, "max_episode_steps", None) or max_steps
+        self._test_mode, self._step = test_mode, 0
+        space = env.observation_space
+        box = space["observation"] if isinstance(space, spaces.Dict) else space
+        if not isinstance(box, spaces.Box) or len(box.shape) != 1:
+            raise ValueError(f"TimeFeatureWrapper adds to a Box of one axis, or to one at 'observation'; got {space}")
+        low, high = np.append(box.low, 0.0), np.append(box.high, 1.0)
+        longer = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        self.observation_space = longer
+        if isinstance(space, spaces.Dict):
+            self.observation_space = spaces.Dict({**space.spaces, "observation": longer})
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self._step = 0
+        obs, info = self.env.reset(**kwargs)
+        return self._with_time(obs), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._step += 1
+        obs, *others = self.env.step(action)
+        return (self._with_time(obs), *others)
+
+    def _with_time(self, obs: Any) -> Any:
+        left = 1.0 if self._test_mode else 1.0 - self._step / self._max_steps
+        if isinstance(obs, dict):
+            return {**obs, "observation": np.append(obs["observation"], left).astype(np.float32)}
+        return np.append(obs, left).astype(np.float32)
+
+
+class MaskableEvalCallback(EvalCallback):
+    """``EvalCallback``, which gives a policy the masks of the environment.
+
+    Args:
+        args: those of ``EvalCallback``.
+        use_masking: only True.
+        kwargs: those of ``EvalCallback``.
+    """
+
+    def __init__(self, *args: Any, use_masking: bool = True, **kwargs: Any) -> None:
+        _require_masking(use_masking)
+        super().__init__(*args, **kwargs)
+
+
+class MaskableActorCriticPolicy(ActorCriticPolicy):
+    """Policy and value of MaskablePPO."""
+
+
+def evaluate_policy(*args: Any, use_masking: bool = True, **kwargs: Any) -> Any:
+    """Returns what :func:`rejeu.sb3.common.evaluation.evaluate_policy` does, which gives a policy the masks.
+
+    Raises:
+        ValueError: if the environment has no masks.
+    """
+    env = kwargs.get("env", args[1] if len(args) > 1 else None)
+    if not use_masking and args and isinstance(args[0], MaskablePPO):
+        return evaluate_by_masks(_WithoutMasks(args[0]), *args[1:], **kwargs)
+    if not is_masking_supported(env):
+        raise ValueError("the environment has no method action_masks; wrap it in ActionMasker, or use PPO")
+    return evaluate_by_masks(*args, **kwargs)
+
+
+class _WithoutMasks:
+    """The ``predict`` of a model, to which all actions are allowed."""
+
+    def __init__(self, model: Any) -> None:
+        self.predict = model.predict
+
+
+def _require_masking(use_masking: bool) -> None:
+    if not use_masking:
+        raise ValueError("use_masking=False: MaskablePPO needs masks; use PPO for environments without")
+
+
+def get_action_masks(env: Any) -> np.ndarray:
+    """Returns the masks of an environment, ``bool (n,)``, or of a vector environment, ``bool (num_envs, n)``."""
+    return (
+        np.stack(env.env_method("action_masks")) if isinstance(env, VecEnv) else env.get_wrapper_attr("action_masks")()
+    )
+
+
+def is_masking_supported(env: Any) -> bool:
+    """Returns whether an environment has a method ``action_masks``."""
+    if isinstance(env, VecEnv):
+        return env.has_attr("action_masks")
+    return not isinstance(env, gym.Env) or env.has_wrapper_attr("action_masks")
+
+
+MODULES: dict[str, dict[str, Any]] = {
+    "common": {},
+    "common.envs": {
+        one.__name__: one
+        for one in (InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete)
+    },
+    "common.wrappers": {"ActionMasker": ActionMasker, "TimeFeatureWrapper": TimeFeatureWrapper},
+    "common.wrappers.action_masker": {"ActionMasker": ActionMasker},
+    "common.wrappers.time_feature": {"TimeFeatureWrapper": TimeFeatureWrapper},
+    "common.maskable": {},
+    "common.maskable.callbacks": {"MaskableEvalCallback": MaskableEvalCallback},
+    "common.maskable.evaluation": {"evaluate_policy": evaluate_policy},
+    "common.maskable.utils": {"get_action_masks": get_action_masks, "is_masking_supported": is_masking_supported},
+    "common.maskable.policies": {
+        "MaskableActorCriticPolicy": MaskableActorCriticPolicy,
+        "MaskableActorCriticCnnPolicy": CnnPolicy,
+        "MaskableMultiInputActorCriticPolicy": MultiInputPolicy,
+    },
+    "common.maskable.distributions": {
+        f"Maskable{name}": getattr(distributions, name)
+        for name in ("BernoulliDistribution", "CategoricalDistribution", "MultiCategoricalDistribution")
+    },
+    "common.recurrent": {},
+    "common.recurrent.policies": {
+        "RecurrentActorCriticPolicy": ActorCriticPolicy,
+        "RecurrentActorCriticCnnPolicy": CnnPolicy,
+        "RecurrentMultiInputActorCriticPolicy": MultiInputPolicy,
+    },
+}
+"""Names by the module in which sb3-contrib has them."""
+for kind, folder in ((QRDQN, "qrdqn"), (TQC, "tqc"), (CrossQ, "crossq"), (MaskablePPO, "ppo_mask")):
+    named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
+    MODULES |= {folder: {kind.__name__: kind, **named}, f"{folder}.{folder}": {kind.__name__: kind}}
+    MODULES[f"{folder}.policies"] = named
+lstm = {"CnnLstmPolicy": CnnPolicy, "MlpLstmPolicy": MlpPolicy, "MultiInputLstmPolicy": MultiInputPolicy}
+MODULES |= {"ppo_recurrent": {"RecurrentPPO": RecurrentPPO, **lstm}, "ppo_recurrent.policies": lstm}
+MODULES["ppo_recurrent.ppo_recurrent"] = {"RecurrentPPO": RecurrentPPO}
+
+for path, names in MODULES.items():
+    define(f"{__name__}.{path}", names)

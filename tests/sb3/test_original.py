@@ -1,0 +1,313 @@
+"""What scripts for Stable-Baselines3 do: one test for each kind of call."""
+
+from __future__ import annotations
+
+import io
+import warnings
+
+import equinox as eqx
+import gymnasium as gym
+import jax
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rejeu import sb3
+from rejeu.algorithms.actor_critic.network import sde_std
+from rejeu.sb3.common import env_checker, envs, logger as loggers, utils
+from rejeu.sb3.common.buffers import HerReplayBuffer, NStepReplayBuffer, ReplayBuffer, RolloutBuffer
+from rejeu.sb3.common.noise import NormalActionNoise, VectorizedActionNoise
+from rejeu.sb3.common.torch_layers import BaseFeaturesExtractor
+from rejeu.sb3.policy import ActorCriticPolicy
+
+SMALL = {"policy_kwargs": {"net_arch": [8]}}
+
+
+class Features(BaseFeaturesExtractor):
+    linear: eqx.nn.Linear
+
+    def __init__(self, observation_space, features_dim=3, *, key):
+        super().__init__(observation_space, features_dim)
+        self.linear = eqx.nn.Linear(observation_space.shape[0], features_dim, key=key)
+
+    def forward(self, observations):
+        return jax.nn.relu(self.linear(observations))
+
+
+class AdamW:
+    """Stands for PyTorch's class of that name."""
+
+
+class Wide(ActorCriticPolicy):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs, net_arch={"pi": [5], "vf": [6]})
+
+
+def ppo(**settings):
+    return sb3.PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=16, batch_size=16, n_epochs=1, seed=0, **settings)
+
+
+def sac(**settings):
+    return sb3.SAC(
+        "MlpPolicy", gym.make("Pendulum-v1"), learning_starts=8, seed=0, **{"batch_size": 8, **SMALL, **settings}
+    )
+
+
+def test_policy_kwargs_of_the_original_are_translated():
+    config = sac(
+        policy_kwargs={"net_arch": [8], "n_critics": 3, "optimizer_class": AdamW, "share_features_extractor": False}
+    ).config
+    assert (config.n_critics, config.optimizer) == (3, "adamw")
+    kwargs = {
+        "optimizer_class": AdamW,
+        "optimizer_kwargs": {"weight_decay": 0.5, "betas": (0.8, 0.9)},
+        "net_arch": {"pi": [4]},
+    }
+    config = ppo(policy_kwargs=kwargs).config
+    assert dict(config.optimizer.settings) == {"weight_decay": 0.5, "b1": 0.8, "b2": 0.9}
+    assert (config.policy_kwargs.pi, config.policy_kwargs.vf) == ((4,), ())
+
+
+def test_a_features_extractor_is_used_saved_and_loaded(tmp_path):
+    kwargs = {"features_extractor_class": Features, "features_extractor_kwargs": {"features_dim": 7}, "net_arch": [8]}
+    model = ppo(policy_kwargs=kwargs).learn(16)
+    assert model.state.network.torso.layers[0].weight.shape == (7, 8)
+    model.save(tmp_path / "model")
+    obs = np.ones(4, np.float32)
+    assert sb3.PPO.load(tmp_path / "model").predict(obs, deterministic=True) == model.predict(obs, deterministic=True)
+    with pytest.raises(TypeError, match="equinox"):
+        ppo(policy_kwargs={"features_extractor_class": AdamW})
+
+
+def test_the_width_of_convolutions_and_images_that_are_scaled_already():
+    env = envs.FakeImageEnv(screen_height=36, screen_width=36)
+    model = sb3.A2C(
+        "CnnPolicy", env, policy_kwargs={"features_extractor_kwargs": {"features_dim": 16}, "normalize_images": False}
+    )
+    assert model.state.network.encoder.n_features == 16
+    assert model.state.network.encoder.images[0].scale == 1.0
+
+
+def test_a_policy_class_of_ones_own_sets_the_layers():
+    model = sb3.PPO(Wide, "CartPole-v1", n_steps=16, batch_size=16)
+    assert isinstance(model.policy, Wide)
+    assert (model.config.policy_kwargs.pi, model.config.policy_kwargs.vf) == ((5,), (6,))
+
+
+def test_sac_explores_by_state_dependent_noise(tmp_path):
+    model = sac(use_sde=True, sde_sample_freq=4).learn(16)
+    assert model.state.actor.log_std.shape == (8, 1)
+    model.save(tmp_path / "sde.zip")
+    obs = np.ones((2, 3), np.float32)
+    np.testing.assert_array_equal(
+        sb3.SAC.load(tmp_path / "sde").predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]
+    )
+    with pytest.raises(ValueError, match="leave action_noise out"):
+        sac(use_sde=True, action_noise=0.1)
+
+
+def test_expln_continues_the_exponential_smoothly():
+    x = np.array([-1.0, 0.0, 2.0], np.float32)
+    np.testing.assert_allclose(sde_std(x, True), [np.exp(-1), 1, np.log(3) + 1], rtol=1e-6)
+    assert float(jax.grad(lambda v: sde_std(v, True))(1e-6)) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_policy_parts_agree_with_the_agent():
+    model = ppo(**SMALL)
+    obs = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
+    values, log_prob, entropy = model.policy.evaluate_actions(obs, np.array([0, 1, 0, 1, 1]))
+    np.testing.assert_allclose(values[:, 0], model.value(obs), rtol=1e-6)
+    distribution = model.policy.get_distribution(obs)
+    p = jax.nn.softmax(distribution.distribution.logits)
+    np.testing.assert_allclose(np.exp(log_prob.numpy()), p[np.arange(5), [0, 1, 0, 1, 1]], rtol=1e-5)
+    np.testing.assert_allclose(entropy, -(p * np.log(p)).sum(axis=1), rtol=1e-5)
+    agent = sac()
+    np.testing.assert_allclose(2 * agent.actor(obs[:, :3]), agent.predict(obs[:, :3], deterministic=True)[0], rtol=1e-5)
+    assert [q.shape for q in agent.critic(obs[:, :3], np.zeros((5, 1)))] == [(5, 1)] * 2
+    state = {name: array + 1 for name, array in agent.policy.state_dict().items()}
+    agent.policy.load_state_dict(state)
+    np.testing.assert_array_equal(
+        agent.policy.parameters_to_vector(), np.concatenate([a.ravel() for a in state.values()])
+    )
+
+
+def test_box_distributions_are_in_the_environments_units():
+    model = sb3.A2C("MlpPolicy", gym.make("Pendulum-v1"), seed=0)
+    _, log_prob, _ = model.policy.evaluate_actions(
+        np.zeros((1, 3), np.float32), model.policy.get_distribution(np.zeros(3)).mode()
+    )
+    assert float(log_prob[0]) == pytest.approx(-0.5 * np.log(2 * np.pi) - np.log(2), rel=1e-5)  # sigma is 2 there
+
+
+def test_hyperparameters_are_attributes_that_can_be_set():
+    model = ppo(**SMALL, learning_rate=lambda remaining: 1e-3 if remaining > 0.5 else 1e-4, clip_range=0.3)
+    assert (model.gamma, model.batch_size, model.clip_range(0.1)) == (0.99, 16, 0.3)
+    assert (model.lr_schedule(0.9), model.lr_schedule(0.1)) == (1e-3, 1e-4)
+    model.gamma = 0.5
+    assert model.config.gamma == 0.5
+    assert model.learn(16)._n_updates == 1
+    with pytest.raises(AttributeError):
+        _ = model.no_such_thing
+
+
+def test_neutral_arguments_are_accepted_and_those_not_followed_warn():
+    ppo(**SMALL, use_sde=False, rollout_buffer_class=None, _init_setup_model=True)
+    noise = VectorizedActionNoise(NormalActionNoise(np.zeros(1), np.ones(1)), 2)
+    assert noise().shape == (2, 1)
+    model = sac(
+        optimize_memory_usage=True, use_sde=False, sde_sample_freq=-1, action_noise=noise, train_freq=(1, "step")
+    )
+    assert model.config.action_noise == noise.base_noise
+    with pytest.warns(UserWarning, match="handle_timeout_termination"):
+        sac(replay_buffer_kwargs={"handle_timeout_termination": False})
+    with pytest.raises(TypeError, match="no_such_argument"):
+        sac(no_such_argument=1)
+
+
+def test_a_batch_may_be_larger_than_the_buffer():
+    assert sac(batch_size=64, buffer_size=16).learn(20)._n_updates > 0
+
+
+def test_files_have_exactly_the_given_name_or_are_file_objects(tmp_path):
+    model = sac().learn(12)
+    model.save(tmp_path / "a")
+    model.save(tmp_path / "b.any")
+    model.save_replay_buffer(tmp_path / "replay")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.any", "replay.pkl"]
+    file = io.BytesIO()
+    model.save(file)
+    assert sb3.SAC.load(file, custom_objects={"learning_rate": 1e-5, "other": 2}).learning_rate == 1e-5
+    model.load_replay_buffer(tmp_path / "replay")
+    assert model.replay_buffer.size() == 12
+
+
+def test_the_replay_buffer_of_an_agent_is_shown_extended_and_replaced():
+    model = sac().learn(10)
+    shown = model.replay_buffer
+    assert shown.observations.shape == (10, 1, 3)
+    np.testing.assert_array_equal(shown.next_observations[:-1], shown.observations[1:])
+    step = (np.zeros((1, 3)), np.ones((1, 3)), np.full((1, 1), 0.5), np.array([2.0]), np.array([True]), [{}])
+    shown.add(*step)
+    again = model.replay_buffer
+    assert (again.size(), again.rewards[-1, 0], again.dones[-1, 0], again.timeouts[-1, 0]) == (11, 2.0, 1.0, 0.0)
+    own = ReplayBuffer(50, model.observation_space, model.action_space)
+    own.add(*step)
+    model.replay_buffer = own
+    assert model.replay_buffer.size() == 1
+    model.learn(12)
+
+
+def test_n_step_returns_stop_where_episodes_end():
+    buffer = NStepReplayBuffer(8, spaces.Box(0, 9, (1,)), spaces.Discrete(2), n_steps=3, gamma=0.5)
+    for t in range(6):
+        buffer.add(np.array([[t]]), np.array([[t + 1]]), np.array([0]), np.array([1.0]), np.array([t == 3]), [{}])
+    batch = buffer._get_samples(np.array([0, 2, 5]))
+    np.testing.assert_allclose(batch.rewards[:, 0], [1.75, 1.5, 1.0])
+    np.testing.assert_allclose(batch.discounts[:, 0], [0.125, 0.25, 0.5])
+    assert batch.dones[:, 0].tolist() == [0, 1, 0]
+    assert batch.next_observations[:, 0].tolist() == [3, 4, 6]
+
+
+def test_rollout_buffer_computes_advantages_by_the_recursion():
+    buffer = RolloutBuffer(3, spaces.Box(0, 1, (1,)), spaces.Discrete(2), gae_lambda=0.5, gamma=0.9)
+    for t, start in enumerate([True, False, True]):
+        buffer.add(np.zeros((1, 1)), np.zeros(1), np.array([1.0]), np.array([start]), np.array([float(t)]), np.zeros(1))
+    buffer.compute_returns_and_advantage(np.array([2.0]), np.array([False]))
+    last = 1 + 0.9 * 2.0 - 2.0
+    middle = 1 - 1.0  # an episode ends there
+    first = 1 + 0.9 * 1.0 - 0.0 + 0.45 * middle
+    np.testing.assert_allclose(buffer.advantages[:, 0], [first, middle, last], rtol=1e-6)
+    assert sum(len(batch.actions) for batch in buffer.get(2)) == 3
+
+
+def test_hindsight_by_hand_gives_goals_that_were_reached():
+    venv = sb3.common.env_util.make_vec_env(lambda: envs.BitFlippingEnv(4, continuous=True))
+    buffer = HerReplayBuffer(50, venv.observation_space, venv.action_space, venv, n_sampled_goal=4)
+    obs = venv.reset()
+    for _ in range(12):
+        action = np.random.default_rng(0).uniform(-1, 1, (1, 4))
+        new, reward, done, infos = venv.step(action)
+        final = {key: np.array([value]) for key, value in infos[0].get("terminal_observation", {}).items()}
+        buffer.add(obs, final or new, action, reward, done, infos)
+        obs = new
+    batch = buffer.sample(40)
+    goals, reached = batch.observations["desired_goal"], batch.next_observations["achieved_goal"]
+    np.testing.assert_array_equal(batch.rewards[:, 0], -(goals != reached).any(axis=1).astype(np.float32))
+
+
+def test_compute_reward_may_return_an_array_of_one_for_one_goal():
+    class OfOne(envs.BitFlippingEnv):
+        def compute_reward(self, achieved_goal, desired_goal, _info):
+            reward = super().compute_reward(achieved_goal, desired_goal, None)
+            return reward if _info is None else np.atleast_1d(reward)  # step gives None
+
+    kwargs = {"replay_buffer_class": sb3.HerReplayBuffer, "learning_starts": 8, "batch_size": 8, **SMALL}
+    assert sb3.DQN("MultiInputPolicy", OfOne(4), **kwargs).learn(20)._n_updates > 0
+
+
+def test_functions_as_callbacks_take_locals_and_globals():
+    seen = []
+    ppo(**SMALL).learn(8, callback=lambda locals_, globals_: seen.append(locals_["self"].num_timesteps))
+    assert seen == [*range(1, 9)]
+
+
+def test_logger_formats(tmp_path, capsys):
+    logger = loggers.configure(str(tmp_path), ["stdout", "csv", "json", "log"])
+    logger.record("a/b", 1.5)
+    logger.record("a/text", "words", exclude="csv")
+    logger.dump(3)
+    logger.record("c", 2)
+    logger.dump(4)
+    assert "|    b    | 1.5" in capsys.readouterr().out
+    assert loggers.read_csv(tmp_path / "progress.csv") == [{"a/b": "1.5", "c": ""}, {"a/b": "", "c": "2"}]
+    assert loggers.read_json(tmp_path / "progress.json") == [{"a/b": 1.5, "a/text": "words"}, {"c": 2}]
+    logger.record("figure", loggers.Figure(None, False))
+    with pytest.raises(loggers.FormatUnsupportedError, match="exclude"):
+        logger.dump()
+    logger.close()
+    model = ppo(**SMALL)
+    model.set_logger(loggers.Logger(None, []))
+    model.logger.dump = lambda step=0: None
+    model.learn(200, log_interval=1)
+    assert model.logger.name_to_value["time/fps"] > 0
+
+
+@pytest.mark.parametrize(
+    "kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv, envs.SimpleMultiObsEnv]
+)
+def test_environments_pass_the_checker_without_warnings(kind):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env_checker.check_env(kind())
+
+
+def test_the_checker_states_the_difference():
+    env = envs.IdentityEnvBox()
+    env.step = lambda action: (np.full(1, 3.0, np.float32), 0.0, False, False, {})
+    with pytest.raises(AssertionError, match=r"Expected: -1\.0 <= obs\[0\] <= 1\.0, actual value: 3\.0"):
+        env_checker.check_env(env)
+
+
+def test_contrib_modules_and_masks():
+    from rejeu.sb3_contrib.common.envs import InvalidActionEnvDiscrete
+    from rejeu.sb3_contrib.common.maskable.evaluation import evaluate_policy
+    from rejeu.sb3_contrib.common.maskable.utils import get_action_masks
+    from rejeu.sb3_contrib.common.wrappers import ActionMasker, TimeFeatureWrapper
+    from rejeu.sb3_contrib.ppo_recurrent import MlpLstmPolicy  # noqa: F401
+
+    from rejeu.sb3_contrib import MaskablePPO
+
+    env = InvalidActionEnvDiscrete(dim=6, n_invalid_actions=5)
+    model = MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=8, **SMALL)
+    assert evaluate_policy(model, env, n_eval_episodes=2)[0] == 100.0  # only the right action is left
+    assert get_action_masks(ActionMasker(env, lambda inner: np.ones(6))).tolist() == [True] * 6
+    timed = TimeFeatureWrapper(gym.make("Pendulum-v1"))
+    assert timed.reset()[0][-1] == 1.0
+    assert timed.step(np.zeros(1))[0][-1] == pytest.approx(1 - 1 / 200)
+
+
+def test_utilities():
+    assert utils.get_latest_run_id("/nowhere", "PPO") == 0
+    assert utils.is_vectorized_observation(np.zeros((2, 3)), spaces.Box(0, 1, (3,)))
+    assert utils.explained_variance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 1.0
+    assert utils.Tensor.of([1.0]).detach().cpu().numpy().tolist() == [1.0]
