@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rejeu
-from rejeu.loops.packing import Readings
+from rejeu.loops.learner import Readings
 from tests.sharing import shared_learners
 
 

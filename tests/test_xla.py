@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rejeu import xla
-from rejeu.loops.packing import Packing
+from rejeu.loops.learner import Packing
 
 
 def test_what_runs_once_is_computed_also_where_xla_does_not_know_the_options(monkeypatch):

@@ -285,3 +285,10 @@ def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:
 def copy(tree: PyTree) -> PyTree:
     """Returns ``tree`` in buffers of its own: a target network must not share what is donated with the online one."""
     return jax.tree.map(jnp.copy, tree)
+
+
+def names(tree: PyTree) -> list[str]:
+    """Returns the dotted path of each leaf of a tree, such as ``actor.torso.layers.0.weight``."""
+    return [
+        jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_leaves_with_path(tree)
+    ]

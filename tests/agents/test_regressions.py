@@ -15,7 +15,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rejeu
-from rejeu import spaces
+from rejeu import core, spaces
 from rejeu.agents import AGENTS
 from rejeu.algorithms import config as configs
 from rejeu.buffers.ring import Ring
@@ -152,7 +152,7 @@ def parameter_names(kind, observation_space):
     config = module.Config(policy_kwargs={"net_arch": [4]})
     init = module.make(config, observation_space, env_of(kind).action_space).init
     found = {}
-    for name in checkpoint.names(jax.eval_shape(init, jax.ShapeDtypeStruct((2,), jnp.uint32))):
+    for name in core.names(jax.eval_shape(init, jax.ShapeDtypeStruct((2,), jnp.uint32))):
         part, _, rest = name.partition(".")
         found.setdefault(part, set()).add(rest)
     return found

@@ -17,7 +17,7 @@ from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import Rollout
 from rejeu.envs.make import InProcess
-from rejeu.loops.packing import Readings
+from rejeu.loops.learner import Readings
 from tests.algorithms.test_gae import by_definition, random_steps
 from tests.environments import Counter
 

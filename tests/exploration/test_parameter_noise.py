@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from rejeu import core
 from rejeu.algorithms import ddpg, dqn, td3
 from rejeu.core import Clock
 from rejeu.exploration import explorer, parameter_space
@@ -108,7 +109,7 @@ def test_noise_is_drawn_at_the_first_step_also_in_the_middle_of_an_episode():
 def test_noise_has_the_standard_deviation_sigma_in_every_perturbed_leaf_and_spares_layer_norm():
     _, act, carry, actor = made(noise=ParameterNoise(initial_sigma=0.3), n_envs=500)
     _, carry = act(carry, actor, observations(500), np.ones(500, bool), jax.random.PRNGKey(0), CLOCK)
-    names = checkpoint.names(actor)
+    names = core.names(actor)
     spared = [name for i, name in enumerate(names) if i not in parameter_space.perturbed_leaves(actor)]
     assert spared == ["torso.norms.0.scale", "torso.norms.0.offset"]
     assert len(carry.perturbation) == 4  # weight and bias of the hidden layer and the head

@@ -23,8 +23,8 @@ from rejeu.core import EXPLAINED_VARIANCE, TD_ERROR, Rollout
 from rejeu.envs.make import InProcess
 from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
 from rejeu.io.checkpoint import read
-from rejeu.loops import finite, nonfinite
-from rejeu.loops.packing import Readings
+from rejeu.loops import finite, learner, nonfinite
+from rejeu.loops.learner import Readings
 from rejeu.normalization import merged, no_moments
 from rejeu.spaces import Leaf
 from tests.environments import Counter, Reach, Sampled
@@ -519,19 +519,19 @@ def test_all_finite_is_numpys_answer(sizes, place, value):
     vectors = [np.full(n, -1.5, np.float32) for n in sizes]
     vectors[-1][place % sizes[-1]] = value
     expected = all(np.isfinite(vector).all() for vector in vectors)
-    assert bool(nonfinite.check([*map(jnp.asarray, vectors), jnp.arange(3)], {})) == expected
+    assert bool(learner.check([*map(jnp.asarray, vectors), jnp.arange(3)], {})) == expected
 
 
 def test_whole_numbers_alone_are_finite():
-    assert bool(nonfinite.check([jnp.arange(3)], {}))
+    assert bool(learner.check([jnp.arange(3)], {}))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_metrics_must_be_finite_but_for_td_errors_and_explained_variance(value):
     fine, bad = jnp.float32(1), jnp.float32(value)
-    assert not bool(nonfinite.check([jnp.zeros(3)], {"critic_loss": bad, "q_value": fine}))
-    assert not bool(nonfinite.check([], {"loss": jnp.stack([fine, bad])}))
-    assert bool(nonfinite.check([jnp.zeros(3)], {"policy_loss": fine, EXPLAINED_VARIANCE: bad, TD_ERROR: bad}))
+    assert not bool(learner.check([jnp.zeros(3)], {"critic_loss": bad, "q_value": fine}))
+    assert not bool(learner.check([], {"loss": jnp.stack([fine, bad])}))
+    assert bool(learner.check([jnp.zeros(3)], {"policy_loss": fine, EXPLAINED_VARIANCE: bad, TD_ERROR: bad}))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -188,7 +188,7 @@ def test_plain_networks_keep_the_names_of_their_parameters():
     expected = ["torso.layers.0.weight", "torso.layers.0.bias", "torso.norms.0.scale", "torso.norms.0.offset"]
     expected += ["head.weight", "head.bias"]
     for network in (actor, critic):
-        assert rejeu.io.checkpoint.names(network) == expected
+        assert rejeu.core.names(network) == expected
 
 
 def test_action_values_are_those_of_each_critic():

@@ -12,7 +12,7 @@ import pytest
 import rejeu
 from rejeu.errors import BadEnvironmentError, CheckpointError
 from rejeu.io import checkpoint
-from rejeu.loops.packing import Readings
+from rejeu.loops.learner import Readings
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.running_mean_std import RunningMeanStd

@@ -9,7 +9,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from rejeu import devices, spaces
+from rejeu import core, devices, spaces
 from rejeu.agents import exporting, model_files, outputs, policy, resume, training
 from rejeu.agents.base import BaseAgent
 from rejeu.agents.exporting import Exported, Target
@@ -340,7 +340,7 @@ class Agent(BaseAgent):
             path = source
             with checkpoint.opened(path, "agent") as file:
                 shapes = self.learner.shapes
-                own = {} if exact_match else dict(zip(checkpoint.names(shapes), jax.tree.leaves(shapes), strict=True))
+                own = {} if exact_match else dict(zip(core.names(shapes), jax.tree.leaves(shapes), strict=True))
                 checkpoint.match(shapes, {**own, **file.specs}, path)
                 source = file.read()
             checkpoint.require_finite(source, path)

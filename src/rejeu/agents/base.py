@@ -28,8 +28,7 @@ from rejeu.exploration.noise import Noise, check_fits
 from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops import nonfinite
 from rejeu.loops.device.chunks import Stops
-from rejeu.loops.learner import Learner
-from rejeu.loops.packing import PackedState
+from rejeu.loops.learner import Learner, PackedState
 from rejeu.loops.run import Progress, Run, initial_run
 from rejeu.loops.training_call import TrainingCall
 from rejeu.normalization import normalized

@@ -39,7 +39,7 @@ from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, json_arrays
 from rejeu.io.records import MAX_ENVS, WRONG, brief, convert
 from rejeu.loops.checks import is_finite
-from rejeu.loops.packing import Readings
+from rejeu.loops.learner import Readings
 from rejeu.loops.run import Run
 from rejeu.loops.training_call import TrainingCall
 from rejeu.runs.folder import run_files

@@ -26,7 +26,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of
+from rejeu.algorithms.actor_critic.network import ActorCritic, checked, exploit, explore, explorer_of, state_value
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     clip_and_descend,
@@ -100,12 +100,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network = ActorCritic(key, obs_leaves, kind, shape, config.use_sde)
         return State(network, optimizer.init(network), jnp.int32(0))
 
-    def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return actor.policy(obs).sample(key)
-
-    def exploit(actor: ActorCritic, obs: PyTree) -> Array:
-        return actor.policy(obs).mode()
-
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
         if config.normalize_advantage:
@@ -124,11 +118,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             metrics["std"] = jnp.mean(jnp.exp(network.log_std))
         return State(network, optimizer_state, state.n_updates + 1), metrics
 
-    def value(carry: PyTree, network: ActorCritic, obs: PyTree, ended: Array) -> Array:
-        return network.value(obs)
-
     explorer = explorer_of(config, kind)
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=state_value)
 
 
 def optimizer_of(config: Config) -> optax.GradientTransformation:

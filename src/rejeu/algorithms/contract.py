@@ -11,8 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree
-from rejeu.io.checkpoint import names
+from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, names
 from rejeu.spaces import random_action
 
 

@@ -35,7 +35,7 @@ from jax import Array
 from rejeu import schedules
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of
+from rejeu.algorithms.actor_critic.network import ActorCritic, checked, exploit, explore, explorer_of, state_value
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     clip_and_descend,
@@ -139,12 +139,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network = ActorCritic(network_key, obs_leaves, kind, shape, config.use_sde)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
-    def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return actor.policy(obs).sample(key)
-
-    def exploit(actor: ActorCritic, obs: PyTree) -> Array:
-        return actor.policy(obs).mode()
-
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
         order_key = nth(state.key, state.n_rollouts)
@@ -155,11 +149,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
-    def value(carry: PyTree, network: ActorCritic, obs: PyTree, ended: Array) -> Array:
-        return network.value(obs)
-
     explorer = explorer_of(config, kind)
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=state_value)
 
 
 def metrics_of(

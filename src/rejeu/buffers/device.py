@@ -24,11 +24,10 @@ from jax import Array
 from rejeu import schedules
 from rejeu.buffers import device_priorities
 from rejeu.buffers.device_priorities import DevicePriorities
-from rejeu.buffers.n_step import look_ahead, replaced, with_new_goals
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.buffers.strategies import BUILT_IN, GoalStrategy, HindsightSteps
-from rejeu.buffers.uniform import bootstrap_discount
+from rejeu.buffers.uniform import NewGoals, bootstrap_discount, outcome, replaced
 from rejeu.core import PyTree, Transition, copy
 from rejeu.prng import below
 
@@ -253,55 +252,35 @@ class DeviceReplay:
             rows, weight = self.draw_rows(ring, rows_key, self.batch_size), None
         else:
             rows, weight = self.draw_by_priority(ring, rows_key, progress)
-        if self.strategy is None:
-            return self.batch(ring, rows)._replace(weight=weight), rows
-        assert reward is not None
-        n = self.n_relabeled
-        goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
-        goal = ring.obs[self.achieved][goal_rows]
-        return self.batch(ring, rows, goal, reward, terminated)._replace(weight=weight), rows
+        goals = None
+        if self.strategy is not None:
+            assert reward is not None
+            n = self.n_relabeled
+            goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
+            goal = ring.obs[self.achieved][goal_rows]
+            goals = NewGoals(slice(n), goal, self.achieved, reward, terminated)
+        return self.batch(ring, rows, goals)._replace(weight=weight), rows
 
     @property
     def n_relabeled(self) -> int:
         """The number of transitions of a batch that get a new goal: the first of it."""
         return int(self.batch_size * self.n_sampled_goal / (self.n_sampled_goal + 1))
 
-    def batch(
-        self,
-        ring: DeviceRing,
-        rows: DeviceRows,
-        goal: Array | None = None,
-        reward: GoalFunction | None = None,
-        terminated: GoalFunction | None = None,
-    ) -> Transition:
-        """Returns the transitions of ``rows``, the first of them with new goals ``(n_relabeled, ...)``, if there are any.
-
-        See :class:`rejeu.buffers.uniform.ReplayBuffer` and :class:`rejeu.buffers.hindsight.HerReplayBuffer`.
-        """
-        which = slice(0 if goal is None else len(goal))
+    def batch(self, ring: DeviceRing, rows: DeviceRows, goals: NewGoals | None = None) -> Transition:
+        """Returns the transitions of ``rows``, with new goals if there are any; see :meth:`BaseReplayBuffer.batch`."""
         obs, action = [store[rows.position] for store in ring.obs], ring.action[rows.position]
-        rewards, steps = None, 1
-        if self.n_steps == 1:
-            rewarded, ends = ring.reward[rows.position], ring.kind[rows.position] == TERMINATED
-            if goal is not None and reward is not None and which.stop:
-                reached = ring.obs[self.achieved][self.positions(rows.env[which], rows.time[which] + 1)]
-                rewarded = replaced(rewarded, which, reward(reached, goal))
-                ends = ends if terminated is None else replaced(ends, which, terminated(reached, goal))
-        else:
-            window = look_ahead(jnp, ring, self.positions, rows, self.n_steps)
-            each = ring.reward[window.position]
-            if goal is not None and reward is not None and which.stop:
-                later = rows.time[which, None] + 1 + jnp.arange(self.n_steps)[None]
-                reached = ring.obs[self.achieved][self.positions(rows.env[which, None], later)]
-                each, window = with_new_goals(jnp, each, window, which, reached, goal, reward, terminated)
-            rewarded, rewards = self._sums(jnp.where(window.valid, each, jnp.float32(0)))
-            ends, steps = window.terminal.any(axis=1), window.valid.sum(axis=1)
+        rewards, steps, ends = outcome(jnp, ring, self.positions, rows, self.n_steps, goals)
+        each = None
+        if self.n_steps > 1:
+            each = rewards * jnp.asarray((self.gamma ** np.arange(self.n_steps)).astype(np.float32))[None]
+            rewards, each = each.sum(axis=1), each if self.each_reward else None
         next_obs = [store[self.positions(rows.env, rows.time + steps)] for store in ring.obs]
-        for leaves in (obs, next_obs) if goal is not None else ():
-            leaves[self.desired] = replaced(leaves[self.desired], which, goal)
+        for leaves in (obs, next_obs) if goals is not None else ():
+            leaves[self.desired] = replaced(leaves[self.desired], goals.which, goals.goal)  # type: ignore[union-attr]
         tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
-        discount = self._discounts(ends, steps)
-        return Transition(tree(obs), action, rewarded, tree(next_obs), discount, None, rewards)
+        table = bootstrap_discount(self.gamma, np.arange(self.n_steps + 1), np.zeros(self.n_steps + 1, bool))
+        discount = jnp.where(ends, jnp.float32(0), jnp.asarray(table)[steps])
+        return Transition(tree(obs), action, rewards, tree(next_obs), discount, None, each)
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
         """Returns the positions of the rows whose achieved goals become the new goals of ``rows``, by the strategy."""
@@ -324,17 +303,6 @@ class DeviceReplay:
         if self.strategy not in BUILT_IN:
             times = jnp.clip(times.astype(jnp.int32), first, last)
         return self.positions(rows.env, times)
-
-    def _sums(self, rewards: Array) -> tuple[Array, Array | None]:
-        """Returns the discounted sums of rewards ``(batch, n)``, and the discounted rewards where they are asked for."""
-        powers = jnp.asarray((self.gamma ** np.arange(self.n_steps)).astype(np.float32))
-        discounted = rewards * powers[None]
-        return discounted.sum(axis=1), discounted if self.each_reward else None
-
-    def _discounts(self, terminated: Array, steps: Any) -> Array:
-        """Returns ``gamma^steps``, and 0 where the MDP terminated."""
-        table = bootstrap_discount(self.gamma, np.arange(self.n_steps + 1), np.zeros(self.n_steps + 1, bool))
-        return jnp.where(terminated, jnp.float32(0), jnp.asarray(table)[steps])
 
 
 def put(store: Array, index: Array, values: Array) -> Array:

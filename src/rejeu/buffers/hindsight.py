@@ -23,17 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.buffers.n_step import look_ahead, with_new_goals
 from rejeu.buffers.prioritized import Draw, Priorities
-from rejeu.buffers.ring import Ring, Rows
+from rejeu.buffers.ring import Ring
 from rejeu.buffers.strategies import BUILT_IN, STRATEGIES, GoalStrategy, HindsightSteps, name_of, takes_generator
-from rejeu.buffers.uniform import (
-    BaseReplayBuffer,
-    batch,
-    bootstrap_discount,
-    discounted,
-    discounted_sum,
-)
+from rejeu.buffers.uniform import BaseReplayBuffer, NewGoals
 from rejeu.core import Transition
 from rejeu.envs.goals import GoalFunctions
 
@@ -127,31 +120,14 @@ class HerReplayBuffer(BaseReplayBuffer):
 
         Of each batch, the first ``k / (k + 1)`` are relabeled.
         """
-        ring, k = self.ring, self.config.n_sampled_goal
+        ring = self.ring
         rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
-        step, obs = ring.read(rows.position)
-        relabeled = relabeled_positions(shape, k)
-
-        goal_index = self.goal_index(rng, rows.env[relabeled], rows.time[relabeled], step[relabeled])
-        goal = ring.read_leaf(self.achieved, goal_index)
-        steps: int | np.ndarray = 1
-        rewards = None
-        if self.n_steps > 1:
-            rewards, steps, terminated = self._n_step(rows, relabeled, goal)
-            reward = discounted_sum(rewards, self.gamma)
-            discount = bootstrap_discount(self.gamma, steps, terminated)
-        _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
-        if self.n_steps == 1:
-            reward, discount = step["reward"], self.discounts.take(rows.kind)
-            if len(goal):
-                reached = next_obs[self.achieved][relabeled]
-                reward[relabeled] = self.goals.reward(reached, goal)
-                if self.goals.terminated is not None:
-                    discount[relabeled] = bootstrap_discount(self.gamma, 1, self.goals.terminated(reached, goal))
-        obs[self.desired][relabeled] = goal
-        next_obs[self.desired][relabeled] = goal
-        rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
-        return batch(ring, shape, step, obs, reward, next_obs, discount, weight, rewards), drawn
+        read = ring.read(rows.position)
+        which = relabeled_positions(shape, self.config.n_sampled_goal)
+        index = self.goal_index(rng, rows.env[which], rows.time[which], read[0][which])
+        goal = ring.read_leaf(self.achieved, index)
+        goals = NewGoals(which, goal, self.achieved, self.goals.reward, self.goals.terminated)
+        return self.batch(shape, rows, read, weight, goals), drawn
 
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.
@@ -184,19 +160,6 @@ class HerReplayBuffer(BaseReplayBuffer):
         steps = HindsightSteps.of(np, ring.index, env, (time, first, last), goals_at, integers)
         times = steps.chosen_by(strategy)
         return ring.index(env, times if strategy in BUILT_IN else checked(times, first, last))
-
-    def _n_step(
-        self, rows: Rows, relabeled: slice | np.ndarray, goal: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns rewards ``(batch, n)``, number of steps and ``terminated``, for the new goals where there are any."""
-        ring = self.ring
-        window = look_ahead(np, ring, ring.index, rows, self.n_steps)
-        following = ring.index(rows.env[relabeled, None], rows.time[relabeled, None] + 1 + np.arange(self.n_steps))
-        reached, judges = ring.obs[self.achieved][following], (self.goals.reward, self.goals.terminated)
-        rewards = ring.reward[window.position]
-        rewards, window = with_new_goals(np, rewards, window, relabeled, reached, goal, *judges)
-        rewards = np.where(window.valid, rewards, np.float32(0.0))
-        return rewards, window.valid.sum(axis=1), window.terminal.any(axis=1)
 
 
 @cache

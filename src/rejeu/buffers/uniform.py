@@ -1,24 +1,31 @@
-"""The replay buffer: steps are drawn uniformly, or by priority, with one-step or n-step returns."""
+"""The replay buffer: steps are drawn uniformly, or by priority, with one-step or n-step returns.
+
+What the rows of a batch lead to is one definition for the arrays of NumPy and those of JAX, with and without new goals
+(:func:`outcome`). ``xp`` is the module that computes with the arrays, ``numpy`` or ``jax.numpy``. ``ring`` has ``kind``,
+``reward``, ``obs`` and ``head``, and ``index(env, time)`` returns positions in it, as :class:`rejeu.buffers.ring.Ring` does.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from rejeu.buffers import ring_io
-from rejeu.buffers.n_step import look_ahead
 from rejeu.buffers.prioritized import Draw, Priorities
-from rejeu.buffers.ring import TERMINATED, Ring, Rows
+from rejeu.buffers.ring import LAST, TERMINATED, Ring, Rows
 from rejeu.core import Transition
 
 
 class BaseReplayBuffer(ABC):
     """Stores steps in a :class:`Ring`; subclasses define how batches are drawn from it."""
+
+    achieved = desired = 0
+    """Indices of the leaves of the two goals, where there are some."""
 
     def __init__(
         self,
@@ -31,8 +38,6 @@ class BaseReplayBuffer(ABC):
         """Takes a ring; with ``each_reward``, transitions of several steps have :attr:`Transition.rewards`."""
         self.ring, self.gamma, self.n_steps, self.priorities = ring, gamma, n_steps, priorities
         self.each_reward = each_reward and n_steps > 1
-        self.discounts = bootstrap_discount(gamma, 1, np.arange(3) == TERMINATED)
-        """Discounts of single steps, by the kind of their row, ``float32 (3,)``."""
 
     @abstractmethod
     def draw(
@@ -82,6 +87,40 @@ class BaseReplayBuffer(ABC):
             return self.ring.draw(rng, n), None, None
         return self.priorities.draw(rng, n, progress)
 
+    def batch(
+        self,
+        shape: tuple[int, ...],
+        rows: Rows,
+        read: tuple[np.ndarray, list[np.ndarray]],
+        weight: np.ndarray | None,
+        goals: NewGoals | None = None,
+    ) -> Transition:
+        """Returns the transitions of rows, in ``shape``.
+
+        Args:
+            shape: the last axis is one batch, whose weights are divided by the largest of them.
+            rows: ``(n,)``.
+            read: what :meth:`Ring.read` returned for them.
+            weight: their importance weights, or None.
+            goals: the new goals of some of them, or None.
+        """
+        ring, (step, obs) = self.ring, read
+        rewards, steps, terminated = outcome(np, ring, ring.index, rows, self.n_steps, goals)
+        _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
+        if goals is not None:
+            for leaves in (obs, next_obs):
+                leaves[self.desired][goals.which] = goals.goal
+        reward, discount = rewards, bootstrap_discount(self.gamma, steps, terminated)
+        powers = self.gamma ** np.arange(self.n_steps)
+        if self.n_steps > 1:
+            reward = (rewards @ powers).astype(np.float32)
+        each = (rewards * powers).astype(np.float32) if self.each_reward else None
+        flat = Transition(ring.tree(obs), step["action"], reward, ring.tree(next_obs), discount, weight, each)
+        shaped = flat if len(shape) == 1 else jax.tree.map(lambda array: array.reshape(shape + array.shape[1:]), flat)
+        if weight is not None:
+            return shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
+        return shaped
+
     def update_priorities(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
         """Sets priorities by pairs of a :class:`Draw` and the absolute TD errors of its batch."""
         if self.priorities is not None:
@@ -106,50 +145,105 @@ class ReplayBuffer(BaseReplayBuffer):
     ) -> tuple[Transition, Draw | None]:
         """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`."""
         rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
-        step, obs = self.ring.read(rows.position)
-        steps: int | np.ndarray = 1
-        rewards = None
-        if self.n_steps == 1:
-            reward, discount = step["reward"], self.discounts.take(rows.kind)
-        else:
-            window = look_ahead(np, self.ring, self.ring.index, rows, self.n_steps)
-            rewards = np.where(window.valid, self.ring.reward[window.position], np.float32(0.0))
-            reward, steps = discounted_sum(rewards, self.gamma), window.valid.sum(axis=1)
-            discount = bootstrap_discount(self.gamma, steps, window.terminal.any(axis=1))
-        _, next_obs = self.ring.read(self.ring.index(rows.env, rows.time + steps))
-        rewards = discounted(rewards, self.gamma) if self.each_reward and rewards is not None else None
-        return batch(self.ring, shape, step, obs, reward, next_obs, discount, weight, rewards), drawn
-
-
-def batch(
-    ring: Ring,
-    shape: tuple[int, ...],
-    step: np.ndarray,
-    obs: list[np.ndarray],
-    reward: np.ndarray,
-    next_obs: list[np.ndarray],
-    discount: np.ndarray,
-    weight: np.ndarray | None,
-    rewards: np.ndarray | None = None,
-) -> Transition:
-    """Returns transitions in ``shape`` from flat arrays and records; weights are divided by the largest of each batch."""
-    flat = Transition(ring.tree(obs), step["action"], reward, ring.tree(next_obs), discount, weight, rewards)
-    shaped = flat if len(shape) == 1 else jax.tree.map(lambda array: array.reshape(shape + array.shape[1:]), flat)
-    if weight is not None:
-        return shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
-    return shaped
-
-
-def discounted_sum(rewards: np.ndarray, gamma: float) -> np.ndarray:
-    """Returns ``sum_i gamma^i r_i`` of rewards ``(batch, n)``, ``float32 (batch,)``."""
-    return (rewards @ gamma ** np.arange(rewards.shape[1])).astype(np.float32)
-
-
-def discounted(rewards: np.ndarray, gamma: float) -> np.ndarray:
-    """Returns ``gamma^i r_i`` of rewards ``(batch, n)``, ``float32``."""
-    return (rewards * gamma ** np.arange(rewards.shape[1])).astype(np.float32)
+        return self.batch(shape, rows, self.ring.read(rows.position), weight), drawn
 
 
 def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
     """Returns ``gamma^steps``, and 0 where the MDP terminated, ``float32``."""
     return np.where(terminated, np.float32(0.0), np.asarray(gamma**steps, np.float32))
+
+
+class Window(NamedTuple):
+    """The steps that n-step returns sum, ``(batch, n)`` each."""
+
+    position: Any
+    """Positions in the ring of the n rows from the sampled one on."""
+    valid: Any
+    """Which of them belong to the return; the first always does."""
+    terminal: Any
+    """Which of these entered a terminal state."""
+
+
+def look_ahead(xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n: int) -> Window:
+    """Returns the up to ``n`` steps from each of ``rows`` to its episode's end or to the newest step."""
+    times = rows.time[:, None] + xp.arange(n)[None]
+    position = index(rows.env[:, None], times)
+    kind = ring.kind[position]
+    is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
+    continues = xp.cumprod(is_step & (kind != TERMINATED), axis=1).astype(bool)
+    valid = xp.concatenate([is_step[:, :1], is_step[:, 1:] & continues[:, :-1]], axis=1)
+    return Window(position, valid, (kind == TERMINATED) & valid)
+
+
+class NewGoals(NamedTuple):
+    """The goals that replace those of some transitions of a batch."""
+
+    which: Any
+    """Which transitions."""
+    goal: Any
+    """Their new goals, ``(n_goals, ...)``."""
+    achieved: int
+    """Index of the leaf of the achieved goal."""
+    reward: Callable[[Any, Any], Any]
+    """The reward of achieved and desired goals."""
+    terminated: Callable[[Any, Any], Any] | None
+    """Whether they end the episode; None if the steps keep their own flags."""
+
+
+class Outcome(NamedTuple):
+    """What transitions lead to."""
+
+    rewards: Any
+    """``(batch,)``; of n steps ``(batch, n)``, 0 after the last."""
+    steps: Any
+    """Number of steps to the next observation, ``(batch,)``, or 1 for all."""
+    terminated: Any
+    """Whether the MDP terminated, ``bool (batch,)``."""
+
+
+def outcome(
+    xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n_steps: int, goals: NewGoals | None = None
+) -> Outcome:
+    """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
+    if goals is not None and not len(goals.goal):
+        goals = None
+    if n_steps == 1:
+        rewards, terminated = ring.reward[rows.position], ring.kind[rows.position] == TERMINATED
+        if goals is not None:
+            reached = ring.obs[goals.achieved][index(rows.env[goals.which], rows.time[goals.which] + 1)]
+            rewards = replaced(rewards, goals.which, goals.reward(reached, goals.goal))
+            if goals.terminated is not None:
+                terminated = replaced(terminated, goals.which, goals.terminated(reached, goals.goal))
+        return Outcome(rewards, 1, terminated)
+    window = look_ahead(xp, ring, index, rows, n_steps)
+    rewards = ring.reward[window.position]
+    if goals is not None:
+        times = rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
+        reached = ring.obs[goals.achieved][index(rows.env[goals.which, None], times)]
+        rewards, window = with_new_goals(xp, rewards, window, reached, goals)
+    rewards = xp.where(window.valid, rewards, xp.float32(0))
+    return Outcome(rewards, window.valid.sum(axis=1), window.terminal.any(axis=1))
+
+
+def with_new_goals(xp: Any, rewards: Any, window: Window, reached: Any, goals: NewGoals) -> tuple[Any, Window]:
+    """Returns rewards ``(batch, n)`` and window of transitions some of which have new goals.
+
+    ``reached`` are the goals achieved by each of their steps, ``(n_goals, n, ...)``. Arrays of NumPy are mutated.
+    """
+    which, goal, valid, terminal, n = goals.which, goals.goal, window.valid, window.terminal, window.valid.shape[1]
+    reached, each = reached.reshape(-1, *goal.shape[1:]), xp.repeat(goal, n, axis=0)
+    rewards = replaced(rewards, which, goals.reward(reached, each).reshape(-1, n))
+    if goals.terminated is not None:
+        ends = goals.terminated(reached, each).astype(bool).reshape(-1, n) & valid[which]
+        goes_on = xp.cumsum(ends, axis=1)[:, :-1] == 0
+        valid = replaced(valid, (which, slice(1, None)), valid[which][:, 1:] & goes_on)
+        terminal = replaced(terminal, which, ends) & valid
+    return rewards, Window(window.position, valid, terminal)
+
+
+def replaced(array: Any, which: Any, values: Any) -> Any:
+    """Returns ``array`` with ``values`` at ``which``; an array of NumPy is mutated."""
+    if isinstance(array, np.ndarray):
+        array[which] = values
+        return array
+    return array.at[which].set(values.astype(array.dtype))

@@ -176,6 +176,8 @@ def match(expected: PyTree, found: Mapping[str, Any], path: str | Path) -> None:
     """
     import jax  # here and below, so that a policy in NumPy starts without it
 
+    from rejeu.core import names
+
     keys = names(expected)
     for key, leaf in zip(keys, jax.tree.leaves(expected), strict=True):
         if key not in found:
@@ -297,16 +299,11 @@ def require_finite(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
             )
 
 
-def names(tree: PyTree) -> list[str]:
-    """Returns the dotted path of each leaf of a tree, such as ``actor.torso.layers.0.weight``."""
-    from jax.tree_util import keystr, tree_leaves_with_path
-
-    return [keystr(path, simple=True, separator=".") for path, _ in tree_leaves_with_path(tree)]
-
-
 def tree_to_arrays(tree: PyTree) -> dict[str, np.ndarray]:
     """Returns the leaves of a tree by name, on the host."""
     import jax
+
+    from rejeu.core import names
 
     return dict(zip(names(tree), map(np.asarray, jax.tree.leaves(tree)), strict=True))
 
@@ -318,6 +315,8 @@ def arrays_to_tree(expected: PyTree, arrays: Mapping[str, np.ndarray], path: str
         CheckpointError: unless names, shapes and dtypes are the same, naming the first that is not.
     """
     import jax
+
+    from rejeu.core import names
 
     match(expected, arrays, path)
     return jax.tree.unflatten(jax.tree.structure(expected), [arrays[key] for key in names(expected)])

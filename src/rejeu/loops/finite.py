@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rejeu import spaces
+from rejeu import core, spaces
 from rejeu.core import Clock, Masked, Rollout, Transition
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
-from rejeu.loops.nonfinite import bad_leaves, checked
+from rejeu.loops.learner import bad_leaves, checked
 
 
 class Found(NamedTuple):
@@ -49,7 +49,7 @@ def load_batch(agent: Any, path: str | Path) -> tuple[Transition | Rollout, Cloc
     """
     with checkpoint.opened(path, "batch") as file:
         like, header = batch_like(agent, {*file.specs}), file.header
-        names = checkpoint.names(like)
+        names = core.names(like)
         if header.get("algorithm") != agent.name or {*names} != {*file.specs}:
             raise CheckpointError(f"{path} holds a batch of another kind of agent than this {agent.name}")
         arrays = file.read()

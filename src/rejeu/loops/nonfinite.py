@@ -4,26 +4,26 @@ Every compiled update reports, with its metrics, whether what it left is finite.
 turn later, when the loop waits for the device anyway. It keeps a copy of a state and the updates since, from which it
 recomputes the state before the first bad update. Large arrays are checked only in these copies, on the host: until then NaN
 in one of them shows in the loss of the next update. With ``nonfinite="skip"`` a bad update is undone on the device at once
-(:func:`undo`), and the monitor only counts. :func:`reported` saves the batch and returns the error that users see.
+(:func:`rejeu.loops.learner.undo`), and the monitor only counts. :func:`reported` saves the batch and returns the error that
+users see.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu.core import EXPLAINED_VARIANCE, TD_ERROR, Clock, Metrics, PyTree, Rollout, Transition
+from rejeu.core import Clock, Rollout, Transition
 from rejeu.errors import NonFiniteError
 from rejeu.io import checkpoint
-from rejeu.loops.packing import PackedState, Readings
+from rejeu.loops.learner import PackedState, Readings, bad_leaves, checked
 
 MAX_CALLS = 64
 """Largest number of calls after which the state is copied again."""
@@ -31,75 +31,8 @@ MAX_BYTES = 32 * 2**20
 """Number of bytes of batches after which the state is copied again."""
 MAX_SKIPPED = 100
 """Number of successive skipped updates after which training stops, because nothing is learned."""
-FINITE = "finite"
-"""Name among the metrics for whether a gradient step was kept, where bad ones are undone."""
 PREFIX = "nonfinite_batch_"
 """Beginning of the names of files with batches of bad updates."""
-WIDTH, FEW = 16, 256
-"""Parts of a vector that are added up, and the size up to which a vector is left as it is; see :func:`check`."""
-
-
-def check(arrays: Iterable[Array], metrics: Metrics) -> Array:
-    """Returns whether all numbers of a state and its metrics are finite, ``bool[]``; used inside compiled code."""
-    vectors = [array.reshape(-1) for array in (*arrays, *checked(metrics).values())]
-    floats = [_folded(vector).astype(jnp.float32) for vector in vectors if jnp.issubdtype(vector.dtype, jnp.floating)]
-    if not floats:
-        return jnp.bool(True)
-    return jnp.isfinite(jnp.sum(_folded(jnp.concatenate(floats)) * jnp.float32(0)))  # 0 * x is NaN unless x is finite
-
-
-def checked(metrics: Metrics) -> Metrics:
-    """Returns the metrics that must be finite.
-
-    TD errors are left out, which priorities ignore if they are NaN, and so is the explained variance, which is undefined
-    if all returns are equal.
-    """
-    return {name: value for name, value in metrics.items() if name not in (TD_ERROR, EXPLAINED_VARIANCE)}
-
-
-def _folded(x: Array) -> Array:
-    """Returns a sixteenth as many numbers, one of which is NaN unless all of ``x`` are finite; short vectors unchanged.
-
-    XLA on a CPU sums a single vector number by number. Adding up sixteen parts of it is several times faster.
-    """
-    if x.size <= FEW:
-        return x
-    n, zero = -(-x.size // WIDTH), jnp.zeros((), x.dtype)
-    begins = [min(i * n, x.size - n) for i in range(WIDTH)]  # the last parts overlap
-    return sum((x[begin : begin + n] * zero for begin in begins), jnp.zeros(n, x.dtype))
-
-
-def undo(before: PyTree, after: PyTree, metrics: Metrics) -> tuple[PyTree, Metrics]:
-    """Returns the state ``after`` an update, or the one ``before`` it unless the update left finite numbers.
-
-    The metrics then say so, and TD errors are NaN, which leaves priorities unchanged. Used inside compiled code.
-    """
-    finite = check(jax.tree.leaves(after), metrics)
-    if TD_ERROR in metrics:
-        metrics = metrics | {TD_ERROR: jnp.where(finite, metrics[TD_ERROR], jnp.nan)}
-    return jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before), metrics | {FINITE: finite}
-
-
-def readings(state: Iterable[Array], metrics: Metrics) -> Readings:
-    """Returns the means of metrics over gradient steps, and how many of these were bad; used inside compiled code.
-
-    ``state`` are the arrays to be checked.
-    """
-    if FINITE not in metrics:  # one bad step spoils all that follow
-        return Readings.of({name: jnp.mean(value) for name, value in metrics.items()}, ~check(state, metrics))
-    finite = metrics.pop(FINITE)
-    means = {name: jnp.mean(value, where=finite) for name, value in metrics.items()}
-    return Readings.of(means, jnp.sum(~finite))
-
-
-def bad_leaves(tree: PyTree) -> list[str]:
-    """Returns the dotted names of the leaves that hold NaN or infinity, each with the first such number."""
-    found = []
-    for name, leaf in zip(checkpoint.names(tree), jax.tree.leaves(tree), strict=True):
-        array = np.asarray(leaf)
-        if array.dtype.kind == "f" and not (ok := np.isfinite(array)).all():
-            found.append(f"{name} ({array[~ok].ravel()[0]})")
-    return found
 
 
 class NonFiniteUpdate(Exception):

@@ -19,9 +19,8 @@ from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree
 from rejeu.envs import seeds
 from rejeu.envs.base import Step, VectorEnv
-from rejeu.loops.learner import Learner, is_finite
+from rejeu.loops.learner import Learner, PackedState, is_finite
 from rejeu.loops.nonfinite import NonFiniteMonitor
-from rejeu.loops.packing import PackedState
 
 PARTS = ("env", "replay", "update")
 """Stepping environments; storing and sampling; waiting for the device."""

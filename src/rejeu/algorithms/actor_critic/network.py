@@ -181,6 +181,21 @@ class ActorCritic(eqx.Module):
         return MultiCategorical(tuple(Categorical(part) for part in jnp.split(outputs, ends, axis=-1)))
 
 
+def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
+    """Returns actions sampled from the policy; for :class:`rejeu.core.Algorithm`, as are the next two."""
+    return actor.policy(obs).sample(key)
+
+
+def exploit(actor: ActorCritic, obs: PyTree) -> Array:
+    """Returns the likeliest actions."""
+    return actor.policy(obs).mode()
+
+
+def state_value(carry: PyTree, actor: ActorCritic, obs: PyTree, ended: Array) -> Array:
+    """Returns the values of observations, ``(batch,)``."""
+    return actor.value(obs)
+
+
 def unmasked(obs: PyTree) -> tuple[PyTree, Array | None]:
     """Returns an observation and its mask, None where it has none."""
     return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)

@@ -21,6 +21,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import device_priorities
 from rejeu.buffers.device import DeviceReplay, DeviceRing, DeviceRows, download, uploaded
 from rejeu.buffers.device_priorities import Pending, noted
+from rejeu.buffers.hindsight import HerReplayBuffer
 from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree, Transition
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
@@ -221,15 +222,10 @@ def most_updates(config: OffPolicyConfig, n_envs: int) -> int | None:
 
 def replay_of(run: Run, config: OffPolicyConfig) -> DeviceReplay:
     """Returns how batches are drawn on the device from the replay buffer of a run."""
-    buffer, hindsight = run.buffer, config.hindsight
-    ring = buffer.ring
-    paths = [leaf.path for leaf in ring.obs_leaves]
-    goals: dict[str, Any] = {} if hindsight is None else {
-        "strategy": hindsight.goal_selection_strategy,
-        "n_sampled_goal": hindsight.n_sampled_goal,
-        "achieved": paths.index("achieved_goal"),
-        "desired": paths.index("desired_goal"),
-    }  # fmt: skip
+    buffer, ring, goals = run.buffer, run.buffer.ring, dict[str, Any]()
+    if isinstance(buffer, HerReplayBuffer):
+        hindsight, leaves = buffer.config, {"achieved": buffer.achieved, "desired": buffer.desired}
+        goals = {"strategy": hindsight.goal_selection_strategy, "n_sampled_goal": hindsight.n_sampled_goal, **leaves}
     return DeviceReplay(
         ring.rows,
         ring.n_envs,

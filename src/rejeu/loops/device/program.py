@@ -34,9 +34,8 @@ from rejeu.core import (
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
 from rejeu.envs.masks import FunctionalMask, masked
-from rejeu.loops import nonfinite
-from rejeu.loops.learner import td_error_of
-from rejeu.loops.packing import Packing
+from rejeu.loops.learner import FINITE, Packing, check, td_error_of, undo
+from rejeu.loops.nonfinite import MAX_SKIPPED
 from rejeu.loops.run import Run
 from rejeu.prng import below
 
@@ -239,7 +238,7 @@ class Program(ABC):
         program = self.with_hyperparameters(carry.hyper)
         first_episode = carry.episodes.n_finished
         state, carry = program.packing.unpack(carry.state), carry._replace(state=None)
-        action = program.no_action(carry, experience)
+        action = experience.action[0] if carry.action is None else carry.action  # of its shape
         loop = Loop(
             carry,
             experience,
@@ -255,15 +254,11 @@ class Program(ABC):
 
         loop = program.turns(env, loop, limits, may_go_on)
         learned = loop.learned
-        is_finite = nonfinite.check(jax.tree.leaves(learned.state), {})
+        is_finite = check(jax.tree.leaves(learned.state), {})
         counted = learned.metrics, learned.n_updates, learned.n_bad
         report = Report(*counted, is_finite, loop.nonfinite_env, loop.result, loop.log)
         carry = loop.carry._replace(state=program.packing.pack(learned.state), in_a_row=learned.in_a_row)
         return carry, loop.experience, report
-
-    def no_action(self, carry: Carry, experience: Any) -> Array:
-        """Returns an array of the shape of actions."""
-        return experience.action[0] if carry.action is None else carry.action
 
     def with_hyperparameters(self, hyper: dict[str, Array]) -> Any:
         """Returns the program for the hyperparameters ``float32[]`` of one run."""
@@ -294,12 +289,12 @@ class Program(ABC):
         found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
         n = found[GRADIENT_STEPS].astype(jnp.int32) if GRADIENT_STEPS in found else 1
         if self.skips:
-            after, found = nonfinite.undo(learned.state, after, found)
-            is_bad = ~found.pop(nonfinite.FINITE)
+            after, found = undo(learned.state, after, found)
+            is_bad = ~found.pop(FINITE)
             td_error = None if td_error is None else jnp.where(is_bad, jnp.nan, td_error)
         else:
-            is_bad = ~nonfinite.check((), found)
-        is_over = learned.in_a_row >= nonfinite.MAX_SKIPPED  # the turns after it, in the same chunk, do not count
+            is_bad = ~check((), found)
+        is_over = learned.in_a_row >= MAX_SKIPPED  # the turns after it, in the same chunk, do not count
         in_a_row = jnp.where(is_bad | is_over, learned.in_a_row + ~is_over, 0)
         return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from rejeu.loops import packing
-from rejeu.loops.packing import Packing, Readings
+from rejeu.loops import learner
+from rejeu.loops.learner import Packing, Readings
 
 DTYPES = ("float32", "int32", "uint32", "uint8", "bool")
 SHAPES = ((), (1,), (3,), (2, 3), (0, 2), (4, 1, 2), (5, 7))
@@ -31,10 +31,10 @@ def assert_same(one, two):
         np.testing.assert_array_equal(a, b)
 
 
-@given(trees(), st.sampled_from([3, 10, packing.LARGE]))
+@given(trees(), st.sampled_from([3, 10, learner.LARGE]))
 def test_unpacking_gives_the_tree_back(tree, large):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(packing, "LARGE", large)
+        patch.setattr(learner, "LARGE", large)
         plan = Packing(tree)
     on_host = plan.pack(tree, np.concatenate)
     on_device = plan.pack(jax.tree.map(jnp.asarray, tree))
