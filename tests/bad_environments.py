@@ -7,6 +7,7 @@ training.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -41,137 +42,71 @@ class Good(gym.Env):
         return self.time >= 3
 
 
-class FloatAsImage(Good):
-    observation_space = spaces.Box(0, 255, (2, 2, 3), np.uint8)
-
-    def observe(self):
-        return np.full((2, 2, 3), 0.5 if self.late else 0.0)
+def seeing(name: str, seen: Callable[[Good], Any], space: spaces.Space = Good.observation_space) -> type[Good]:
+    """Returns an environment of ``space`` whose observations are ``seen(env)``."""
+    return type(name, (Good,), {"observe": seen, "observation_space": space, "__module__": __name__})
 
 
-class Double(Good):
-    def observe(self):
-        return super().observe().astype(np.float64)
+def later(name: str, bad: Any) -> type[Good]:
+    """Returns an environment that is observed as ``bad`` from the third step on."""
+    return seeing(name, lambda env: bad if env.late else Good.observe(env))
 
 
-class AsList(Good):
-    def observe(self):
-        return super().observe().tolist()
+PAIR = spaces.Box(-1, 1, (2,), np.float32)
+FloatAsImage = seeing(
+    "FloatAsImage", lambda env: np.full((2, 2, 3), 0.5 if env.late else 0.0), spaces.Box(0, 255, (2, 2, 3), np.uint8)
+)
+Double = seeing("Double", lambda env: Good.observe(env).astype(np.float64))
+AsList = seeing("AsList", lambda env: Good.observe(env).tolist())
+Scalar = later("Scalar", np.float32(1.0))  # which NumPy would broadcast to all three elements
+TooLong = later("TooLong", np.zeros(4, np.float32))
+NothingSeen = later("NothingSeen", None)
+NanSeen = later("NanSeen", np.array([0.0, np.nan, 0.0], np.float32))
+NestedShape = seeing(
+    "NestedShape",
+    lambda env: {"arm": {"angles": np.zeros(3 if env.late else 2, np.float32)}, "step": env.time},
+    spaces.Dict({"arm": spaces.Dict({"angles": PAIR}), "step": spaces.Discrete(11)}),
+)
+TupleShape = seeing(
+    "TupleShape",
+    lambda env: (np.zeros(2, np.float32), np.zeros(2, int) if env.late else 1),
+    spaces.Tuple([PAIR, spaces.Discrete(11)]),
+)
+MissingKey = seeing(
+    "MissingKey",
+    lambda env: {key: np.zeros(2, np.float32) for key in ("left", "right")[: 1 if env.late else 2]},
+    spaces.Dict({"left": PAIR, "right": PAIR}),
+)
+OutOfBounds = seeing(
+    "OutOfBounds",
+    lambda env: {"speed": np.array([0.0, 7.5 if env.late else 0.0], np.float32)},
+    spaces.Dict({"speed": PAIR}),
+)
 
 
-class Scalar(Good):
-    """One number, which NumPy would broadcast to all three elements."""
+def answering(name: str, answer: Callable[..., tuple]) -> type[Good]:
+    """Returns an environment whose steps return ``answer(obs, reward, terminated, truncated, info)`` from the third on."""
 
-    def observe(self):
-        return np.float32(1.0) if self.late else super().observe()
+    def step(self: Good, action: Any) -> Any:
+        given = Good.step(self, action)
+        return answer(*given) if self.late else given
 
-
-class TooLong(Good):
-    def observe(self):
-        return np.zeros(4, np.float32) if self.late else super().observe()
+    return type(name, (Good,), {"step": step, "__module__": __name__})
 
 
-class NestedShape(Good):
-    observation_space = spaces.Dict(
-        {"arm": spaces.Dict({"angles": spaces.Box(-1, 1, (2,), np.float32)}), "step": spaces.Discrete(11)}
-    )
-
-    def observe(self):
-        return {"arm": {"angles": np.zeros(3 if self.late else 2, np.float32)}, "step": self.time}
-
-
-class TupleShape(Good):
-    observation_space = spaces.Tuple([spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(11)])
-
-    def observe(self):
-        return np.zeros(2, np.float32), np.zeros(2, int) if self.late else 1
-
-
-class MissingKey(Good):
-    observation_space = spaces.Dict({key: spaces.Box(-1, 1, (2,), np.float32) for key in ("left", "right")})
-
-    def observe(self):
-        left = {"left": np.zeros(2, np.float32)}
-        return left if self.late else {**left, "right": np.zeros(2, np.float32)}
-
-
-class NothingSeen(Good):
-    def observe(self):
-        return None if self.late else super().observe()
-
-
-class NanSeen(Good):
-    def observe(self):
-        return np.array([0.0, np.nan, 0.0], np.float32) if self.late else super().observe()
-
-
-class OutOfBounds(Good):
-    observation_space = spaces.Dict({"speed": spaces.Box(-1.0, 1.0, (2,), np.float32)})
-
-    def observe(self):
-        return {"speed": np.array([0.0, 7.5 if self.late else 0.0], np.float32)}
-
-
-class Answering(Good):
-    """Modifies the result of ``step`` with :meth:`answer` from the third step on."""
-
-    def step(self, action):
-        answer = super().step(action)
-        return self.answer(*answer) if self.late else answer
-
-    def answer(self, obs, reward, terminated, truncated, info):
-        raise NotImplementedError
-
-
-class FourValues(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, reward, terminated or truncated, info
-
-
-class NoReward(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, None, terminated, truncated, info
-
-
-class NanReward(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, float("nan"), terminated, truncated, info
-
-
-class RewardArray(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, np.array([reward, reward]), terminated, truncated, info
-
-
-class RewardOfOne(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, np.array([reward]), terminated, truncated, info
-
-
-class RewardText(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, str(reward), terminated, truncated, info
-
-
-class TerminatedNone(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, reward, None, truncated, info
-
-
-class TruncatedText(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, reward, terminated, "no", info
-
-
-class TerminatedInfo(Answering):
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, reward, truncated, info, {}
-
-
-class Zeros(Answering):
-    """Returns 0 and 1 as flags."""
-
-    def answer(self, obs, reward, terminated, truncated, info):
-        return obs, reward, int(terminated), np.float32(truncated), info
+FourValues = answering("FourValues", lambda obs, reward, ended, cut, info: (obs, reward, ended or cut, info))
+NoReward = answering("NoReward", lambda obs, reward, *rest: (obs, None, *rest))
+NanReward = answering("NanReward", lambda obs, reward, *rest: (obs, float("nan"), *rest))
+HugeReward = answering("HugeReward", lambda obs, reward, *rest: (obs, 1e300, *rest))
+EndlessReward = answering("EndlessReward", lambda obs, reward, *rest: (obs, 10**400, *rest))
+RewardArray = answering("RewardArray", lambda obs, reward, *rest: (obs, np.array([reward, reward]), *rest))
+RewardOfOne = answering("RewardOfOne", lambda obs, reward, *rest: (obs, np.array([reward]), *rest))
+RewardText = answering("RewardText", lambda obs, reward, *rest: (obs, str(reward), *rest))
+TerminatedNone = answering("TerminatedNone", lambda obs, reward, ended, *rest: (obs, reward, None, *rest))
+TruncatedText = answering("TruncatedText", lambda obs, reward, ended, cut, info: (obs, reward, ended, "no", info))
+TerminatedInfo = answering("TerminatedInfo", lambda obs, reward, ended, cut, info: (obs, reward, cut, info, {}))
+Zeros = answering("Zeros", lambda obs, reward, ended, cut, info: (obs, reward, int(ended), np.float32(cut), info))
+NoInfo = answering("NoInfo", lambda *given: (*given[:4], None))
 
 
 class OnlyObservation(Good):
@@ -228,23 +163,6 @@ class SameArray(Good):
     def observe(self):
         self.__dict__.setdefault("array", np.zeros(3, np.float32))[:] = super().observe()
         return self.array
-
-
-class HugeReward(Good):
-    def step(self, action):
-        obs, reward, *rest = super().step(action)
-        return obs, 1e300 if self.late else reward, *rest
-
-
-class EndlessReward(Good):
-    def step(self, action):
-        obs, reward, *rest = super().step(action)
-        return obs, 10**400 if self.late else reward, *rest
-
-
-class NoInfo(Good):
-    def step(self, action):
-        return *super().step(action)[:4], None if self.late else {}
 
 
 class Line(Reach):

@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import rejeu
@@ -57,17 +55,3 @@ def same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> bool:
     """Returns whether all parameters are equal, bit for bit."""
     first, second = one.get_parameters(), two.get_parameters()
     return all(np.array_equal(value, second[name]) for name, value in first.items())
-
-
-def q_values(agent: rejeu.SAC, obs: Any, action: Any) -> np.ndarray:
-    """Returns the mean of the critics' values of each row, ``(n,)``."""
-    critics = agent.state.critics
-    values = [
-        np.asarray(_member(critics, i)(jnp.asarray(obs, jnp.float32), jnp.asarray(action, jnp.float32)))[:, 0]
-        for i in range(2)
-    ]
-    return np.mean(values, axis=0)
-
-
-def _member(critics: Any, i: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[i], critics)

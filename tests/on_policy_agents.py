@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import pytest
 
 import rejeu
 from rejeu import agents
 from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Bitwise, Discretely, Doubly, Probe
 from tests.sharing import shared_learners
+from tests.tiers import only
 
 
 class Kind(NamedTuple):
@@ -64,6 +66,8 @@ ALGORITHMS = {
 ACTIONS = {"Box": None, "Discrete": Discretely, "MultiDiscrete": Doubly, "MultiBinary": Bitwise}
 NARROW = {"policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}}
 """A Box policy with a smaller initial standard deviation converges sooner."""
+SAMPLE = ("PPO, Box", "PPO, MultiDiscrete", "A2C, Discrete", "A2C, MultiBinary", "PQN, Discrete")
+"""Every algorithm and every kind of actions, which run by default; the other kinds are exhaustive."""
 
 KINDS = {
     f"{name}, {actions}": Kind(name, wrapper, settings | (NARROW if wrapper is None else {}))
@@ -71,3 +75,4 @@ KINDS = {
     for actions, wrapper in ACTIONS.items()
     if name != "PQN" or actions == "Discrete"
 }
+every_kind = pytest.mark.parametrize("kind", only([KINDS[name] for name in SAMPLE], KINDS.values()), ids=KINDS)

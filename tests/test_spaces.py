@@ -85,61 +85,33 @@ def test_plain_takes_values_by_key_not_by_place():
     assert jax.tree.leaves(spaces.plain(space, given)) == [1, 2, 3]
 
 
-def test_plain_misses_a_key_that_is_not_there():
-    with pytest.raises(KeyError, match="b"):
-        spaces.plain(gym_spaces.Dict({"a": BOX, "b": BOX}), {"a": 1})
-
-
-def test_a_space_without_fixed_size_is_refused_with_its_place():
-    with pytest.raises(TypeError, match=r"observation space at 'deep\.text' is Text.*expected Box, Discrete"):
-        spaces.leaves(gym_spaces.Dict({"deep": gym_spaces.Dict({"text": gym_spaces.Text(5)})}))
-
-
 # Actions.
 
 ASYMMETRIC = gym_spaces.Box(np.float32([-1.0, 0.0, -3.0]), np.float32([3.0, 0.5, -1.0]))
 
 
-@pytest.mark.parametrize("space", [gym_spaces.Dict(), gym_spaces.Tuple([gym_spaces.Discrete(2), gym_spaces.Dict()])])
-def test_a_space_that_holds_nothing_is_refused(space):
-    with pytest.raises(TypeError, match="which holds nothing"):
-        spaces.leaves(space)
+BIG = np.finfo(np.float32).max
 
 
-@pytest.mark.parametrize("check", [spaces.check_box_action, spaces.check_action])
-def test_actions_without_a_component_are_refused(check):
-    with pytest.raises(ValueError, match="has no component, so there is nothing to choose"):
-        check(gym_spaces.Box(-1.0, 1.0, (0,)), "SAC")
-
-
-def test_the_ends_of_the_range_become_the_bounds_exactly():
-    ends = np.array([[-1.0] * 3, [1.0] * 3, [0.0] * 3], np.float32)
-    np.testing.assert_array_equal(
-        spaces.scale_action(ASYMMETRIC, ends), [ASYMMETRIC.low, ASYMMETRIC.high, [1.0, 0.25, -2.0]]
-    )
+@pytest.mark.parametrize(
+    ("space", "action", "scaled"),
+    [
+        (ASYMMETRIC, [[-1.0] * 3, [1.0] * 3, [0.0] * 3], [ASYMMETRIC.low, ASYMMETRIC.high, [1.0, 0.25, -2.0]]),
+        (gym_spaces.Box(-2.0, 2.0, (2, 3), np.float64), np.zeros((4, 6)), np.zeros((4, 2, 3))),
+        (gym_spaces.Box(-BIG, BIG, (1,), np.float32), [[-1.0], [1.0]], [[-BIG], [BIG]]),
+        (gym_spaces.Discrete(3, start=4), np.array([0, 2], np.int32), [4, 6]),
+    ],
+)
+def test_the_ends_of_the_range_become_the_bounds_exactly_in_the_shape_and_dtype_of_the_space(space, action, scaled):
+    found = spaces.scale_action(space, np.asarray(action, None if space.shape == () else np.float32))
+    assert found.dtype == space.dtype
+    np.testing.assert_array_equal(found, scaled)
 
 
 def test_scaled_actions_never_leave_bounds_that_float32_rounds():
     space = gym_spaces.Box(np.float32(-0.1), np.float32(0.3), (1,), np.float32)
     action = np.linspace(-1.0, 1.0, 1001, dtype=np.float32)[:, None]
     assert all(space.contains(a) for a in spaces.scale_action(space, action))
-
-
-def test_scaled_actions_have_the_shape_and_dtype_of_the_space():
-    space = gym_spaces.Box(-2.0, 2.0, (2, 3), np.float64)
-    scaled = spaces.scale_action(space, np.zeros((4, 6), np.float32))
-    assert (scaled.shape, scaled.dtype) == ((4, 2, 3), np.float64)
-
-
-def test_bounds_as_wide_as_float32_itself_do_not_overflow():
-    big = np.finfo(np.float32).max
-    space = gym_spaces.Box(-big, big, (1,), np.float32)
-    np.testing.assert_array_equal(spaces.scale_action(space, np.array([[-1.0], [1.0]], np.float32)), [[-big], [big]])
-
-
-def test_discrete_actions_are_counted_from_the_start_of_the_space():
-    scaled = spaces.scale_action(gym_spaces.Discrete(3, start=4), np.array([0, 2], np.int32))
-    np.testing.assert_array_equal(scaled, [4, 6])
 
 
 def test_random_actions_fill_the_range_of_the_algorithm():
@@ -150,46 +122,6 @@ def test_random_actions_fill_the_range_of_the_algorithm():
     assert (action.max(axis=0) > 0.99).all()
     discrete = spaces.random_action(gym_spaces.Discrete(3, start=4), 100, np.random.default_rng(0))
     assert set(discrete.tolist()) == {0, 1, 2}
-
-
-@pytest.mark.parametrize(
-    ("space", "words"),
-    [
-        (gym_spaces.Discrete(2), r"SAC needs a Box action space, got Discrete\(2\); .* use DQN"),
-        (gym_spaces.MultiDiscrete([2, 2]), "SAC needs a Box action space, .*ActionWrapper"),
-        (gym_spaces.Box(-np.inf, np.inf, (1,)), "SAC needs finite action bounds, .*RescaleAction"),
-        (gym_spaces.Box(np.float32([0.0, 1.0]), np.float32([1.0, 1.0])), "every action bound must satisfy low < high"),
-    ],
-)
-def test_an_action_space_that_does_not_fit_is_refused(space, words):
-    with pytest.raises(ValueError, match=words):
-        spaces.check_box_action(space, "SAC")
-
-
-# Goal environments.
-
-
-def test_a_goal_space_passes():
-    spaces.check_goal_space(GOAL_OBSERVATION)
-
-
-def test_a_missing_goal_is_named():
-    space = gym_spaces.Dict(dict.fromkeys(("observation", "achieved_goal"), BOX))
-    with pytest.raises(
-        ValueError, match=r"desired_goal is missing from a Dict with the keys .*replay_buffer_class=None"
-    ):
-        spaces.check_goal_space(space)
-
-
-def test_a_space_that_is_no_dict_is_named():
-    with pytest.raises(ValueError, match=r"observation, achieved_goal, desired_goal is missing from Box"):
-        spaces.check_goal_space(BOX)
-
-
-def test_goals_of_different_shape_are_refused():
-    parts = dict(GOAL_OBSERVATION.spaces) | {"desired_goal": gym_spaces.Box(-np.inf, np.inf, (3,), np.float32)}
-    with pytest.raises(ValueError, match="must be the same space"):
-        spaces.check_goal_space(gym_spaces.Dict(parts))
 
 
 # Descriptions in files.
@@ -239,6 +171,43 @@ def test_bounds_of_a_box_survive_exactly():
 def test_a_damaged_description_is_refused(description):
     with pytest.raises(ValueError, match="not the description of a space"):
         spaces.rebuild(description)
+
+
+GOALS = dict(GOAL_OBSERVATION.spaces)
+
+
+@pytest.mark.parametrize(
+    ("check", "space", "error", "words"),
+    [
+        (spaces.leaves, gym_spaces.Dict({"deep": gym_spaces.Dict({"text": gym_spaces.Text(5)})}), TypeError,
+         r"observation space at 'deep\.text' is Text.*expected Box, Discrete"),
+        (spaces.leaves, gym_spaces.Dict(), TypeError, "which holds nothing"),
+        (spaces.leaves, gym_spaces.Tuple([gym_spaces.Discrete(2), gym_spaces.Dict()]), TypeError, "which holds nothing"),
+        (spaces.check_action, gym_spaces.Box(-1.0, 1.0, (0,)), ValueError, "has no component, so there is nothing to"),
+        (spaces.check_box_action, gym_spaces.Box(-1.0, 1.0, (0,)), ValueError, "has no component, so there is nothing"),
+        (spaces.check_box_action, gym_spaces.Discrete(2), ValueError,
+         r"SAC needs a Box action space, got Discrete\(2\); .* use DQN"),
+        (spaces.check_box_action, gym_spaces.MultiDiscrete([2, 2]), ValueError, "needs a Box action space, .*ActionWra"),
+        (spaces.check_box_action, gym_spaces.Box(-np.inf, np.inf, (1,)), ValueError,
+         "SAC needs finite action bounds, .*RescaleAction"),
+        (spaces.check_box_action, gym_spaces.Box(np.float32([0.0, 1.0]), np.float32([1.0, 1.0])), ValueError,
+         "every action bound must satisfy low < high"),
+        (spaces.check_goal_space, gym_spaces.Dict({key: GOALS[key] for key in ("observation", "achieved_goal")}),
+         ValueError, r"desired_goal is missing from a Dict with the keys .*replay_buffer_class=None"),
+        (spaces.check_goal_space, BOX, ValueError, "observation, achieved_goal, desired_goal is missing from Box"),
+        (spaces.check_goal_space, gym_spaces.Dict(GOALS | {"desired_goal": gym_spaces.Box(-1.0, 1.0, (3,))}),
+         ValueError, "must be the same space"),
+    ],
+)  # fmt: skip
+def test_a_space_that_does_not_fit_is_refused(check, space, error, words):
+    with pytest.raises(error, match=words):
+        check(space, *(["SAC"] if check in (spaces.check_action, spaces.check_box_action) else []))
+
+
+def test_what_fits_passes_and_a_missing_key_does_not():
+    spaces.check_goal_space(GOAL_OBSERVATION)
+    with pytest.raises(KeyError, match="b"):
+        spaces.plain(gym_spaces.Dict({"a": BOX, "b": BOX}), {"a": 1})
 
 
 def test_observation_bounds_do_not_tell_spaces_apart_and_action_bounds_do():

@@ -231,9 +231,11 @@ def test_no_rows_may_be_left_out(which, tmp_path):
         rejeu.SAC.resume(tmp_path)
 
 
-def test_there_must_be_a_checkpoint(tmp_path):
+def test_there_must_be_a_checkpoint_and_an_agent_from_it(tmp_path):
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         rejeu.SAC.resume(tmp_path)
+    with pytest.raises(ValueError, match=r"or an agent from resume\(\)"):
+        small_sac(BALL).learn()
 
 
 def test_the_algorithm_and_the_number_of_environments_must_be_the_same(tmp_path):
@@ -253,17 +255,14 @@ def test_an_environment_that_was_given_must_be_given_again(tmp_path):
     assert rejeu.SAC.resume(tmp_path, gym.make("Pendulum-v1")).resumed.exact
 
 
-def test_a_complete_run_needs_a_new_limit(tmp_path):
+def test_a_complete_run_needs_a_new_limit_and_its_folder_takes_no_other_run(tmp_path):
     small_sac(BALL).learn(30, Checkpoint(tmp_path, every=10))
     agent = rejeu.SAC.resume(tmp_path)
     with pytest.raises(ValueError, match="the run is complete"):
         agent.learn()
-    assert agent.learn(10, reset_num_timesteps=False).num_timesteps == 40
-
-
-def test_an_agent_that_was_not_resumed_has_nothing_to_go_on_with():
-    with pytest.raises(ValueError, match=r"or an agent from resume\(\)"):
-        small_sac(BALL).learn()
+    assert agent.learn(10, Checkpoint(tmp_path, every=10), reset_num_timesteps=False).num_timesteps == 40
+    with pytest.raises(FileExistsError, match="another run"):
+        small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
 
 
 def test_the_first_checkpoint_is_there_before_the_first_step(tmp_path):
@@ -279,10 +278,11 @@ def test_the_first_checkpoint_is_there_before_the_first_step(tmp_path):
     assert_same(facts(again.learn()), facts(whole))
 
 
-def test_where_the_state_cannot_be_carried_new_episodes_begin_and_a_warning_says_so(tmp_path):
-    class Hidden(gym.Wrapper):
-        """Might remember anything."""
+class Hidden(gym.Wrapper):
+    """Might remember anything."""
 
+
+def test_where_the_state_cannot_be_carried_new_episodes_begin_and_a_warning_says_so(tmp_path):
     env = lambda: Hidden(gym.make("Pendulum-v1"))  # noqa: E731
     cut_off = cut_run(tmp_path, env=env())
     with pytest.warns(UserWarning, match="at the start of new episodes: the state of Pendulum-v1 .* cannot be carried"):
@@ -310,9 +310,6 @@ def test_the_number_of_threads_is_saved_and_a_resumed_run_says_if_it_has_another
 
 
 def test_a_rollout_keeps_the_steps_of_the_episodes_that_cannot_go_on(tmp_path):
-    class Hidden(gym.Wrapper):
-        """Might remember anything."""
-
     env = lambda: Hidden(gym.make("CartPole-v1"))  # noqa: E731
     make = lambda: rejeu.PPO("MlpPolicy", env(), n_steps=32, batch_size=16, **SMALL)  # noqa: E731
     make().learn(96, [Checkpoint(tmp_path, every=10), lambda agent, turn: turn.step < 40])
@@ -347,13 +344,6 @@ def test_what_a_process_that_died_was_writing_is_deleted(tmp_path):
     (tmp_path / ".run_000000000010.safetensors.1a2b.tmp").write_bytes(b"half")
     small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
     assert not list(tmp_path.glob(".*"))
-
-
-def test_the_folder_of_another_run_is_refused(tmp_path):
-    agent = small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
-    agent.learn(20, Checkpoint(tmp_path, every=10), reset_num_timesteps=False)  # the same run
-    with pytest.raises(FileExistsError, match="another run"):
-        small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
 
 
 def test_a_replay_buffer_that_was_replaced_is_written_whole(tmp_path):
@@ -446,12 +436,6 @@ class Counting(BaseCallback):
         return True
 
 
-def test_the_progress_bar_counts_the_steps_before(tmp_path, capsys):
-    cut_run(tmp_path)
-    rejeu.SAC.resume(tmp_path).learn(progress_bar=True)
-    assert re.match(r"100%  60/60 steps · ", capsys.readouterr().out)
-
-
 def test_callbacks_go_on_with_what_they_remember(tmp_path):
     def callbacks():
         evaluate = Evaluate(BALL, every=15, episodes=2)
@@ -514,11 +498,12 @@ def test_statistics_of_vec_normalize_are_carried(tmp_path):
     assert_same(one, two)
 
 
-def test_hyperparameters_can_be_changed_on_the_way(tmp_path):
+def test_hyperparameters_can_be_changed_on_the_way_and_the_progress_bar_counts_the_steps_before(tmp_path, capsys):
     cut_run(tmp_path)
     agent = rejeu.SAC.resume(tmp_path, learning_rate=1e-5)
     assert agent.config.learning_rate == 1e-5
-    agent.learn()
+    agent.learn(progress_bar=True)
+    assert re.match(r"100%  60/60 steps · ", capsys.readouterr().out)
 
 
 def test_masks_are_carried_too(tmp_path):

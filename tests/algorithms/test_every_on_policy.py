@@ -15,9 +15,8 @@ from tests.algorithms.probes.environments import Probe
 from tests.algorithms.test_every_algorithm import OBS, Precise, Wanderer, assert_precise
 from tests.environments import Sampled
 from tests.helpers import assert_same_parameters, same_parameters
-from tests.on_policy_agents import KINDS
+from tests.on_policy_agents import KINDS, every_kind
 
-every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 every_algorithm = pytest.mark.parametrize(
     "kind", [KINDS["PPO, Discrete"], KINDS["A2C, Box"], KINDS["PQN, Discrete"]], ids=["PPO", "A2C", "PQN"]
 )

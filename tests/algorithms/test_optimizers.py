@@ -17,6 +17,7 @@ from rejeu.algorithms import a2c, crossq, optimizers, sac
 from rejeu.algorithms.config import rebuild, to_json
 from rejeu.core import descend
 from rejeu.errors import CheckpointError
+from tests.tiers import only
 
 SETTINGS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0}
 OWN = [optax.lamb, partial(optax.adamw, weight_decay=1e-2), optax.chain(optax.clip(1.0), optax.adabelief(1.0))]
@@ -73,8 +74,8 @@ def test_algorithms_keep_their_own_settings_of_adam():
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in rejeu.AGENTS if name != "MaskablePPO"]
-)  # which is PPO with another policy
+    "name", only(["SAC", "CrossQ", "DQN", "PPO", "RecurrentPPO"], sorted(rejeu.AGENTS.keys() - {"MaskablePPO"}))
+)
 def test_the_gradient_of_every_algorithm_can_be_limited(name):
     kind, limit = rejeu.AGENTS[name], 1e-4
     settings = {"optimizer": "sgd", "learning_rate": 1.0, "max_grad_norm": limit, "policy_kwargs": {"net_arch": [8]}}
@@ -123,26 +124,25 @@ SCRIPT = """
 import sys
 import jax, numpy as np, optax, rejeu
 
-for kind, env, settings in (
-    ("DQN", "CartPole-v1", {"learning_starts": 10, "train_freq": 1}),
-    ("A2C", "CartPole-v1", {}),
-    ("PPO", "CartPole-v1", {"n_steps": 32, "batch_size": 16, "n_epochs": 1}),
-):
-    optimizer = {"lamb": optax.lamb, "clip": optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0)),
-                 "adafactor": optax.adafactor}[sys.argv[1]]
-    agent = getattr(rejeu, kind)("MlpPolicy", env, optimizer=optimizer, learning_rate=1e-3, seed=0, **settings)
-    before = agent.get_parameters()
-    after = agent.learn(40).get_parameters()
-    assert any((before[name] != after[name]).any() for name in before), kind
-    assert all(np.isfinite(array).all() for array in after.values()), kind
+kind, optimizer = sys.argv[1:]
+settings = {"DQN": {"learning_starts": 10, "train_freq": 1}, "A2C": {},
+            "PPO": {"n_steps": 32, "batch_size": 16, "n_epochs": 1}}[kind]
+optimizer = {"lamb": optax.lamb, "clip": optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1.0)),
+             "adafactor": optax.adafactor}[optimizer]
+agent = getattr(rejeu, kind)("MlpPolicy", "CartPole-v1", optimizer=optimizer, learning_rate=1e-3, seed=0, **settings)
+before = agent.get_parameters()
+after = agent.learn(40).get_parameters()
+assert any((before[name] != after[name]).any() for name in before), kind
+assert all(np.isfinite(array).all() for array in after.values()), kind
 """
 
 
-@pytest.mark.parametrize(
-    "optimizer", [*(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("lamb", "clip")), "adafactor"]
-)
-def test_optimizers_that_look_at_all_gradients_work_in_the_programs_that_users_compile(optimizer):
+@pytest.mark.parametrize("kind", only(["PPO"], ["DQN", "A2C", "PPO"]))
+@pytest.mark.parametrize("optimizer", only(["adafactor"], ["lamb", "clip", "adafactor"]))
+def test_optimizers_that_look_at_all_gradients_work_in_the_programs_that_users_compile(kind, optimizer):
     """The tests compile with other options, under which the kernels of these optimizers are never made."""
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", SCRIPT, optimizer], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, kind, optimizer], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr[-2000:]

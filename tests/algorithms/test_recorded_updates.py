@@ -1,4 +1,4 @@
-"""Whole updates of SAC and DQN against recorded ones of Stable-Baselines3 (tests/golden/record_sac.py, record_dqn.py)."""
+"""Whole updates of SAC and DQN against recorded ones of Stable-Baselines3 (tests/golden/record_updates.py)."""
 
 from __future__ import annotations
 

@@ -31,10 +31,6 @@ def test_passes_gymnasiums_checker_with_no_other_warning(dimension):
     check_env(gym.make("rejeu/Ball-v0", dimension=dimension, sigma=2.0).unwrapped)
 
 
-def test_registration_tells_the_time_limit():
-    assert gym.spec("rejeu/Ball-v0").max_episode_steps == 500
-
-
 def test_next_position_is_position_plus_push_plus_noise():
     ball = Ball(3, sigma=0.5)
     start, _ = ball.reset(seed=7)
@@ -48,20 +44,23 @@ def test_next_position_is_position_plus_push_plus_noise():
     assert after.dtype == np.float32
 
 
-def test_pushes_beyond_the_bounds_are_clipped():
-    after, *_ = placed(1.0, -1.0).step(np.array([5.0, -2.5]))
-    np.testing.assert_array_equal(after, np.float32([3.0, -3.0]))
+LOST = (-10.0, True, False, {"is_success": False})
 
 
-def test_leaving_costs_in_the_step_that_leaves_and_is_seen_on_the_wall():
-    after, reward, terminated, truncated, info = placed(9.0, 0.0).step(np.array([1.5, 0.5]))
-    assert (reward, terminated, truncated, info) == (-10.0, True, False, {"is_success": False})
-    np.testing.assert_array_equal(after, np.float32([10.0, 0.5]))
-
-
-def test_the_wall_itself_is_inside():
-    after, reward, terminated, *_ = placed(9.0, 0.0).step(np.array([1.0, 0.0]))
-    assert (after[0], reward, terminated) == (10.0, 1.0, False)
+@pytest.mark.parametrize(
+    ("start", "n_steps", "push", "after", "rest"),
+    [
+        ((1.0, -1.0), 0, (5.0, -2.5), (3.0, -3.0), (1.0, False, False, {})),  # pushes beyond the bounds are clipped
+        ((0.0, 0.0), 0, (3.0, -np.inf), (2.0, -2.0), (1.0, False, False, {})),
+        ((9.0, 0.0), 0, (1.0, 0.0), (10.0, 0.0), (1.0, False, False, {})),  # the wall itself is inside
+        ((9.0, 0.0), 0, (1.5, 0.5), (10.0, 0.5), LOST),  # seen on the wall
+        ((9.0, 0.0), 499, (2.0, 0.0), (10.0, 0.0), LOST),
+    ],
+)
+def test_leaving_costs_in_the_step_that_leaves(start, n_steps, push, after, rest):
+    found, *others = placed(*start, n_steps=n_steps).step(np.array(push))
+    np.testing.assert_array_equal(found, np.float32(after))
+    assert tuple(others) == rest
 
 
 def test_holding_for_500_steps_is_a_time_limit_worth_50():
@@ -74,35 +73,49 @@ def test_holding_for_500_steps_is_a_time_limit_worth_50():
     assert steps[-1][4] == {"is_success": True}
 
 
-def test_leaving_in_the_last_step_is_lost():
-    _, reward, terminated, truncated, info = placed(9.0, 0.0, n_steps=499).step(np.array([2.0, 0.0]))
-    assert (reward, terminated, truncated, info) == (-10.0, True, False, {"is_success": False})
+def over():
+    ball = placed(9.0, 0.0)
+    ball.step(np.array([2.0, 0.0]))
+    return ball
 
 
-@pytest.mark.parametrize("when", ["before the first reset", "after the end"])
-def test_step_without_reset_is_refused(when):
-    ball = Ball()
-    if when == "after the end":
-        ball = placed(9.0, 0.0)
-        ball.step(np.array([2.0, 0.0]))
-    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
-        ball.step(NOTHING)
-
-
-def test_actions_that_are_no_push_are_refused():
-    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(2,\)"):
-        placed(0.0, 0.0).step(np.zeros(3))
-    for action in ([np.nan, 0.0], [0.0, np.nan]):
-        with pytest.raises(ValueError, match="not a number"):
-            placed(0.0, 0.0).step(np.array(action))
+def state_of(ball):
+    ball.reset(seed=0)
+    return ball.get_state()
 
 
 @pytest.mark.parametrize(
-    "setting", [{"dimension": 0}, {"dimension": 2.0}, {"sigma": -1.0}, {"sigma": np.nan}, {"render_mode": "ansi"}]
+    ("call", "error", "message"),
+    [
+        (lambda: Ball().step(NOTHING), gym.error.ResetNeeded, r"call reset\(\) before step\(\)"),
+        (lambda: over().step(NOTHING), gym.error.ResetNeeded, r"call reset\(\) before step\(\)"),
+        (lambda: placed(0.0, 0.0).step(np.zeros(3)), ValueError, r"shape \(3,\), expected \(2,\)"),
+        (lambda: placed(0.0, 0.0).step(np.array([np.nan, 0.0])), ValueError, "not a number"),
+        (lambda: placed(0.0, 0.0).step(np.array([0.0, np.nan])), ValueError, "not a number"),
+        (lambda: Ball(dimension=0), ValueError, "dimension"),
+        (lambda: Ball(dimension=2.0), ValueError, "dimension"),
+        (lambda: Ball(sigma=-1.0), ValueError, "sigma"),
+        (lambda: Ball(sigma=np.nan), ValueError, "sigma"),
+        (lambda: Ball(render_mode="ansi"), ValueError, "render_mode"),
+        (lambda: Ball(3).set_state(state_of(Ball(2))), ValueError, "2 dimensions and this ball has 3"),
+        (lambda: placed(0.0, 0.0).render(), ValueError, "render_mode='rgb_array'"),
+    ],
 )
-def test_settings_out_of_range_are_refused_by_name(setting):
-    with pytest.raises(ValueError, match=next(iter(setting))):
-        Ball(**setting)
+def test_what_makes_no_sense_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    "part",
+    [{"position": [np.nan, 0.0]}, {"position": [11.0, 0.0]}, {"position": []}, {"n_steps": 500}, {"n_steps": -1}],
+)
+def test_a_state_in_which_no_ball_can_be_under_way_is_refused_and_changes_nothing(part):
+    ball = Ball(2)
+    before = state_of(ball)
+    with pytest.raises(ValueError, match="no ball is under way"):
+        ball.set_state(before | part)
+    assert ball.get_state() == before
 
 
 def test_restored_state_continues_exactly():
@@ -117,26 +130,6 @@ def test_restored_state_continues_exactly():
         one, two = ball.step(NOTHING), other.step(NOTHING)
         np.testing.assert_array_equal(one[0], two[0])
         assert one[1:] == two[1:]
-
-
-def test_state_of_another_dimension_is_refused():
-    ball = Ball(2)
-    ball.reset(seed=0)
-    with pytest.raises(ValueError, match="2 dimensions and this ball has 3"):
-        Ball(3).set_state(ball.get_state())
-
-
-@pytest.mark.parametrize(
-    "part",
-    [{"position": [np.nan, 0.0]}, {"position": [11.0, 0.0]}, {"position": []}, {"n_steps": 500}, {"n_steps": -1}],
-)
-def test_a_state_in_which_no_ball_can_be_under_way_is_refused_and_changes_nothing(part):
-    ball = Ball(2)
-    ball.reset(seed=0)
-    before = ball.get_state()
-    with pytest.raises(ValueError, match="no ball is under way"):
-        ball.set_state(before | part)
-    assert ball.get_state() == before
 
 
 def survival(sigma: float, n_cells: int = 400, n_steps: int = 500) -> float:
@@ -247,11 +240,6 @@ def test_many_dimensions_are_drawn_as_the_first_ten_beside_the_plane():
     assert ball._drawing.strips[-1].bottom == pytest.approx(ball._drawing.main.bottom)
 
 
-def test_drawing_without_a_render_mode_says_how_to_get_one():
-    with pytest.raises(ValueError, match="render_mode='rgb_array'"):
-        placed(0.0, 0.0).render()
-
-
 def test_drawing_without_pygame_names_the_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pygame", None)
     with pytest.raises(MissingExtra, match=r'pip install "rejeu\['):
@@ -262,14 +250,7 @@ def test_several_balls_make_one_vector_environment():
     vector = rejeu.make_vector("rejeu/Ball-v0", n_envs=3, backend="auto", seed=0, sigma=2.0)
     obs = vector.reset()
     assert vector.backend == "gymnasium"
-    assert vector.max_episode_steps == 500
+    assert vector.max_episode_steps == gym.spec("rejeu/Ball-v0").max_episode_steps == 500
     assert obs.shape == (3, 2)
     assert len(np.unique(obs)) == 6
     vector.close()
-
-
-def test_an_action_out_of_range_is_clipped():
-    pushed = placed(0.0, 0.0)
-    position, reward, *_ = pushed.step(np.array([3.0, -np.inf]))
-    np.testing.assert_array_equal(position, [2.0, -2.0])
-    assert reward == 1.0

@@ -16,7 +16,7 @@ from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
 from rejeu.loops.run import restart
 from rejeu.sb3.common.env_util import make_vec_env
-from rejeu.sb3.common.vec_env import VecNormalize
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 
@@ -101,12 +101,18 @@ def test_worker_processes_walk_like_the_one_in_process(mode):
     vector.close()
 
 
-def test_a_termination_is_reported_as_one():
-    vector = InProcess([Counter((1,), "terminated")])
+def test_an_id_a_function_an_environment_and_a_vector_all_become_vectors():
+    assert make_vector("Pendulum-v1").backend == "gymnasium"
+    assert make_vector("Pendulum-v1", 4).backend == "envpool"
+    assert make_vector("Pendulum-v1", g=9.0).envs[0].unwrapped.g == 9.0
+    assert make_vector("Pendulum-v1", 2, "gymnasium").n_envs == 2
+    assert make_vector(lambda: Counter(), 3).n_envs == 3
+    assert make_vector(SyncVectorEnv(counters())).n_envs == 2
+    vector = make_vector(Counter((1,), "terminated"))
+    assert (vector.n_envs, make_vector(vector)) == (1, vector)
     vector.reset()
     step = vector.step(np.zeros((1, 1), np.float32))
-    assert step.terminated.tolist() == [True]
-    assert step.truncated.tolist() == [False]
+    assert (step.terminated.tolist(), step.truncated.tolist()) == ([True], [False])
 
 
 def test_a_vector_that_resets_itself_beyond_repair_is_refused():
@@ -193,12 +199,8 @@ def test_one_seed_gives_one_series_of_episodes_and_another_another(backend):
     one, two, other = (first_observations(make_vector("Pendulum-v1", 3, backend, seed)) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one, two)
     assert (one != other).any()
-
-
-@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
-def test_environments_of_a_vector_start_differently(backend):
-    obs = make_vector("Pendulum-v1", 3, backend, seed=5).reset()
-    assert len(np.unique(obs[:, 0])) == 3
+    assert len(np.unique(one[0, :, 0])) == 3, "the environments of a vector start differently"
+    assert (one[0] != one[1]).any(), "a seed is used once and later resets differ"
 
 
 def test_in_process_environments_are_seeded_one_after_the_other():
@@ -212,11 +214,6 @@ def test_in_process_environments_are_seeded_one_after_the_other():
 def test_envpool_takes_every_seed_that_an_agent_does(seed):
     vector = make_vector("Pendulum-v1", 2, "envpool", seed)
     assert np.isfinite(vector.reset()).all()
-
-
-def test_a_seed_is_used_once_and_later_resets_differ():
-    vector = make_vector("Pendulum-v1", 1, "gymnasium", seed=5)
-    assert (np.array(vector.reset()) != np.array(vector.reset())).any()
 
 
 # EnvPool.
@@ -269,11 +266,7 @@ def test_envpool_knows_its_time_limit():
         assert bool(step.truncated[0]) == (t == 199)
         assert not step.terminated[0]
     vector.close()
-
-
-def test_envpool_environments_without_a_time_limit_have_none():
-    """EnvPool says 2,147,483,647 of them."""
-    vector = EnvPool("CliffWalking-v0", 1, seed=0)
+    vector = EnvPool("CliffWalking-v0", 1, seed=0)  # of which EnvPool says 2,147,483,647
     assert vector.max_episode_steps is None
     vector.close()
 
@@ -319,15 +312,6 @@ def test_success_is_unknown_where_the_environment_does_not_say():
 # What may be given.
 
 
-def test_an_id_a_function_an_environment_and_a_vector_all_become_vectors():
-    assert make_vector("Pendulum-v1", 2, "gymnasium").n_envs == 2
-    assert make_vector(lambda: Counter(), 3).n_envs == 3
-    assert make_vector(Counter()).n_envs == 1
-    assert make_vector(SyncVectorEnv(counters())).n_envs == 2
-    vector = in_process()
-    assert make_vector(vector) is vector
-
-
 @pytest.mark.parametrize(
     ("env_id", "n_envs", "kwargs", "backend"),
     [
@@ -341,11 +325,6 @@ def test_an_id_a_function_an_environment_and_a_vector_all_become_vectors():
 )
 def test_auto_uses_envpool_from_four_environments_on_or_if_gymnasium_lacks_the_id(env_id, n_envs, kwargs, backend):
     assert auto_backend(env_id, n_envs, kwargs) == backend
-
-
-def test_auto_makes_the_backend_that_its_rule_names():
-    assert make_vector("Pendulum-v1").backend == "gymnasium"
-    assert make_vector("Pendulum-v1", 4).backend == "envpool"
 
 
 @pytest.fixture
@@ -368,30 +347,41 @@ def test_the_envpool_backend_without_envpool_says_how_to_install_it_and_its_size
         make_vector("Pong-v5")
 
 
-def test_environment_arguments_reach_the_environment():
-    assert make_vector("Pendulum-v1", g=9.0).envs[0].unwrapped.g == 9.0
+SAME = Counter()
+
+
+def self_seeding():
+    return VecMonitor(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
 
 
 @pytest.mark.parametrize(
-    ("call", "words"),
+    ("env", "arguments", "words"),
     [
-        (lambda: make_vector("Pendulum-v1", backend="gym"), "backend='gym' must be one of auto, envpool, gymnasium"),
-        (lambda: make_vector("Pendulum-v1", 0), "n_envs=0 must be a whole number of at least 1"),
-        (lambda: make_vector("Pendulum-v1", True), "n_envs=True must be"),
-        (lambda: make_vector(Counter(), 2), "n_envs=2 needs an id or a function"),
+        ("Pendulum-v1", {"backend": "gym"}, "backend='gym' must be one of auto, envpool, gymnasium"),
+        ("Pendulum-v1", {"n_envs": 0}, "n_envs=0 must be a whole number of at least 1"),
+        ("Pendulum-v1", {"n_envs": True}, "n_envs=True must be"),
+        (Counter(), {"n_envs": 2}, "n_envs=2 needs an id or a function"),
+        (3, {}, "env must be an id, a Gymnasium environment, .* got int"),
+        (lambda: SAME, {"n_envs": 2}, "same environment was given more than once"),
+        ("Pendulum-v1", {"backend": "envpool", "g": 9.0}, "envpool backend takes no environment arguments"),
+        ("Pendulun-v1", {}, "no environment is called 'Pendulun-v1'; did you mean .*Pendulum-v1"),
+        ("parkin-v0", {}, "no environment is called 'parkin-v0'; did you mean .*parking-v0"),
+        ("Zzzzzz", {}, "no environment is called 'Zzzzzz'; rejeu list"),
+        ("Pendulun-v1", {"backend": "envpool"}, "no environment is called 'Pendulun-v1'; did you mean"),
         (
-            lambda: make_vector("Pendulum-v1", backend="envpool", g=9.0),
-            "envpool backend takes no environment arguments",
+            "Pendulum-v1",
+            {"n_envs": 3, "seed": [1, 2]},
+            r"seed=\[1, 2\] must be a number, or a sequence of 3 numbers, o",
         ),
-        (lambda: make_vector("Pendulun-v1"), "no environment is called 'Pendulun-v1'; did you mean .*Pendulum-v1"),
-        (lambda: make_vector("parkin-v0"), "no environment is called 'parkin-v0'; did you mean .*parking-v0"),
-        (lambda: make_vector("Zzzzzz"), "no environment is called 'Zzzzzz'; rejeu list"),
-        (lambda: make_vector("Pendulun-v1", backend="envpool"), "no environment is called 'Pendulun-v1'; did you mean"),
+        ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2, -3]}, "must have whole numbers from 0 to 2"),
+        ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2, 2.5]}, "must have whole numbers from 0 to 2"),
+        ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2, 2**31]}, "must have whole numbers from 0 to 2"),
+        (self_seeding(), {"seed": [1, 2]}, "VecMonitor takes a single seed and seeds its environments itself"),
     ],
 )
-def test_a_wrong_argument_is_named_with_its_remedy(call, words):
-    with pytest.raises(ValueError, match=words) as caught:
-        call()
+def test_a_wrong_argument_is_named_with_its_remedy(env, arguments, words):
+    with pytest.raises(TypeError if env == 3 else ValueError, match=words) as caught:
+        make_vector(env, **arguments)
     assert "\n" not in str(caught.value)
 
 
@@ -400,17 +390,6 @@ def test_an_environment_that_only_gymnasium_has_is_referred_to_it(monkeypatch):
     with pytest.raises(ValueError, match="EnvPool does not have OnlyHere-v0; use backend='gymnasium'"):
         make_vector("OnlyHere-v0", backend="envpool")
     assert make_vector("OnlyHere-v0").backend == "gymnasium"
-
-
-def test_something_that_is_no_environment_is_refused():
-    with pytest.raises(TypeError, match=r"env must be an id, a Gymnasium environment, .* got int"):
-        make_vector(3)
-
-
-def test_one_environment_given_several_times_is_refused():
-    env = Counter()
-    with pytest.raises(ValueError, match="same environment was given more than once"):
-        make_vector(lambda: env, 2)
 
 
 def test_a_missing_package_is_named_with_the_command_that_installs_it(monkeypatch):
@@ -482,28 +461,6 @@ def test_runs_with_consecutive_seeds_share_no_first_observation(kind):
 
     starts = [restart(small_sac(environments(), seed=seed).run).copy() for seed in range(5)]
     assert len(np.unique(np.concatenate(starts), axis=0)) == 40
-
-
-@pytest.mark.parametrize(
-    ("seed", "message"),
-    [
-        ([1, 2], r"seed=\[1, 2\] must be a number, or a sequence of 3 numbers, one for each environment"),
-        ([1, 2, -3], "must have whole numbers from 0 to 2"),
-        ([1, 2, 2.5], "must have whole numbers from 0 to 2"),
-        ([1, 2, 2**31], "must have whole numbers from 0 to 2"),
-    ],
-)
-def test_seeds_that_are_not_one_for_each_environment_are_refused(seed, message):
-    with pytest.raises(ValueError, match=message):
-        make_vector("Pendulum-v1", 3, "gymnasium", seed=seed)
-
-
-def test_a_vector_that_seeds_its_environments_itself_takes_one_number():
-    from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor
-
-    venv = VecMonitor(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 2))
-    with pytest.raises(ValueError, match="VecMonitor takes a single seed and seeds its environments itself"):
-        make_vector(venv, seed=[1, 2])
 
 
 def test_a_dict_in_a_dict_that_holds_one_array_is_read():

@@ -50,35 +50,23 @@ def rewrite(source, target, change):
 # Round trips.
 
 
-def test_a_loaded_agent_predicts_the_same_bits(trained):
+def test_a_loaded_agent_predicts_the_same_bits_with_the_settings_and_counters_of_the_saved_one(trained):
     agent, path = trained
-    loaded = rejeu.SAC.load(path)
+    loaded = rejeu.load(path)
+    assert isinstance(loaded, rejeu.SAC)
     np.testing.assert_array_equal(
         loaded.predict(observations(), deterministic=True)[0], agent.predict(observations(), deterministic=True)[0]
     )
     assert_same_parameters(agent, loaded)
-
-
-def test_a_loaded_agent_has_the_settings_and_counters_of_the_saved_one(trained):
-    agent, path = trained
-    loaded = rejeu.SAC.load(path)
     assert loaded.config == agent.config
-    assert (
-        (loaded.n_updates, loaded.seed, loaded.policy)
-        == (agent.n_updates, agent.seed, agent.policy)
-        == (12, 0, "MlpPolicy")
-    )
-    assert loaded.num_timesteps == 20
+    of = lambda a: (a.n_updates, a.seed, a.policy, a.num_timesteps)  # noqa: E731
+    assert of(loaded) == of(agent) == (12, 0, "MlpPolicy", 20)
     assert loaded.env is None
 
 
 def test_saving_a_loaded_agent_gives_the_same_file(trained, tmp_path):
     again = rejeu.SAC.load(trained[1], env=Counter((5,))).save(tmp_path / "again")
     assert again.read_bytes() == trained[1].read_bytes()
-
-
-def test_the_kind_of_agent_is_found_by_load(trained):
-    assert isinstance(rejeu.load(trained[1]), rejeu.SAC)
 
 
 def test_a_suffix_is_added_only_where_there_is_none(trained, tmp_path):
@@ -255,11 +243,6 @@ def test_a_replay_buffer_of_another_environment_is_refused_and_nothing_changes(b
     assert other.replay_buffer.size() == 7
 
 
-def test_a_missing_file_is_named():
-    with pytest.raises(FileNotFoundError, match=r"there is no file .*nowhere\.safetensors"):
-        rejeu.SAC.load("nowhere")
-
-
 # Damage.
 
 
@@ -290,7 +273,7 @@ def test_safetensors_files_of_other_programs_are_refused(tmp_path, metadata, wor
 
 def fails_with(number):
     def fail(*_):
-        raise OSError(number, os.strerror(number))
+        raise OSError(number, os.strerror(number)) if number is not None else KeyboardInterrupt
 
     return fail
 
@@ -303,6 +286,7 @@ def fails_with(number):
         (errno.EROFS, OSError, "Read-only file system; give a path on a disk that can be written"),
         (errno.ENOENT, FileNotFoundError, "its folder was removed while the file was written"),
         (errno.EIO, OSError, "give a path on another disk"),
+        (None, KeyboardInterrupt, "^$"),
     ],
 )
 @pytest.mark.parametrize("where", ["fsync", "replace", "open"])
@@ -319,7 +303,7 @@ def test_a_write_that_fails_says_why_and_leaves_the_old_file_and_nothing_else(
     with pytest.raises(kind, match=words) as caught:
         agent.save(path)
     monkeypatch.undo()
-    assert caught.value.errno == number
+    assert getattr(caught.value, "errno", None) == number
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
 
@@ -347,21 +331,6 @@ print(checkpoint.read(path, "rows")[1]["a"].sum())
     assert "could not be written: File too large; raise the limit on the size of files" in result.stdout
     assert result.stdout.splitlines()[-1] == "45"
     assert [p.name for p in tmp_path.iterdir()] == ["file.safetensors"]
-
-
-def test_ctrl_c_while_writing_leaves_the_old_file_and_nothing_else(trained, tmp_path, monkeypatch):
-    agent, _ = trained
-    path = agent.save(tmp_path / "model")
-    before = path.read_bytes()
-
-    def interrupted(file):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(atomic.os, "fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        agent.save(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
 
 
 def test_the_file_is_on_disk_before_it_takes_the_old_ones_place_and_its_name_after(trained, tmp_path, monkeypatch):
@@ -413,11 +382,12 @@ checkpoint.write(path, "rows", {"a": np.zeros(1000)}, {})
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_path_that_is_a_folder_is_refused(trained, tmp_path):
+def test_a_path_that_is_a_folder_or_no_file_is_refused(trained, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*nowhere\.safetensors"):
+        rejeu.SAC.load("nowhere")
     (tmp_path / "model.safetensors").mkdir()
-    with pytest.raises(
-        IsADirectoryError, match=r"model.safetensors could not be written: there is a folder.* not a folder"
-    ):
+    words = r"model.safetensors could not be written: there is a folder.* not a folder"
+    with pytest.raises(IsADirectoryError, match=words):
         trained[0].save(tmp_path / "model")
     assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
 

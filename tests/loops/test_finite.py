@@ -413,14 +413,22 @@ def test_of_a_scan_only_the_broken_step_is_skipped():
         np.testing.assert_allclose(value, two[name], rtol=1e-5, atol=1e-7, err_msg=name)  # two programs, two roundings
 
 
+def spoil(agent, field):
+    """Makes a field of every batch that is drawn NaN."""
+    draw = agent.run.replay.draw
+
+    def spoiled(*arguments):
+        batch, drawn = draw(*arguments)
+        return batch._replace(**{field: getattr(batch, field) * np.float32(np.nan)}), drawn
+
+    agent.run.replay.draw = spoiled
+
+
 def test_updates_that_are_all_skipped_are_an_error_in_the_end(tmp_path):
     agent = MAKE["SAC"](nonfinite="skip")
     agent.report_folder = tmp_path
     agent.learn(20)
-    agent.run.replay.ring.records["reward"][:] = np.nan
-    draw = agent.run.replay.draw
-    spoiled = lambda batch, drawn: (batch._replace(reward=batch.reward * np.float32(np.nan)), drawn)  # noqa: E731
-    agent.run.replay.draw = lambda *a: spoiled(*draw(*a))
+    spoil(agent, "reward")
     with pytest.raises(NonFiniteError, match=r"^100 updates in a row were skipped, .* the batch held reward") as caught:
         agent.learn(200)
     assert caught.value.batch.exists()
@@ -520,9 +528,6 @@ def test_all_finite_is_numpys_answer(sizes, place, value):
     vectors[-1][place % sizes[-1]] = value
     expected = all(np.isfinite(vector).all() for vector in vectors)
     assert bool(learner.check([*map(jnp.asarray, vectors), jnp.arange(3)], {})) == expected
-
-
-def test_whole_numbers_alone_are_finite():
     assert bool(learner.check([jnp.arange(3)], {}))
 
 
@@ -550,19 +555,15 @@ def test_td_errors_that_are_not_finite_leave_priorities_as_they_are(bad):
     assert priorities.tree.total == pytest.approx(after.sum())
 
 
-def test_statistics_pass_over_what_is_not_finite():
+def test_statistics_pass_over_what_is_not_finite_and_do_not_overflow():
     values = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
     spoilt = np.insert(values, [2, 4], [[np.nan, 0, 0], [0, np.inf, 1]], axis=0).astype(np.float32)
     one = merged(no_moments((3,)), jnp.asarray(values), jnp.ones(6))
     two = merged(no_moments((3,)), jnp.asarray(spoilt), jnp.ones(8))
     jax.tree.map(np.testing.assert_allclose, one, two)
     assert float(two.n_seen) == 6
-
-
-def test_statistics_do_not_overflow():
-    known = merged(no_moments((1,)), jnp.ones((4, 1)), jnp.ones(4))
-    after = merged(known, jnp.full((2, 1), 1e30), jnp.ones(2))
-    jax.tree.map(np.testing.assert_array_equal, known, after)
+    after = merged(two, jnp.full((8, 3), 1e30), jnp.ones(8))
+    jax.tree.map(np.testing.assert_array_equal, two, after)
 
 
 def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_folder(tmp_path, capsys):
@@ -581,8 +582,6 @@ def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_
 def test_rewards_that_are_clipped_one_by_one_are_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     agent = MAKE["SAC, normalised"](n_steps=3)
-    draw = agent.run.replay.draw
-    spoiled = lambda batch, drawn: (batch._replace(rewards=batch.rewards * np.float32(np.nan)), drawn)  # noqa: E731
-    agent.run.replay.draw = lambda *a: spoiled(*draw(*a))
+    spoil(agent, "rewards")
     with pytest.raises(NonFiniteError, match=r"the batch held .*rewards \(nan\)"):
         agent.learn(TOTAL)

@@ -543,8 +543,12 @@ def test_a_head_of_another_width_is_refused():
 @pytest.mark.parametrize("agent", [rejeu.SAC, rejeu.PPO])
 def test_an_agent_with_own_modules_learns_and_loads(agent, tmp_path):
     policy = {"torso": own_mlp, "head": lambda key, n, m: eqx.nn.Linear(n, m, key=key)}
-    settings = {"n_steps": 32, "batch_size": 16} if agent is rejeu.PPO else {"learning_starts": 20, "batch_size": 8}
-    made = agent("MlpPolicy", "Pendulum-v1", policy_kwargs=policy, seed=0, **settings).learn(64)
+    short = (
+        {"n_steps": 8, "batch_size": 8, "n_epochs": 1}
+        if agent is rejeu.PPO
+        else {"learning_starts": 4, "batch_size": 4}
+    )
+    made = agent("MlpPolicy", "Pendulum-v1", policy_kwargs=policy, seed=0, **short).learn(16)
     assert "MLP" in made.summary() or "OwnModule" in made.summary()
     path = made.save(tmp_path / "own")
     with pytest.raises(CheckpointError, match="its torso is your own, 'own_mlp'"):
@@ -568,7 +572,8 @@ def test_a_named_encoder_is_given_on_the_command_line_saved_and_loaded(tmp_path,
     monkeypatch.chdir(tmp_path)
     Path("numbers_file.py").write_text(NAMED)
     given = ["--import", "numbers_file.py", "--set", "policy_kwargs.encoder=numbers", "max_grad_norm=1"]
-    small = ["--steps", "120", "--evaluate-episodes", "1", "--out", "run", "--no-report", "--no-video"]
+    given += ["policy_kwargs.net_arch=[8]", "learning_starts=10", "batch_size=8"]
+    small = ["--steps", "20", "--evaluate-episodes", "1", "--out", "run", "--no-report", "--no-video"]
     assert cli.main(["train", "Pendulum-v1", "--algo", "SAC", *given, *small]) == 0
     agent = rejeu.load("run")
     assert (agent.config.policy_kwargs.encoder, agent.config.max_grad_norm) == ("numbers", 1.0)

@@ -18,20 +18,15 @@ def evaluated(step, success=float("nan")):
     return step, Evaluation(np.array([-500.0, -400.0]), np.array([50, 50]), np.array([success, success]))
 
 
-def test_a_curve_is_written_where_asked(tmp_path):
-    learning_curve(history(), tmp_path / "made" / "curve.png")
+def test_a_curve_is_written_where_asked_and_large_numbers_have_thousands_separators(tmp_path):
+    figure = learning_curve(history(), tmp_path / "made" / "curve.png")
     assert (tmp_path / "made" / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert "100,000" in [label.get_text() for label in figure.axes[0].get_xticklabels()]
 
 
 def test_success_has_a_panel_of_its_own_where_it_is_known():
     assert len(learning_curve(history()).axes) == 1
     assert len(learning_curve(history(success=1.0)).axes) == 2
-
-
-def test_large_numbers_have_thousands_separators(tmp_path):
-    figure = learning_curve(history(), tmp_path / "curve.png")
-    labels = [label.get_text() for label in figure.axes[0].get_xticklabels()]
-    assert "100,000" in labels
 
 
 def test_the_line_is_the_moving_average():
@@ -48,9 +43,19 @@ def test_the_line_averages_a_fifth_of_a_short_run(n_episodes, window):
     assert f"mean of {window} episodes" in labels
 
 
-def test_a_window_below_one_is_an_error():
-    with pytest.raises(ValueError, match="window=0 must be a whole number of at least 1"):
-        learning_curve(history(), window=0)
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ({"window": 0}, ValueError, "window=0 must be a whole number of at least 1"),
+        ({"against": "epochs"}, ValueError, "step, seconds"),
+        ({}, MissingExtra, r"rejeu\[plot\]"),
+    ],
+)
+def test_what_cannot_be_drawn_is_an_error_that_says_why(given, error, message, monkeypatch):
+    if not given:
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(error, match=message):
+        learning_curve(history(), **given)
 
 
 @pytest.mark.parametrize("success", [float("nan"), 1.0])
@@ -66,8 +71,13 @@ def test_a_long_title_and_the_legend_keep_apart_and_inside_the_picture(success):
     assert legend_box.x1 < figure.bbox.x1
 
 
-def test_the_intervals_of_evaluations_are_drawn_whole():
-    low, high = learning_curve(history(), evaluations=[evaluated(100_000)]).axes[0].get_ylim()
+def test_points_at_the_right_edge_and_the_intervals_of_evaluations_are_drawn_whole():
+    figure = learning_curve(history(), evaluations=[evaluated(200_000)])
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    marker = 5 / 2 * figure.dpi / 72  # half of the largest dot, in pixels
+    assert axes.transData.transform((200_000, -800))[0] + marker < axes.get_window_extent().x1
+    low, high = axes.get_ylim()
     assert low < -450 - 12.7 * 50 < -450 + 12.7 * 50 < high  # Student's t of two episodes
 
 
@@ -76,14 +86,6 @@ def test_the_axes_of_a_run_without_an_episode_or_with_equal_returns_have_readabl
     flat = History([Episode(10 * i, 0, -200.0, 10, float("nan"), i) for i in range(9)])
     low, high = learning_curve(flat).axes[0].get_ylim()
     assert high - low > 10
-
-
-def test_points_at_the_right_edge_are_drawn_whole():
-    figure = learning_curve(history(), evaluations=[evaluated(200_000)])
-    figure.draw_without_rendering()
-    axes = figure.axes[0]
-    marker = 5 / 2 * figure.dpi / 72  # half of the largest dot, in pixels
-    assert axes.transData.transform((200_000, -800))[0] + marker < axes.get_window_extent().x1
 
 
 def test_a_notebook_shows_the_curve_without_matplotlibs_magic():
@@ -108,18 +110,15 @@ def test_the_best_return_is_seen_however_rare_it_is():
     assert 45.0 < high < 50.0
 
 
-def test_evaluations_are_drawn_at_their_steps():
-    figure = learning_curve(history(), evaluations=[evaluated(50_000), evaluated(100_000)])
-    points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))
-    np.testing.assert_array_equal(points.get_xdata(), [50_000, 100_000])
+@pytest.mark.parametrize(("against", "at"), [("step", [50_000, 100_000]), ("seconds", [4.9, 9.9])])
+def test_evaluations_are_drawn_at_their_steps_or_at_their_time(against, at):
+    """Episode 49 ended at step 50,000 after 4.9 s."""
+    evaluations = [evaluated(50_000), evaluated(100_000)]
+    axes = learning_curve(history(), against=against, evaluations=evaluations).axes[0]
+    points = next(line for line in axes.lines if line.get_label().startswith("evaluation"))
+    np.testing.assert_allclose(points.get_xdata(), at, rtol=1e-5)
     np.testing.assert_array_equal(points.get_ydata(), [-450, -450])
-
-
-def test_evaluations_stand_at_their_time_when_drawn_against_seconds():
-    figure = learning_curve(history(), against="seconds", evaluations=[evaluated(50_000)])
-    points = next(line for line in figure.axes[0].lines if line.get_label().startswith("evaluation"))
-    np.testing.assert_allclose(points.get_xdata(), [4.9], rtol=1e-5)  # episode 49 ended at step 50,000 after 4.9 s
-    assert figure.axes[0].get_xlabel() == "seconds of training"
+    assert (axes.get_xlabel() == "seconds of training") == (against == "seconds")
 
 
 @pytest.mark.parametrize("n", [0, 1])
@@ -138,17 +137,6 @@ def test_nothing_of_matplotlibs_global_state_is_touched():
     assert pyplot is None or not pyplot.get_fignums()
 
 
-def test_an_unknown_axis_is_an_error():
-    with pytest.raises(ValueError, match="step, seconds"):
-        learning_curve(history(), against="epochs")
-
-
-def test_without_matplotlib_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingExtra, match=r"rejeu\[plot\]"):
-        learning_curve(history())
-
-
 def test_an_evaluation_draws_every_episode_by_success_and_the_mean_with_its_interval(tmp_path):
     result = Evaluation(np.array([1.0, 5.0, 3.0]), np.array([9, 9, 9]), np.array([0.0, 1.0, 1.0]))
     panel = result.plot(tmp_path / "evaluation.png").axes[0]
@@ -159,9 +147,6 @@ def test_an_evaluation_draws_every_episode_by_success_and_the_mean_with_its_inte
     (band,) = panel.patches
     assert (band.get_y(), band.get_y() + band.get_height()) == pytest.approx(result.return_interval)
     assert (tmp_path / "evaluation.png").exists()
-
-
-def test_an_evaluation_of_one_episode_without_success_can_be_drawn():
     panel = Evaluation(np.array([1.0]), np.array([9]), np.array([np.nan])).plot().axes[0]
     assert not panel.patches
     assert [line.get_label() for line in panel.lines] == ["mean 1", "episodes"]

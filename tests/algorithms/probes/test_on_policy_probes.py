@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from tests.algorithms.probes.environments import BySight, BySightAndAction, Constant, Cut, CutByLimit, Endless, Later
-from tests.on_policy_agents import KINDS
+from tests.on_policy_agents import KINDS, every_kind
 from tests.tiers import crossed, only
 
 GAMMA = 0.5
-every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 some_kinds = pytest.mark.parametrize(
     "kind", only([KINDS["PPO, Box"], KINDS["A2C, Discrete"], KINDS["PQN, Discrete"]], KINDS.values()), ids=KINDS
 )

@@ -9,32 +9,7 @@ import rejeu
 from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import ByAction
 from tests.environments import Reach
-from tests.helpers import q_values, small_sac
-
-GAMMA = 0.5
-ALPHA = 0.01
-"""Fixed temperature: a uniform policy on [-1, 1] has entropy log 2, so no value moves by more than 0.007 / (1 - gamma)."""
-
-
-def solve(environment, steps=700):
-    return small_sac(
-        environment(),
-        gamma=GAMMA,
-        ent_coef=ALPHA,
-        learning_rate=1e-2,
-        tau=0.05,
-        batch_size=32,
-        buffer_size=2000,
-        learning_starts=64,
-        policy_kwargs={"net_arch": [32]},
-    ).learn(steps)
-
-
-def values(agent, sights):
-    """Values of the agent's own best actions, which are what is learnt best."""
-    obs = np.float32(sights)[:, None]
-    action = agent.predict(obs, deterministic=True)[0] - 1.0  # bounds 0 and 2 to -1 and 1
-    return q_values(agent, obs, action)
+from tests.helpers import small_sac
 
 
 def test_the_automatic_temperature_reaches_the_target_entropy():

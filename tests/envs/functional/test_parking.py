@@ -48,7 +48,7 @@ def check(n: int) -> None:
 
 @equal_to
 def test_steps_equal_highway_envs():
-    check(900)
+    check(500)
 
 
 @equal_to
