@@ -55,6 +55,7 @@ LEARNING = {"learning_rate": rejeu.Linear(2e-2, 1e-3), "gamma": 0.5, "policy_kwa
 ALGORITHMS = {
     "PPO": {"n_steps": 16, "batch_size": 16, "n_epochs": 4},
     "A2C": {"n_steps": 4, "learning_rate": rejeu.Linear(5e-2, 1e-2)},
+    "TRPO": {"n_steps": 16, "batch_size": 16, "n_critic_updates": 4, "target_kl": 0.03},
     "PQN": {
         "n_steps": 16,
         "batch_size": 16,

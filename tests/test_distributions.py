@@ -346,3 +346,25 @@ def test_logits_far_from_0_give_what_the_limit_gives(scale):
         gradient = jax.grad(lambda z, kind=kind, value=value: jnp.sum(kind(z).log_prob(value)))(logits)
         assert np.isfinite(gradient).all()
         assert np.abs(gradient).max() == 1.0
+
+
+KL_PAIRS = {
+    "normal": lambda rng: [Normal(*jnp.float32(rng.normal(size=(2, 3)) * 0.5)) for _ in range(2)],
+    "squashed": lambda rng: [TanhNormal(*jnp.float32(rng.normal(size=(2, 3)) * 0.5)) for _ in range(2)],
+    "choice": lambda rng: [Categorical(jnp.float32(rng.normal(size=4))) for _ in range(2)],
+    "choices": lambda rng: [
+        MultiCategorical(tuple(Categorical(jnp.float32(rng.normal(size=n))) for n in (2, 3))) for _ in range(2)
+    ],
+    "bits": lambda rng: [Bernoulli(jnp.float32(rng.normal(size=3))) for _ in range(2)],
+}
+
+
+@pytest.mark.parametrize("name", KL_PAIRS)
+def test_the_kl_divergence_is_the_mean_log_ratio_of_samples(name):
+    one, two = KL_PAIRS[name](np.random.default_rng(0))
+    keys = jax.random.split(jax.random.key(0), 100_000)
+    drawn = jax.vmap(one.sample)(keys)
+    ratio = np.asarray(jax.vmap(lambda x: one.log_prob(x) - two.log_prob(x))(drawn), np.float64)
+    deviation = ratio.std() / np.sqrt(len(ratio))
+    assert float(one.kl_divergence(two)) == pytest.approx(ratio.mean(), abs=4 * deviation)
+    assert float(one.kl_divergence(one)) == pytest.approx(0.0, abs=1e-6)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rejeu.agents import (
         A2C as A2C,
         AGENTS as AGENTS,
+        ARS as ARS,
         DDPG as DDPG,
         DQN as DQN,
         PPO as PPO,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
         SAC as SAC,
         TD3 as TD3,
         TQC as TQC,
+        TRPO as TRPO,
         CrossQ as CrossQ,
         MaskablePPO as MaskablePPO,
         OffPolicyAgent as OffPolicyAgent,
@@ -76,7 +78,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS DDPG DQN PPO PQN QRDQN SAC TD3 TQC CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent "
+    "rejeu.agents": "A2C AGENTS ARS DDPG DQN PPO PQN QRDQN SAC TD3 TQC TRPO CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent "
     "RecurrentPPO load register",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",

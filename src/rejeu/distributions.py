@@ -41,6 +41,12 @@ class Normal(NamedTuple):
         """Returns the most likely value, ``(..., action_dim)``."""
         return self.mean
 
+    def kl_divergence(self, other: Normal) -> Array:
+        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
+        shift = jnp.square((self.mean - other.mean) * jnp.exp(-other.log_std))
+        log_ratio = other.log_std - self.log_std
+        return jnp.sum(log_ratio + 0.5 * (jnp.exp(-2.0 * log_ratio) + shift - 1.0), axis=-1)
+
 
 class TanhNormal(NamedTuple):
     """A normal squashed into (-1, 1) by tanh (Haarnoja et al. 2018, arXiv 1801.01290, appendix C).
@@ -74,6 +80,10 @@ class TanhNormal(NamedTuple):
         """Returns the squashed mean, ``(..., action_dim)``."""
         return jnp.tanh(self.mean)
 
+    def kl_divergence(self, other: TanhNormal) -> Array:
+        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats: that before squashing."""
+        return Normal(self.mean, self.log_std).kl_divergence(Normal(other.mean, other.log_std))
+
 
 class Categorical(NamedTuple):
     """One choice among several; the last axis of the logits is the choices."""
@@ -100,6 +110,11 @@ class Categorical(NamedTuple):
         """Returns the most likely choice, ``int32 (...)``, the first of equals."""
         return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)
 
+    def kl_divergence(self, other: Categorical) -> Array:
+        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
+        own, others = jax.nn.log_softmax(self.logits), jax.nn.log_softmax(other.logits)
+        return jnp.sum(jnp.exp(own) * (own - others), axis=-1)
+
 
 class MultiCategorical(NamedTuple):
     """Several independent choices, each among its own number of possibilities; the last axis of a value is one event."""
@@ -123,6 +138,10 @@ class MultiCategorical(NamedTuple):
     def mode(self) -> Array:
         """Returns the most likely value, ``int32 (..., n_choices)``."""
         return jnp.stack([part.mode() for part in self.parts], axis=-1)
+
+    def kl_divergence(self, other: MultiCategorical) -> Array:
+        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
+        return sum_of([own.kl_divergence(theirs) for own, theirs in zip(self.parts, other.parts, strict=True)])
 
 
 class Bernoulli(NamedTuple):
@@ -149,6 +168,13 @@ class Bernoulli(NamedTuple):
     def mode(self) -> Array:
         """Returns the most likely bits, ``int32 (..., n)``."""
         return (self.logits > 0).astype(jnp.int32)
+
+    def kl_divergence(self, other: Bernoulli) -> Array:
+        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
+        one = jax.nn.log_sigmoid(self.logits) - jax.nn.log_sigmoid(other.logits)
+        zero = jax.nn.log_sigmoid(-self.logits) - jax.nn.log_sigmoid(-other.logits)
+        share = jax.nn.sigmoid(self.logits)
+        return jnp.sum(share * one + (1.0 - share) * zero, axis=-1)
 
 
 def log_tanh_slope(unsquashed: Array) -> Array:

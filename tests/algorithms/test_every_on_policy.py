@@ -1,4 +1,4 @@
-"""What holds for PPO, A2C and PQN on every kind of action: counting, repeating, learning in parts, saving, stopping."""
+"""What holds for PPO, A2C, TRPO and PQN on every kind of action: counting, repeating, learning in parts, saving, stopping."""
 
 from __future__ import annotations
 
@@ -46,6 +46,7 @@ CRITIC = {"value_loss", "entropy_loss", "explained_variance"}
 METRICS = {
     "PPO": {"loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "clip_range"} | CRITIC,
     "A2C": {"policy_loss"} | CRITIC,
+    "TRPO": {"policy_objective", "kl_divergence_loss", "is_line_search_success", "value_loss", "explained_variance"},
     "PQN": {"loss", "q_value"},
 }
 

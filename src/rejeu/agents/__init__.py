@@ -2,7 +2,7 @@
 
 from rejeu.agents.agent import Agent
 from rejeu.agents.off_policy import DDPG, DQN, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
-from rejeu.agents.on_policy import A2C, PPO, PQN, MaskablePPO, OnPolicyAgent, RecurrentPPO
+from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
 from rejeu.agents.registry import AGENTS, agent_of_file, find_agent, load, modules_of, register
 from rejeu.callbacks.base import Callback
 from rejeu.validation import whole_seed
@@ -10,6 +10,7 @@ from rejeu.validation import whole_seed
 __all__ = [
     "A2C",
     "AGENTS",
+    "ARS",
     "DDPG",
     "DQN",
     "PPO",
@@ -18,6 +19,7 @@ __all__ = [
     "SAC",
     "TD3",
     "TQC",
+    "TRPO",
     "Agent",
     "Callback",
     "CrossQ",

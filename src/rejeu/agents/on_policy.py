@@ -1,4 +1,4 @@
-"""Agents that learn from rollouts of their current policy: PPO, RecurrentPPO, MaskablePPO, A2C and PQN."""
+"""Agents that learn from rollouts of their current policy: PPO, RecurrentPPO, MaskablePPO, TRPO, A2C, PQN and ARS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rejeu import devices, spaces
 from rejeu.agents import policy
 from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
-from rejeu.algorithms import a2c, maskable_ppo, ppo, pqn, recurrent_ppo
+from rejeu.algorithms import a2c, ars, maskable_ppo, ppo, pqn, recurrent_ppo, trpo
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import Masked
@@ -105,7 +105,7 @@ class OnPolicyAgent(Agent):
             obs_leaves = (*obs_leaves, mask_leaf(env.action_space, env.env_id))
         n_steps = config.n_steps
         if config.n_episodes is not None:
-            n_steps = config.n_episodes * (env.max_episode_steps or config.n_steps)
+            n_steps = config.episodes(env.n_envs) * (env.max_episode_steps or config.n_steps)
         return RolloutBuffer(n_steps, env.n_envs, obs_leaves, structure, action.shape[1:], action.dtype, config.gamma)
 
     def keep_buffer(self, env: VectorEnv) -> None:
@@ -130,6 +130,18 @@ class A2C(OnPolicyAgent):
     """Advantage actor-critic (Mnih et al. 2016), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
 
     algorithm: ClassVar[ModuleType] = a2c
+
+
+class TRPO(OnPolicyAgent):
+    """Trust region policy optimization (Schulman et al. 2015), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
+
+    algorithm: ClassVar[ModuleType] = trpo
+
+
+class ARS(OnPolicyAgent):
+    """Augmented random search (Mania et al. 2018), without gradients, for Box and Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = ars
 
 
 class RecurrentPPO(OnPolicyAgent):

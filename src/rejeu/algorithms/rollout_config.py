@@ -34,6 +34,10 @@ class RolloutConfig(AlgorithmConfig):
         coerce(self, "n_steps", whole, least=1)
         coerce(self, "n_episodes", whole, least=1, optional=True)
 
+    def episodes(self, n_envs: int) -> int:
+        """Returns the complete episodes of each of ``n_envs`` environments between two updates; 0 if steps are counted."""
+        return self.n_episodes or 0
+
     def steps_per_gradient(self, n_envs: int) -> int:
         """Returns the number of steps of ``n_envs`` environments per gradient step."""
         return self.n_steps * n_envs

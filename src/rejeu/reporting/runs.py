@@ -362,6 +362,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
     """Returns ``given`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
     from rejeu.algorithms import (
         a2c,
+        ars,
         config,
         crossq,
         ddpg,
@@ -374,9 +375,10 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         sac,
         td3,
         tqc,
+        trpo,
     )
 
-    modules: tuple[Any, ...] = (a2c, crossq, ddpg, dqn, maskable_ppo, ppo, pqn, qrdqn, recurrent_ppo, sac, td3, tqc)
+    modules: Any = (a2c, ars, crossq, ddpg, dqn, maskable_ppo, ppo, pqn, qrdqn, recurrent_ppo, sac, td3, tqc, trpo)
     kinds = {module.Config.name: module.Config for module in modules} | config.registered
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
 

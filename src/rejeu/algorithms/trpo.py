@@ -1,0 +1,246 @@
+"""Trust region policy optimization: the largest step of the policy within a bound on its KL divergence.
+
+Source: Schulman et al. 2015, "Trust Region Policy Optimization" (arXiv 1502.05477, appendix C), with the advantages of
+:mod:`rejeu.algorithms.actor_critic.gae`. With the policy ``pi``, the policy ``pi_old`` that collected the rollout,
+advantages ``A``, the mean divergence ``D(theta) = mean KL(pi_old(. | s) || pi(. | s))``, its Hessian ``F`` at ``pi_old``
+and the bound ``delta``::
+
+    L(theta)  = mean pi(a | s) / pi_old(a | s) A
+    x         = (F + cg_damping I)^-1 g,     g = gradient of L at pi_old,        by conjugate gradients
+    theta     = theta_old + shrink^i sqrt(2 delta / (x . (F + cg_damping I) x)) x
+
+for the first ``i`` from 0 at which ``L`` has improved and ``D < delta``; the policy stays if there is none. Then the value
+takes ``n_critic_updates`` passes of gradient steps on ``mean (V(s) - R)^2``, ``R = A + V_old``. Products with ``F`` are
+derivatives of the gradient of ``D``, so the matrix is never formed.
+
+Defaults are those of Stable-Baselines3 Contrib. Unlike there, ``D`` is the paper's divergence also in the line search, where
+sb3-contrib has the reversed one; to second order the two are equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from gymnasium import spaces
+from jax import Array
+from jax.scipy.sparse.linalg import cg
+
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.actor_critic.config import OnPolicyConfig
+from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of, is_value
+from rejeu.algorithms.actor_critic.steps import (
+    Samples,
+    explained_variance,
+    masked_mean,
+    minibatches,
+    samples,
+    standardized,
+)
+from rejeu.algorithms.search import NearOne, SearchSpace, Uniform
+from rejeu.core import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
+from rejeu.prng import nth
+from rejeu.schedules import Schedule, at
+from rejeu.validation import coerce, number, whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(OnPolicyConfig):
+    """Hyperparameters of TRPO; the defaults are those of Stable-Baselines3 Contrib."""
+
+    learning_rate: float | Schedule = 1e-3
+    """Learning rate of the value. The policy's step follows from ``target_kl``."""
+    batch_size: int = 128
+    """Steps per gradient step of the value."""
+    target_kl: float = 0.01
+    """Bound on the mean KL divergence between two policies, in nats. A larger value takes larger, riskier steps."""
+    cg_max_steps: int = 15
+    """Steps of conjugate gradients. More find the direction more precisely, at a higher cost."""
+    cg_damping: float = 0.1
+    """Added to the diagonal of the Hessian. A larger value is more stable and turns the step toward the plain gradient."""
+    line_search_shrinking_factor: float = 0.8
+    """Factor of the step after each attempt that is refused, in (0, 1)."""
+    line_search_max_iter: int = 10
+    """Attempts before the policy stays as it is."""
+    n_critic_updates: int = 10
+    """Passes of the value over every rollout."""
+    sub_sampling_factor: int = 1
+    """Every so many steps of the rollout count for the policy's step. A larger number computes less."""
+    max_grad_norm: float | None = None
+    """Limit of the norm of the value's gradient. None: no limit."""
+    # Class variables in place of inherited fields take the fields away: they have no meaning here.
+    ent_coef: ClassVar[float] = 0.0  # type: ignore[misc]
+    vf_coef: ClassVar[float] = 1.0  # type: ignore[misc]
+    critic_learning_rate: ClassVar[None] = None  # type: ignore[misc]
+
+    name: ClassVar[str] = "TRPO"
+    search_space: ClassVar[SearchSpace] = {
+        "gamma": NearOne(0.9, 0.9999),
+        "gae_lambda": NearOne(0.8, 0.99),
+        "target_kl": Uniform(0.001, 0.1),
+    }
+
+    def __post_init__(self) -> None:
+        OnPolicyConfig.__post_init__(self)
+        whole_fields = ("batch_size", "cg_max_steps", "line_search_max_iter", "n_critic_updates", "sub_sampling_factor")
+        coerce(self, whole_fields, whole, least=1)
+        coerce(self, "target_kl", number, above=0)
+        coerce(self, "cg_damping", number, least=0)
+        coerce(self, "line_search_shrinking_factor", number, above=0, most=1)
+
+    def gradient_steps(self, n: int) -> int:
+        """Returns the number of gradient steps on a rollout of ``n`` steps: those of the value, and one of the policy."""
+        return 1 + self.n_critic_updates * -(-n // self.batch_size)
+
+
+class State(eqx.Module):
+    """Everything that TRPO learns; every leaf is an array."""
+
+    network: ActorCritic
+    optimizer: PyTree
+    """Of the value."""
+    key: Array
+    """Root of the orders of the minibatches, ``uint32[2]``; never changes."""
+    n_updates: Array
+    """Gradient steps so far, ``int32[]``."""
+    n_rollouts: Array
+    """Rollouts learned from, ``int32[]``."""
+
+
+class Step(NamedTuple):
+    """The policy's step on a rollout, each ``float32[]``."""
+
+    objective: Array
+    """``L`` after the step."""
+    kl: Array
+    """Mean KL divergence from the policy before, in nats."""
+    accepted: Array
+    """1 if the line search took a step, else 0."""
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns TRPO for these spaces.
+
+    Raises:
+        ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
+    """
+    obs_leaves, kind, shape = checked(config, observation_space, action_space)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+
+    def init(key: Array) -> State:
+        network_key, update_key = jax.random.split(key)
+        network = ActorCritic(network_key, obs_leaves, kind, shape, config.use_sde)
+        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+
+    def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
+        return actor.policy(obs).sample(key)
+
+    def exploit(actor: ActorCritic, obs: PyTree) -> Array:
+        return actor.policy(obs).mode()
+
+    def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
+        data = samples(state.network, rollout, config.gae_lambda)
+        network, taken = policy_step(state.network, data, config)
+        order_key = nth(state.key, state.n_rollouts)
+        minibatch, n_steps = minibatches(data, order_key, config.n_critic_updates, config.batch_size)
+        rate = at(config.learning_rate, clock.progress)
+
+        def fit(i: Array, learned: tuple[ActorCritic, PyTree, Array]) -> tuple[ActorCritic, PyTree, Array]:
+            network, optimizer_state, total = learned
+            network, optimizer_state, loss, _ = minimize(
+                value_loss, network, optimizer_state, optimizer, rate, minibatch(i)
+            )
+            return network, optimizer_state, total + loss
+
+        network, optimizer_state, total = jax.lax.fori_loop(
+            0, n_steps, fit, (network, state.optimizer, jnp.float32(0.0))
+        )
+        metrics = {
+            "policy_objective": taken.objective,
+            "kl_divergence_loss": taken.kl,
+            "is_line_search_success": taken.accepted,
+            "value_loss": total / jnp.maximum(n_steps, 1),
+            GRADIENT_STEPS: (1 + n_steps).astype(jnp.float32),
+            EXPLAINED_VARIANCE: explained_variance(data.value, data.target, data.valid),
+            "learning_rate": jnp.asarray(rate, jnp.float32),
+        }
+        if network.log_std is not None:
+            metrics["std"] = jnp.mean(jnp.exp(network.log_std))
+        n_updates = state.n_updates + 1 + n_steps
+        return State(network, optimizer_state, state.key, n_updates, state.n_rollouts + 1), metrics
+
+    def value(carry: PyTree, network: ActorCritic, obs: PyTree, ended: Array) -> Array:
+        return network.value(obs)
+
+    explorer = explorer_of(config, kind)
+    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
+
+
+def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:
+    """Returns the network after the policy's step, and the figures of that step.
+
+    What belongs to the value alone stays. Layers that policy and value share move with the policy.
+    """
+    data = jax.tree.map(lambda x: x[:: config.sub_sampling_factor], data)
+    if config.normalize_advantage:
+        data = data._replace(advantage=standardized(data.advantage, data.valid))
+    of_value, policy = eqx.partition(network, is_value(network))
+    before = jax.lax.stop_gradient(network.policy(data.obs))
+
+    def objective(policy: Any) -> Array:
+        distribution = eqx.combine(policy, of_value).policy(data.obs)
+        log_ratio = jnp.where(data.valid, distribution.log_prob(data.action) - data.log_prob, 0.0)
+        return masked_mean(jnp.exp(log_ratio) * data.advantage, data.valid)
+
+    def divergence(policy: Any) -> Array:
+        after = eqx.combine(policy, of_value).policy(data.obs)
+        return masked_mean(before.kl_divergence(after), data.valid)
+
+    start, gradient = jax.value_and_grad(objective)(policy)
+    product = damped_product(divergence, policy, config.cg_damping)
+    direction, _ = cg(product, gradient, maxiter=config.cg_max_steps)
+    curvature = dot(direction, product(direction))
+    longest = jnp.sqrt(2.0 * config.target_kl / jnp.maximum(curvature, jnp.finfo(jnp.float32).tiny))
+
+    def moved(attempt: Array) -> Any:
+        length = longest * config.line_search_shrinking_factor ** attempt.astype(jnp.float32)
+        return jax.tree.map(lambda p, d: p + length * d, policy, direction)
+
+    def tried(attempt: Array) -> Step:
+        candidate = moved(attempt)
+        reached, kl = objective(candidate), divergence(candidate)
+        return Step(reached, kl, ((reached > start) & (kl < config.target_kl)).astype(jnp.float32))
+
+    def search(attempt: tuple[Array, Step]) -> tuple[Array, Step]:
+        return attempt[0] + 1, tried(attempt[0] + 1)
+
+    refused = lambda attempt: (attempt[1].accepted == 0) & (attempt[0] + 1 < config.line_search_max_iter)  # noqa: E731
+    attempt, step = jax.lax.while_loop(refused, search, (jnp.int32(0), tried(jnp.int32(0))))
+    stays = Step(start, jnp.float32(0.0), jnp.float32(0.0))
+    accepted = step.accepted > 0
+    policy, step = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), (moved(attempt), step), (policy, stays))
+    return eqx.combine(policy, of_value), step
+
+
+def damped_product(function: Callable[[Any], Array], at_point: Any, damping: float) -> Callable[[Any], Any]:
+    """Returns the product of a vector with the Hessian of ``function`` at ``at_point``, plus ``damping`` times the vector."""
+
+    def product(vector: Any) -> Any:
+        _, curved = jax.jvp(jax.grad(function), (at_point,), (vector,))
+        return jax.tree.map(lambda h, v: h + damping * v, curved, vector)
+
+    return product
+
+
+def dot(left: Any, right: Any) -> Array:
+    """Returns the sum of the products of all numbers of two trees, ``float32[]``."""
+    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), left, right))))
+
+
+def value_loss(network: ActorCritic, batch: Samples) -> tuple[Array, None]:
+    """Returns the mean square of the value's errors in a minibatch."""
+    return masked_mean(jnp.square(network.value(batch.obs) - batch.target), batch.valid), None
