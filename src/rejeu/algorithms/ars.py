@@ -135,8 +135,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     check_action(action_space, config.name)
     if not isinstance(action_space, spaces.Box | spaces.Discrete):
         raise ValueError(f"ARS needs Box or Discrete actions, got {action_space}; use PPO")
-    is_box = isinstance(action_space, spaces.Box)
-    n_outputs = action_dimension(action_space) if is_box else int(action_space.n)
+    n_outputs = action_dimension(action_space) if isinstance(action_space, spaces.Box) else int(action_space.n)
     obs_leaves, shape = network_inputs(config, observation_space)
     widths = shape.actor_widths(())
 
@@ -149,7 +148,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def act(network: Network, obs: PyTree) -> Array:
         outputs = network(obs)
-        if not is_box:
+        if not isinstance(action_space, spaces.Box):
             return jnp.argmax(outputs, axis=-1).astype(jnp.int32)
         return jnp.tanh(outputs) if widths else jnp.clip(outputs, -1.0, 1.0)
 
