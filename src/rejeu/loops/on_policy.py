@@ -116,7 +116,7 @@ def begin_episodes(run: Run, config: RolloutConfig) -> None:
 def begin(run: Run, config: RolloutConfig) -> None:
     """Starts a rollout at the current observations."""
     run.replay.begin(run.carry, run.ended)
-    run.playing = np.full(run.env.n_envs, config.episodes(run.env.n_envs))
+    run.playing = np.full(run.env.n_envs, 0 if config.n_episodes is None else config.episodes(run.env.n_envs))
 
 
 def which_count(run: Run, stepped: np.ndarray | None, last: int | None) -> np.ndarray | None:
