@@ -11,12 +11,14 @@ import importlib.util
 import os
 import re
 import shlex
+import shutil
 import sys
 import warnings
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
+import gymnasium
 import pytest
 
 import rejeu
@@ -25,6 +27,8 @@ from rejeu.algorithms import ppo, sac
 from rejeu.experiments import process
 from rejeu.experiments.plan import read_plan
 from rejeu.runs import values
+from rejeu.sb3 import load_zip
+from tests.sb3_models import MadeUp
 
 ROOT = Path(__file__).parents[1]
 WRITTEN = Path(os.environ.get("REJEU_PAGES", ROOT))
@@ -108,7 +112,19 @@ def import_box2d():
         pytest.importorskip("Box2D")
 
 
-PREPARATIONS = {"docs/play.md": play_a_recording, "docs/networks.md": import_box2d}
+def give_a_model_of_stable_baselines3():
+    """Copies a model, and registers an environment of its spaces."""
+    for end, name in (("zip", "model.zip"), ("pkl", "vecnormalize.pkl")):
+        shutil.copy(ROOT / "tests" / "data" / "sb3" / f"ppo-normalized.{end}", name)
+    agent = load_zip("model.zip")
+    gymnasium.register("MyEnv-v0", lambda: MadeUp(agent.observation_space, agent.action_space))
+
+
+PREPARATIONS = {
+    "docs/play.md": play_a_recording,
+    "docs/networks.md": import_box2d,
+    "docs/sb3-models.md": give_a_model_of_stable_baselines3,
+}
 
 
 @pytest.fixture
@@ -143,6 +159,7 @@ def test_the_examples_of_a_page_run(page, short, request, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     if prepare := PREPARATIONS.get(page.relative_to(WRITTEN).as_posix()):
         prepare()
+    if page.name in ("play.md", "networks.md"):
         request.getfixturevalue("windows_close")
     if page.name == "tuning.md":
         request.getfixturevalue("trainings_pretend")

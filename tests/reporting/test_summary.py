@@ -147,6 +147,8 @@ def test_the_parts_of_a_nested_observation_are_listed():
         "  icon (9, 9, 3) -> 32 x 4x4/2 -> 64 x 3x3/1 -> 256",
         "  pose (2, 3) -> 6",
     ]
+    learner, obs = state(PolicyConfig(cnn_features=20), space=space)
+    assert "  icon (9, 9, 3) -> 32 x 4x4/2 -> 64 x 3x3/1 -> 20" in describe(learner, obs)
 
 
 def test_an_agent_draws_itself():

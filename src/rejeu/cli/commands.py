@@ -441,6 +441,25 @@ class Status:
     json: PrintJson = False
 
 
+@dataclass(frozen=True)
+class Import(EnvironmentOptions):
+    """Converts a model of Stable-Baselines3 to a model file of rejeu, without executing code from it.
+
+    The agent acts as the original does. Example: rejeu import model.zip --vecnormalize vecnormalize.pkl --env CartPole-v1
+    """
+
+    model: Annotated[Path, Shown("FILE", is_positional=True, help="The zip file.")]
+    vecnormalize: Annotated[Path | None, Shown("FILE")] = None
+    """File of the VecNormalize that the policy was trained behind; the agent then normalizes by its statistics."""
+    env: Annotated[str | None, Shown("ENV")] = None
+    """Environment, as for rejeu train, which the model file then names, for rejeu evaluate and others."""
+    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    """Hyperparameters that replace those of the file."""
+    out: Annotated[Path | None, Shown("FILE")] = None
+    """Model file to write; by default next to the zip file, under its name."""
+    json: Json = False
+
+
 COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "tune": Tune,
@@ -460,6 +479,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "course": Course,
     "report": Report,
     "class": Class,
+    "import": Import,
 }
 """The arguments of each command, by its name."""
 MODULES = {
@@ -468,6 +488,7 @@ MODULES = {
     "course": "courses",
     "evaluate": "models",
     "export": "models",
+    "import": "converting",
     "pbt": "tune",
     "play": "models",
     "record": "models",

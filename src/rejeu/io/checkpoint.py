@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -220,9 +221,10 @@ def _explained(path: str | Path) -> Iterator[None]:
     except (FileNotFoundError, CheckpointError):
         raise
     except (Malformed, SafetensorError) as error:
-        raise CheckpointError(
-            f"{shown_path} is not a complete safetensors file ({shown(error)}); it was cut short or is from another program"
-        ) from None
+        advice = "it was cut short or is from another program"
+        if zipfile.is_zipfile(path):
+            advice = "it is a zip file; rejeu import converts those of Stable-Baselines3"
+        raise CheckpointError(f"{shown_path} is not a complete safetensors file ({shown(error)}); {advice}") from None
     except OSError as error:
         raise CheckpointError(f"{shown_path} cannot be read: {error.strerror or error}") from None
     except MemoryError:

@@ -26,7 +26,7 @@ from rejeu import normalization
 from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
 from rejeu.core import averaged_fields
-from rejeu.networks import MLP, Branches, Linear, Network, QNetwork, SimBa, convolutions
+from rejeu.networks import MLP, Branches, Encoder, Linear, Network, PolicyConfig, QNetwork, SimBa, convolutions
 from rejeu.spaces import Leaf
 
 ARROW = " -> "
@@ -49,7 +49,9 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
     }
     reach = max((branch_width(network) for network in networks.values()), default=0)
     paragraphs = [f"{name}: {count(network)}\n{draw(network, reach)}" for name, network in networks.items()]
-    return "\n\n".join([*paragraphs, *inputs(leaves)])
+    parts = jax.tree.leaves(networks, is_leaf=lambda part: isinstance(part, Encoder))
+    shape = next((part.shape for part in parts if isinstance(part, Encoder)), PolicyConfig())
+    return "\n\n".join([*paragraphs, *inputs(leaves, shape)])
 
 
 def n_parameters(network: Any) -> int:
@@ -144,16 +146,16 @@ def branch_width(network: Any) -> int:
     return branches_width(network.torso) if is_branched else 0
 
 
-def inputs(leaves: tuple[Leaf, ...]) -> list[str]:
+def inputs(leaves: tuple[Leaf, ...], shape: PolicyConfig) -> list[str]:
     """Returns the parts of the observation, one line for each leaf."""
     if len(leaves) == 1 and leaves[0].kind == "continuous" and len(leaves[0].shape) == 1:
         return [f"state: {leaves[0].shape[0]}"]
-    return ["state:\n" + "\n".join(f"  {leaf.path or 'observation'} {entrance(leaf)}" for leaf in leaves)]
+    return ["state:\n" + "\n".join(f"  {leaf.path or 'observation'} {entrance(leaf, shape)}" for leaf in leaves)]
 
 
-def entrance(leaf: Leaf) -> str:
+def entrance(leaf: Leaf, shape: PolicyConfig) -> str:
     """Returns the encoding of an observation leaf: ``(84, 84, 4) -> 32 x 8x8/4 ... -> 512``."""
-    kind = convolutions(leaf)
+    kind = convolutions(leaf, shape)
     steps = [str(leaf.shape)]
     if kind is not None:
         steps += [f"{filters} x {side}x{side}/{stride}" for filters, side, stride in kind.layers]

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rejeu.sb3.algorithms import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
     from rejeu.sb3.common.buffers import HerReplayBuffer
     from rejeu.sb3.common.utils import get_system_info
+    from rejeu.sb3.zip_files import load_zip
 
 __all__ = [
     "A2C",
@@ -34,6 +35,7 @@ __all__ = [
     "MaskablePPO",
     "RecurrentPPO",
     "get_system_info",
+    "load_zip",
 ]
 
 
@@ -41,7 +43,11 @@ def __getattr__(name: str) -> Any:
     """Imports an algorithm when it is first used, so that worker processes need not."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    elsewhere = {"HerReplayBuffer": "rejeu.sb3.common.buffers", "get_system_info": "rejeu.sb3.common.utils"}
+    elsewhere = {
+        "HerReplayBuffer": "rejeu.sb3.common.buffers",
+        "get_system_info": "rejeu.sb3.common.utils",
+        "load_zip": "rejeu.sb3.zip_files",
+    }
     return getattr(importlib.import_module(elsewhere.get(name, "rejeu.sb3.algorithms")), name)
 
 

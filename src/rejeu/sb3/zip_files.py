@@ -1,0 +1,502 @@
+"""The zip files and ``VecNormalize`` files of Stable-Baselines3 and its Contrib package, read without executing their code.
+
+A zip file holds ``data``, JSON with the hyperparameters, in which some values are pickles; ``policy.pth`` with the weights,
+one file of each optimizer's state, and ``pytorch_variables.pth``. :mod:`rejeu.sb3.pickled` reads pickles as data.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import jax
+import msgspec
+import numpy as np
+
+from rejeu import core, normalization, spaces
+from rejeu.agents.agent import Agent
+from rejeu.agents.model_files import check_depths
+from rejeu.agents.registry import BUILT_IN
+from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
+from rejeu.io.records import Malformed, brief, shown
+from rejeu.sb3.conversion import EXTRACTORS, Policy, converted, parts_of, shares_extractor
+from rejeu.sb3.pickled import UNREADABLE, Name, Record, array_of, opened, parse, tensors_of
+
+MOST_DATA = 16 * 2**20
+"""Upper limit on the bytes of ``data``."""
+MOST_FIELD = 4 * 2**20
+"""Upper limit on the bytes of one of its values, and of a ``VecNormalize`` file."""
+EXPANSION = 16
+"""Upper limit on the size of the unpacked content relative to that of the file: weights can hardly be compressed."""
+ON_POLICY = ("PPO", "A2C", "MaskablePPO", "RecurrentPPO")
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+"""Hyperparameters that are numbers here and may be code in a file."""
+IGNORED: tuple[str, ...] = (
+    "action_noise",
+    "exploration_schedule",
+    "nonfinite",
+    "optimizer",
+    "policy_kwargs",
+    "replay_buffer_class",
+)
+IGNORED += ("replay_buffer_kwargs", "train_freq")
+"""Hyperparameters that have another form in a file."""
+
+
+class Pickled(msgspec.Struct):
+    """A value of ``data`` that is not JSON."""
+
+    content: str | None = msgspec.field(default=None, name=":serialized:")
+
+
+class Model(NamedTuple):
+    """The content of a zip file."""
+
+    fields: Mapping[str, msgspec.Raw]
+    """The values of ``data``, still as JSON."""
+    tensors: Mapping[str, Any]
+    """Of each file with the ending ``.pth``, by its name without it."""
+    room: int
+    """Bytes of the file."""
+
+    def value(self, key: str) -> Any:
+        """Returns a value of ``data``; the parts that it would create by code are records. None if it is missing.
+
+        Raises:
+            Malformed: if it cannot be read as data.
+        """
+        raw = bytes(self.fields.get(key, b"null"))
+        if len(raw) > MOST_FIELD:
+            raise Malformed(f"{key} has more than {MOST_FIELD:,} bytes")
+        if raw.startswith(b"{") and (text := msgspec.json.decode(raw, type=Pickled).content) is not None:
+            with part_of(f"data: {key}"):
+                return parse(base64.b64decode(text))
+        return msgspec.json.decode(raw)
+
+    def readable(self, key: str) -> Any:
+        """Returns a value of ``data``, or the error if it cannot be read as data."""
+        try:
+            return self.value(key)
+        except Malformed as error:
+            return error
+
+    @property
+    def group(self) -> dict[str, Any]:
+        """The settings of the policy's optimizer."""
+        for name in ("policy.optimizer", "actor.optimizer"):
+            if isinstance(optimizer := self.tensors.get(name), dict) and optimizer.get("param_groups"):
+                return dict(optimizer["param_groups"][0])
+        return {}
+
+
+@contextlib.contextmanager
+def part_of(name: str) -> Iterator[None]:
+    """Turns errors of a damaged part into ``Malformed`` with its name."""
+    try:
+        yield
+    except UNREADABLE as error:
+        raise Malformed(f"{name}: {brief(error)}") from None
+
+
+@contextlib.contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Turns errors of a damaged file into ``CheckpointError`` with its path."""
+    try:
+        yield
+    except (FileNotFoundError, CheckpointError):
+        raise
+    except UNREADABLE as error:
+        raise CheckpointError(f"{path} cannot be read as a file of Stable-Baselines3: {brief(error)}") from None
+
+
+def read(path: Path) -> Model:
+    """Returns the content of a zip file.
+
+    Raises:
+        Malformed: if it is damaged, too large, or no model of Stable-Baselines3.
+    """
+    found = path.stat()
+    room = min(found.st_size, 512 * getattr(found, "st_blocks", found.st_size))
+    with path.open("rb") as file, opened(file, EXPANSION * room + 2**20) as archive:
+        sizes = {info.filename: info.file_size for info in archive.infolist()}
+        if not {"data", "policy.pth"} <= sizes.keys() or sizes["data"] > MOST_DATA:
+            raise Malformed("it has no data and policy.pth, or too much data")
+        fields = msgspec.json.decode(archive.read("data"), type=dict[str, msgspec.Raw])
+        tensors = {}
+        for name in sizes:
+            if name.endswith(".pth"):
+                with part_of(name):
+                    tensors[name.removesuffix(".pth")] = tensors_of(archive.read(name))
+    weights = tensors["policy"]
+    if not isinstance(weights, dict) or not all(isinstance(one, np.ndarray) for one in weights.values()):
+        raise Malformed("policy.pth holds something else than tensors by name")
+    return Model(fields, tensors, room)
+
+
+def algorithm_of(model: Model) -> str:
+    """Returns the name of the algorithm, which the weights and hyperparameters tell.
+
+    Raises:
+        Malformed: if it is none of those that rejeu has.
+    """
+    modules = {".".join(key.split(".")[:2]) for key in model.tensors["policy"]} | set(model.tensors["policy"])
+    roots = {name.split(".")[0] for name in modules}
+    if "quantile_net" in roots or "q_net" in roots:
+        return "QRDQN" if "quantile_net" in roots else "DQN"
+    if "lstm_actor" in roots:
+        return "RecurrentPPO"
+    if "action_net" in roots and "value_net" in roots:
+        if "clip_range" not in model.fields:
+            return "A2C"
+        policy = model.value("policy_class")
+        return "MaskablePPO" if isinstance(policy, Name) and "maskable" in policy.module.lower() else "PPO"
+    if "actor.latent_pi" in modules and "critic" in roots:
+        if "critic_target" not in roots:
+            return "CrossQ"
+        return "TQC" if "top_quantiles_to_drop_per_net" in model.fields else "SAC"
+    if {"actor.mu", "critic.qf0", "actor_target.mu"} <= modules:
+        is_ddpg = model.value("policy_delay") == 1 and "critic.qf1" not in modules
+        return "DDPG" if is_ddpg and model.value("target_noise_clip") == 0 else "TD3"
+    return unknown(roots)
+
+
+def unknown(roots: set[str]) -> str:
+    """Raises ``Malformed`` for a policy of another algorithm."""
+    raise Malformed(
+        f"its policy has the parts {shown(', '.join(sorted(roots)))}, of no algorithm that rejeu has; it reads DQN, QRDQN, "
+        "PPO, A2C, SAC, TD3, DDPG, TQC, CrossQ, RecurrentPPO and MaskablePPO"
+    )
+
+
+def described(value: Any) -> Any:
+    """Returns the description of a space as :func:`rejeu.spaces.describe` gives it, from what a file says of it.
+
+    Raises:
+        Malformed: for another kind of space.
+    """
+    kind = value.name.rpartition(".")[2] if isinstance(value, Record) and ".spaces." in value.name else ""
+    state = value.state if kind else None
+    if not isinstance(state, dict):
+        raise Malformed("it is no space of Gymnasium")
+    if kind == "Dict" and isinstance(state["spaces"], dict):
+        return {"Dict": {str(key): described(part) for key, part in state["spaces"].items()}}
+    if kind == "Box":
+        low, high = array_of(state["low"]), array_of(state["high"])
+        return {"Box": {"low": low.tolist(), "high": high.tolist(), "shape": list(low.shape), "dtype": low.dtype.name}}
+    if kind == "Discrete":
+        return {"Discrete": {"n": int(array_of(state["n"])), "start": int(array_of(state.get("start", 0)))}}
+    if kind == "MultiDiscrete":
+        n = array_of(state["nvec"])
+        start = array_of(state["start"]) if isinstance(state.get("start"), Record) else np.zeros_like(n)
+        return {"MultiDiscrete": {"nvec": n.tolist(), "start": start.tolist()}}
+    if kind == "MultiBinary":
+        shape = state["n"] if isinstance(state["n"], tuple | list) else [state["n"]]
+        return {"MultiBinary": {"shape": [int(array_of(n)) for n in shape]}}
+    raise Malformed(f"it is the space {shown(kind, 40)}, which policies of Stable-Baselines3 do not take")
+
+
+def space_of(model: Model, key: str) -> tuple[gym.Space, list[str]]:
+    """Returns a space, and the keys of a Dict in the order of the file.
+
+    Raises:
+        Malformed: if it cannot be read.
+    """
+    with part_of(f"data: {key}"):
+        description = described(model.value(key))
+        return spaces.rebuild(description, max(spaces.MAX_NUMBERS, model.room)), [*description.get("Dict", ())]
+
+
+def observation_space_of(own: gym.Space, given: gym.Space | None) -> gym.Space:
+    """Returns the observation space of an agent: that of the environment, if it is given.
+
+    Raises:
+        Malformed: if the policy was trained on another; the axes of images may be in another order, as behind
+            Stable-Baselines3's ``VecTransposeImage``.
+    """
+    if given is None:
+        return own
+    plain = lambda leaf: leaf if leaf.kind != "image" else dataclasses.replace(leaf, shape=tuple(sorted(leaf.shape)))  # noqa: E731
+    if [*map(plain, spaces.leaves(own))] != [*map(plain, spaces.leaves(given))]:
+        raise Malformed(f"its observation space is {own}, and the environment's is {given}")
+    return given
+
+
+def number_of(value: Any) -> Any:
+    """Returns the number that a schedule of Stable-Baselines3 always gives; other values as they are."""
+    for key in ("value_schedule", "val"):
+        value = value.state.get(key) if isinstance(value, Record) and isinstance(value.state, dict) else value
+    return array_of(value).item() if isinstance(value, Record) and value.name.endswith(".scalar") else value
+
+
+def settings_of(kind: Any, model: Model, notes: list[str]) -> dict[str, Any]:
+    """Returns the hyperparameters of a file that rejeu has too; what is left out goes to ``notes``."""
+    names = {field.name for field in dataclasses.fields(kind)}
+    found: dict[str, Any] = {}
+    for name in sorted(names & model.fields.keys() - {*IGNORED}):
+        value = number_of(model.readable(name))
+        if name in SCHEDULES and not isinstance(value, int | float | None):
+            value = model.group.get("lr") if name == "learning_rate" else None
+            notes.append(f"{name} is code in the file; " + (f"{value:g} is used" if value else "the default is used"))
+        if isinstance(value, bool | int | float | str) or name not in SCHEDULES:
+            found[name] = value
+    if "train_freq" in names and isinstance(value := model.readable("train_freq"), Record | int):
+        n, unit = value.arguments if isinstance(value, Record) else (value, "step")
+        unit = unit.arguments[0] if isinstance(unit, Record) else unit
+        found["train_freq"] = n if unit == "step" else (n, unit)
+    if isinstance(buffer := model.readable("replay_buffer_class"), Name) and buffer.name == "HerReplayBuffer":
+        settings = model.readable("replay_buffer_kwargs")
+        known = [
+            key
+            for key in ("n_sampled_goal", "goal_selection_strategy")
+            if isinstance(settings, dict) and key in settings
+        ]
+        found |= {"replay_buffer_class": buffer.name, "replay_buffer_kwargs": {key: settings[key] for key in known}}
+    if "action_noise" in names and (noise := model.readable("action_noise")) is not None:
+        state = noise.state if isinstance(noise, Record) and isinstance(noise.state, dict) else {}
+        sigma = np.unique(array_of(state["_sigma"])) if "_sigma" in state and "_theta" not in state else np.zeros(2)
+        if sigma.size == 1 and not array_of(state["_mu"]).any():
+            found["action_noise"] = float(sigma[0])
+        else:
+            notes.append("action_noise is not taken over; give it again for training")
+    if "rms_prop_eps" in names:
+        found |= {"rms_prop_eps": model.group.get("eps", 1e-5), "use_rms_prop": "alpha" in model.group}
+    return found
+
+
+def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, Any]:
+    """Returns ``policy_kwargs``, and hyperparameters that are among those of the policy there.
+
+    The widths of layers are those of the weights.
+
+    Raises:
+        Malformed: for settings of a policy that rejeu does not have.
+    """
+    given = model.value("policy_kwargs") or {}
+    if not isinstance(given, dict):
+        raise Malformed("data: policy_kwargs are no dict")
+    extractor = given.get("features_extractor_class")
+    if extractor is not None and not (isinstance(extractor, Name) and extractor.name in EXTRACTORS):
+        raise Malformed(
+            f"its feature extractor is of another kind than {', '.join(EXTRACTORS)}, and no file holds code"
+        )
+    for key, expected in {"use_expln": False, "full_std": True, "clip_mean": 2.0}.items():
+        if given.get(key, expected) != expected:
+            raise Malformed(f"policy_kwargs has {key}={shown(given[key], 40)}, which is not read")
+    shape: dict[str, Any] = {"normalize_images": given.get("normalize_images", True)}
+    if (activation := given.get("activation_fn")) is not None:
+        shape["activation_fn"] = activation.name.lower() if isinstance(activation, Name) else "of another kind"
+        if shape["activation_fn"] == "gelu":
+            raise Malformed("its activation_fn is GELU, of which JAX has an approximation; the outputs would differ")
+    dims = {policy.n_features(leaf) for leaf in policy.leaves if leaf.kind == "image"}
+    if len(dims) > 1:
+        raise Malformed(f"its images have {sorted(dims)} features, expected one number")
+    shape |= {"cnn_features": dims.pop()} if dims else {}
+    changes: dict[str, Any] = {"policy_kwargs": shape}
+    if algorithm in ON_POLICY:
+        shared = policy.widths("mlp_extractor.shared_net")
+        nets = {"pi": "policy_net", "vf": "value_net"}
+        shape["net_arch"] = {key: shared + policy.widths(f"mlp_extractor.{name}") for key, name in nets.items()}
+        shape["squash_output"] = policy.squashes
+        shape["share_features_extractor"] = shares_extractor(policy)
+        if algorithm == "RecurrentPPO":
+            if "lstm_actor.weight_ih_l1" in policy.weights or policy.has("critic"):
+                raise Malformed("it has several layers of LSTM, or a critic without one, which rejeu does not have")
+            shape["lstm_hidden_size"] = int(policy.weights["lstm_actor.weight_hh_l0"].shape[1])
+            shape["shared_lstm"] = not policy.has("lstm_critic")
+        return changes
+    if "actor.log_std" in policy.weights and algorithm == "CrossQ":
+        raise Malformed("it explores by state-dependent noise (use_sde=True), which CrossQ does not have in rejeu")
+    if algorithm in ("DQN", "QRDQN"):
+        name = "q_net" if algorithm == "DQN" else "quantile_net"
+        *widths, n_outputs = policy.widths(f"{name}.{name}")
+        shape["net_arch"] = widths
+        return changes | ({} if algorithm == "DQN" else {"n_quantiles": n_outputs // int(policy.action_space.n)})  # type: ignore[attr-defined]
+    *critic, n_outputs = policy.widths("critic.qf0")
+    pi = policy.widths("actor.latent_pi") if algorithm in ("SAC", "TQC", "CrossQ") else policy.widths("actor.mu")[:-1]
+    shape["net_arch"] = {"pi": pi, "qf": critic}
+    if algorithm != "DDPG":
+        changes["n_critics"] = len({key.split(".")[1] for key in policy.weights if key.startswith("critic.qf")})
+    return changes | ({"n_quantiles": n_outputs} if algorithm == "TQC" else {})
+
+
+def read_normalization(path: Path) -> dict[str, Any]:
+    """Returns the attributes of a ``VecNormalize`` file.
+
+    Raises:
+        Malformed: if it is none, or damaged.
+    """
+    with path.open("rb") as file:
+        data = file.read(MOST_FIELD + 1)
+    if len(data) > MOST_FIELD:
+        raise Malformed(f"it has more than {MOST_FIELD:,} bytes")
+    found = parse(data)
+    if not isinstance(found, Record) or not found.name.endswith("VecNormalize") or not isinstance(found.state, dict):
+        raise Malformed("it holds no VecNormalize")
+    return found.state
+
+
+def moments(field: str, value: Any) -> dict[str, np.ndarray]:
+    """Returns the arrays of a running mean and variance."""
+    if not isinstance(value, Record) or not isinstance(value.state, dict):
+        raise Malformed(f"it has no running statistics for {field}")
+    mean, variance, count = (array_of(value.state[key]) for key in ("mean", "var", "count"))
+    seen = min(float(count), normalization.MAX_COUNT)
+    return {f"{field}.mean": mean, f"{field}.variance": variance, f"{field}.n_seen": np.asarray(seen)}
+
+
+def statistics_of(
+    state: Mapping[str, Any], leaves: tuple[spaces.Leaf, ...]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Returns the setting ``normalize`` and the statistics of a ``VecNormalize`` as those of an agent.
+
+    Raises:
+        Malformed: if they cannot be expressed.
+    """
+    keys = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "epsilon")
+    settings = {key: state[key] for key in keys}
+    arrays = moments("statistics.returns", state["ret_rms"])
+    obs = state["obs_rms"] if state["norm_obs"] else None
+    for leaf, group in zip(leaves, spaces.groups(leaves), strict=True):
+        if obs is None or (group is None and not isinstance(obs, dict)):
+            continue
+        one = obs.get(leaf.path) if isinstance(obs, dict) else obs
+        if (one is None) != (group is None):
+            raise Malformed(f"it normalizes other parts of observations than an agent does: {leaf.path}")
+        if group is not None:
+            field = f"statistics.obs.{group}"
+            made = moments(field, one)
+            if any(not np.array_equal(made[key], arrays.get(key, made[key])) for key in made):
+                raise Malformed("achieved_goal and desired_goal have statistics of their own, and share them in rejeu")
+            arrays |= made
+    return settings, arrays
+
+
+def load_zip(path: str | Path, env: Any = None, vecnormalize: str | Path | None = None, **changes: Any) -> Agent:
+    """Returns the agent of a zip file that Stable-Baselines3 or its Contrib package saved. No code from the file is run.
+
+    The agent acts as the original does: actions, values and probabilities are equal up to rounding. It holds the
+    optimizer's state and the counters, so ``learn(..., reset_num_timesteps=False)`` continues. What could not be taken over is
+    in its attribute ``notes``. See ``docs/sb3-models.md``.
+
+    Args:
+        path: of the file; ``.zip`` is added if it has no suffix.
+        env: environments to continue training in, as for :meth:`rejeu.Agent.load`; None for an agent that only predicts.
+        vecnormalize: the file of the ``VecNormalize`` that the policy was trained behind. The agent normalizes by its
+            statistics and takes raw observations.
+        changes: constructor arguments and hyperparameters that replace those of the file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if the file is damaged, names code, or its policy cannot be expressed; the message says which part.
+    """
+    path = Path(path)
+    path = path if path.suffix else path.with_name(f"{path.name}.zip")
+    with explained(path):
+        model = read(path)
+        algorithm = algorithm_of(model)
+    state = None
+    if vecnormalize is not None:
+        with explained(Path(vecnormalize)):
+            state = read_normalization(Path(vecnormalize))
+    cls = BUILT_IN[algorithm]
+    agent: Agent = cls.__new__(cls)
+    own = {
+        key: changes.pop(key) for key in [*changes] if key in ("seed", "device", "verbose", "log", "tensorboard_log")
+    }
+    outputs = {key: own.pop(key) for key in [*own] if key in ("verbose", "log", "tensorboard_log")}
+    with explained(path):
+        seed = model.value("seed")
+        own.setdefault("seed", seed if isinstance(seed, int) and 0 <= seed < 2**32 else None)
+        notes: list[str] = []
+        file_space, keys = space_of(model, "observation_space")
+        action_space, _ = space_of(model, "action_space")
+        kwargs = model.readable("policy_kwargs")
+        squashes = algorithm in ON_POLICY and isinstance(kwargs, dict) and kwargs.get("squash_output") is True
+        policy = Policy(model.tensors["policy"], spaces.leaves(file_space), keys, action_space, squashes)
+        settings = settings_of(cls.algorithm.Config, model, notes)
+        settings |= policy_settings(model, policy, algorithm)
+        arrays: dict[str, np.ndarray] = {}
+    if state is not None:
+        with explained(Path(vecnormalize or path)):
+            settings["normalize"], arrays = statistics_of(state, policy.leaves)
+    with explained(path):
+        config = cls.algorithm.Config(**settings | changes)
+        check_depths(config)
+    name = spaces.POLICIES[1] if keys else spaces.POLICIES[2 if policy.leaves[0].kind == "image" else 0]
+    agent.configure(name, config, **own)
+    agent.set_outputs(**outputs)
+    vector = None if env is None else agent.make_envs(env, 1, seed=agent.seed)
+    with explained(path):
+        agent.build(
+            observation_space_of(file_space, None if vector is None else vector.observation_space), action_space
+        )
+        prefix = "" if config.normalize is None else "learner."
+        parts = parts_of(algorithm, policy, getattr(config, "n_quantiles", 1))
+        found, left_out = converted(parts, policy, model.tensors)
+        notes += [f"the state of {name} is not taken over: it is of another optimizer" for name in left_out]
+        found |= counts_of(algorithm, model)
+        arrays |= {f"{prefix}{key}": value for key, value in found.items()}
+        arrays = checked(agent.learner.shapes, arrays, [f"{prefix}{part.field}." for part in parts])
+        agent.start_run(None)
+        agent.set_parameters(arrays, exact_match=False)
+        restore_counters(agent, model, found)
+    if vector is not None:
+        agent.set_env(vector)
+        agent.made_from_id = isinstance(env, str)
+    agent.notes = notes  # type: ignore[attr-defined]
+    return agent
+
+
+def counts_of(algorithm: str, model: Model) -> dict[str, np.ndarray]:
+    """Returns the counters and the temperature among the arrays of a state."""
+    variables = model.tensors.get("pytorch_variables")
+    found: dict[str, Any] = {}
+    if isinstance(variables, dict) and isinstance(log_alpha := variables.get("log_ent_coef"), np.ndarray):
+        found["log_alpha"] = log_alpha.reshape(())
+        optimizer = model.tensors.get("ent_coef_optimizer")
+        moments = optimizer["state"].get(0) if isinstance(optimizer, dict) else None
+        if moments:
+            found |= {"alpha_optimizer.count": np.asarray(int(moments["step"]))}
+            for ours, theirs in (("mu", "exp_avg"), ("nu", "exp_avg_sq")):
+                found[f"alpha_optimizer.{ours}"] = moments[theirs].reshape(())
+    if algorithm in ("DQN", "QRDQN"):
+        found["step"] = np.asarray(model.value("num_timesteps"))
+    return found
+
+
+def checked(shapes: Any, arrays: Mapping[str, np.ndarray], fields: list[str]) -> dict[str, np.ndarray]:
+    """Returns arrays in the dtypes of the state, after their shapes have been compared with those of our networks.
+
+    Raises:
+        CheckpointError: if one is missing or of another shape.
+    """
+    expected = dict(zip(core.names(shapes), jax.tree.leaves(shapes), strict=True))
+    for name, leaf in expected.items():
+        if name not in arrays and name.startswith(tuple(fields)):
+            raise CheckpointError(f"it has nothing for {name} {list(leaf.shape)}: the policy is of another structure")
+    for name, array in arrays.items():
+        if name not in expected or expected[name].shape != array.shape:
+            wanted = list(expected[name].shape) if name in expected else "nothing of that name"
+            raise CheckpointError(
+                f"{name} is {list(array.shape)}, expected {wanted}: the policy is of another structure"
+            )
+    result = {name: np.asarray(array, expected[name].dtype) for name, array in arrays.items()}
+    checkpoint.require_finite(result, "its weights")
+    return result
+
+
+def restore_counters(agent: Agent, model: Model, found: Mapping[str, np.ndarray]) -> None:
+    """Sets steps, episodes and gradient steps of an agent, which Stable-Baselines3 counts in epochs for PPO."""
+    step, episode, n_updates = (model.value(key) for key in ("num_timesteps", "_episode_num", "_n_updates"))
+    counts = [value if isinstance(value, int) and 0 <= value < 2**31 else 0 for value in (step, episode, n_updates)]
+    if "optimizer.count" in found:
+        counts[2] = int(found["optimizer.count"])
+    agent.run.step, agent.run.episode, agent.run.n_updates = counts
+    names = [name for name in core.names(agent.learner.shapes) if name.split(".")[-1] == "n_updates"]
+    agent.set_parameters({name: np.asarray(counts[2], np.int32) for name in names}, exact_match=False)

@@ -1,0 +1,90 @@
+"""Files of PyTorch and of Stable-Baselines3, made without either, to test what reads them."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import pickle
+import sys
+import types
+import zipfile
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+
+def torch_modules() -> dict[str, types.ModuleType]:
+    """Returns modules with the names that a file of tensors mentions, so that pickle can write them."""
+    torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
+
+    def _rebuild_tensor_v2() -> None: ...
+
+    _rebuild_tensor_v2.__module__, _rebuild_tensor_v2.__qualname__ = "torch._utils", "_rebuild_tensor_v2"
+    utils._rebuild_tensor_v2, torch._utils = _rebuild_tensor_v2, utils
+    torch.FloatStorage = type("FloatStorage", (), {"__module__": "torch"})
+    return {"torch": torch, "torch._utils": utils}
+
+
+class Tensor:
+    """An array that is written as a tensor."""
+
+    def __init__(self, array: Any) -> None:
+        self.array = np.ascontiguousarray(array, np.float32)
+
+
+def torch_file(content: Any, storages: Mapping[str, bytes] | None = None) -> bytes:
+    """Returns a file of PyTorch; ``Tensor`` objects in ``content`` become tensors, each with a storage of its own."""
+    modules, found = torch_modules(), {}
+
+    class Writer(pickle.Pickler):
+        def persistent_id(self, obj: Any) -> Any:
+            return obj[1] if isinstance(obj, tuple) and obj[:1] == ("a storage",) else None
+
+        def reducer_override(self, obj: Any) -> Any:
+            if not isinstance(obj, Tensor):
+                return NotImplemented
+            array, key = obj.array, str(len(found))
+            found[key] = array.tobytes()
+            storage = ("a storage", ("storage", modules["torch"].FloatStorage, key, "cpu", array.size))
+            strides = tuple(n // 4 for n in array.strides)
+            arguments = (storage, 0, array.shape, strides, False, OrderedDict())
+            return modules["torch._utils"]._rebuild_tensor_v2, arguments
+
+    stream = io.BytesIO()
+    with mock.patch.dict(sys.modules, modules):
+        Writer(stream, protocol=2).dump(content)
+    members = {"data.pkl": stream.getvalue(), "byteorder": b"little"}
+    members |= {f"data/{key}": value for key, value in {**found, **(storages or {})}.items()}
+    return zipped({f"archive/{name}": value for name, value in members.items()}, zipfile.ZIP_STORED)
+
+
+def zipped(members: Mapping[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """Returns a zip file."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", compression) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def members_of(content: bytes) -> dict[str, bytes]:
+    """Returns the members of a zip file."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def changed(content: bytes, data: Mapping[str, Any] | None = None, **files: bytes) -> bytes:
+    """Returns a model file with other values in ``data``, and other files; ``policy_pth`` stands for ``policy.pth``."""
+    members = members_of(content)
+    members["data"] = json.dumps({**json.loads(members["data"]), **(data or {})}).encode()
+    return zipped({**members, **{name.replace("_pth", ".pth"): value for name, value in files.items()}})
+
+
+def serialized(value: Any) -> dict[str, str]:
+    """Returns a value as Stable-Baselines3 writes it if it is not JSON."""
+    content = value if isinstance(value, bytes) else pickle.dumps(value)
+    return {":type:": str(type(value)), ":serialized:": base64.b64encode(content).decode()}
