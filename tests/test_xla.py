@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu import xla
+from rejeu import core, xla
+from rejeu.algorithms import optimizers
 from rejeu.loops.learner import Packing
 
 
@@ -57,6 +58,21 @@ def test_a_packed_state_that_xla_splits_between_threads_is_compiled(n_runs):
     packed = jax.vmap(xla.for_runs(doubled, n_runs))
     (found,) = jax.jit(packed)(leaves)
     assert found.reshape(n_runs, 12, -1)[:, :, 0].tolist() == [[2.0 * i for i in range(12)]] * n_runs
+
+
+def test_a_step_with_compiled_functions_inside_is_compiled_for_several_runs():
+    """RAdam, of PQN, selects by ``jnp.where``, which is such a function."""
+    optimizer = optimizers.make("radam")
+    weights = [jnp.ones((3, 128, 128))]
+    begin = weights, jax.vmap(optimizer.init)(weights)
+
+    def steps(begin):
+        step = lambda _, now: core.descend(now[0], now[0], now[1], optimizer, 0.1)  # noqa: E731
+        return jax.lax.fori_loop(0, 2, step, begin)[0]
+
+    (found,) = jax.jit(jax.vmap(xla.for_runs(steps, 3)))(begin)
+    (expected,) = steps(jax.tree.map(lambda x: x[0], begin))
+    np.testing.assert_allclose(found, jnp.broadcast_to(expected, found.shape), rtol=1e-6)
 
 
 def test_other_processors_are_told_nothing(monkeypatch):

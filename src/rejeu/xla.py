@@ -6,6 +6,7 @@ import functools
 import math
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any, TypeVar, cast
 
 import jax
@@ -180,7 +181,8 @@ def _marked(function: F, marks: dict[str, str], most: float, concatenates: int =
                 complete[i] = array
             with set_xla_metadata(**dict.fromkeys(marks)):  # marks the call, not the operations inside
                 arguments, keywords = jax.tree.unflatten(structure, complete)
-                return function(*arguments, **keywords)
+                with jax.disable_jit() if marks is ONE_KERNEL and _n_runs > 1 else nullcontext():  # XLA splits calls
+                    return function(*arguments, **keywords)
 
         of_arrays.__name__ = getattr(function, "__name__", of_arrays.__name__)  # a profile shows it
         with set_xla_metadata(**marks):
