@@ -7,6 +7,7 @@ import weakref
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -137,3 +138,19 @@ def test_compiled_programs_are_collected_with_their_agents(seeds: int) -> None:
     del agents
     gc.collect()
     assert kept() is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "env_id", "settings"),
+    [
+        (rejeu.PPO, "jax/CartPole-v1", {"n_steps": 16, "batch_size": 16}),
+        (rejeu.PQN, "jax/CartPole-v1", {"n_steps": 16}),
+        (rejeu.PQN, "CartPole-v1", {"n_steps": 16}),
+        (rejeu.SAC, "jax/Pendulum-v1", {"priorities": {}, "learning_starts": 20, "batch_size": 8}),
+    ],
+)
+def test_agents_train_where_jax_computes_in_64_bits(kind: Any, env_id: str, settings: Any) -> None:
+    with jax.enable_x64(True):
+        agent = kind("MlpPolicy", env_id, policy_kwargs={"net_arch": [4]}, seed=0, **settings).learn(64)
+        assert agent.n_updates > 0
+        assert all(array.dtype != np.float64 for array in agent.get_parameters().values())

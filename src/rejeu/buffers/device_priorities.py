@@ -65,14 +65,14 @@ def add(priorities: DevicePriorities, index: Array, following: Array) -> DeviceP
 def changed(priorities: DevicePriorities, index: Array, value: Array) -> DevicePriorities:
     """Returns the priorities with ``value`` ``(n,)`` at ``index`` ``(n,)``, which must differ except for ``NOWHERE``."""
     before = priorities.values.at[index].get(mode="fill", fill_value=0)
-    values = priorities.values.at[index].set(value, mode="drop", unique_indices=True)
+    values = priorities.values.at[index].set(value.astype(jnp.float32), mode="drop", unique_indices=True)
     block = jnp.where(index == NOWHERE, NOWHERE, index // WIDTH)
     sums = added_up(values.reshape(-1, WIDTH).at[block].get(mode="fill", fill_value=0))
     more = jnp.where(index == NOWHERE, 0, (value > 0).astype(jnp.int32) - (before > 0).astype(jnp.int32))
     return priorities._replace(
         values=values,
         sums=priorities.sums.at[block].set(sums, mode="drop"),  # of repeated blocks all sums are equal
-        n_steps=priorities.n_steps + jnp.sum(more),
+        n_steps=priorities.n_steps + jnp.sum(more, dtype=jnp.int32),
     )
 
 

@@ -130,7 +130,7 @@ def minibatches(data: D, key: Array, n_epochs: int, batch_size: int) -> tuple[Ca
     steps: Any = data
     n = steps.valid.shape[0]
     size = min(batch_size, n)
-    n_valid = jnp.sum(steps.valid)
+    n_valid = jnp.sum(steps.valid, dtype=jnp.int32)
     n_batches = (n_valid + size - 1) // size
     orders = shuffled(key, steps.valid, n_epochs, -n % size)
 
