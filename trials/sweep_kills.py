@@ -12,8 +12,7 @@ kill is a SIGKILL at a random moment: of a run; of the command that began them, 
 of a Ray worker, or of everything that belongs to a node, in whose place a new one begins.
 
 ``together`` is four seeds of SAC in one program. Killed, each continues alone, and sums are rounded otherwise there. So its
-models are compared with those of an undisturbed ``rejeu resume`` from the same checkpoints, and the largest difference from
-the models of an undisturbed program is noted.
+models are compared with those of an undisturbed ``rejeu resume`` from the same checkpoints.
 
 Before each kill of a run the training time since its newest checkpoint is noted, which is what it loses. The others let
 their runs stop with a checkpoint. All arrays of the final models are compared bit for bit, and at the end no process
@@ -237,14 +236,6 @@ def all_have_checkpoints(folder: Path) -> bool:
     return bool(found) and all(found)
 
 
-def largest_difference(one: dict[str, Any], other: dict[str, Any]) -> float:
-    """Returns the largest difference between two numbers at the same place of the same models."""
-    import numpy as np
-
-    pairs = [(one[name][key], other[name][key]) for name in one.keys() & other.keys() for key in one[name]]
-    return max(float(np.max(np.abs(a.astype(np.float64) - b), initial=0.0)) for a, b in pairs)
-
-
 def trial(
     kind: str,
     words: list[str],
@@ -261,8 +252,6 @@ def trial(
     ends: list[float] = []
     different: list[str] = []
     failed = rounds = 0
-    program = undisturbed
-    change = 0.0
     options = ["--workers", "2"] + (["--ray", cluster.cluster.address] if cluster else [])
     at_once = ["--jobs", "2"] if kind == "seeds" else options
     while counts.total() < kills:
@@ -290,9 +279,7 @@ def trial(
                 sweep = start(["resume", str(folder), *options], log)
         failed += sweep.returncode != 0
         ends.append(wait_for_end(folder))
-        found = models(folder)
-        different += [f"{folder.name}/{name}" for name in differing(undisturbed, found)]
-        change = max(change, largest_difference(program, found)) if kind == "together" else change
+        different += [f"{folder.name}/{name}" for name in differing(undisturbed, models(folder))]
     if failed:
         print((root / "printed.log").read_text(encoding="utf-8"))
     return {
@@ -303,7 +290,6 @@ def trial(
         "runs": rounds * len(undisturbed),
         "most_seconds_of_training_lost": round(max(lost, default=0.0), 2),
         "models_that_differ": different,
-        **({"largest_difference_from_one_program": change} if kind == "together" else {}),
         "most_seconds_until_no_process_was_left": round(max(ends), 2),
     }
 
