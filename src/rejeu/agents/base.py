@@ -20,7 +20,7 @@ import numpy as np
 
 from rejeu import devices, hardware, spaces, validation, xla
 from rejeu.algorithms import config as configs, contract
-from rejeu.callbacks.base import RunFolder, Stateful
+from rejeu.callbacks.base import Stateful
 from rejeu.core import Algorithm
 from rejeu.envs.make import Backend, VectorEnv
 from rejeu.exploration import explorer as exploration
@@ -151,7 +151,7 @@ class BaseAgent(ABC):
     """Class names and states of callbacks in a resumed checkpoint, until ``learn`` restores them."""
     resumed: Resumed | None = None
     """Where :meth:`resume` continued the run; None for a new or loaded agent."""
-    run_folders: dict[Path, RunFolder]
+    run_folders: dict[Path, Any]
     """Folders that contain its checkpoints, by path."""
     failed_writes: FailedWrites
     """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""

@@ -82,8 +82,7 @@ def run_folder(agent: BaseAgent, folder: Path) -> RunFolder:
     path = folder.resolve()
     if path not in agent.run_folders:
         agent.run_folders[path] = RunFolder(agent, folder)
-    found = agent.run_folders[path]
-    assert isinstance(found, RunFolder)
+    found: RunFolder = agent.run_folders[path]
     return found
 
 

@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from rejeu.envs.base import VectorEnv
-from rejeu.io.failed_writes import FailedWrites
-from rejeu.loops.run import Progress, Run
-from rejeu.loops.training_call import TrainingCall
-from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.history import History
-from rejeu.reporting.logging import Logger
+from rejeu.loops.run import Progress
 
 Callback = Callable[[Any, Progress], bool | None]
 """Called after every step of the environments as ``callback(agent, progress)``. Only ``False`` stops training."""
@@ -61,60 +53,6 @@ class Periodic(Protocol):
     """The interval; None for another one."""
 
 
-class RunFolder(Protocol):
-    """The folder of the checkpoints of a run."""
-
-    def open(self) -> None:
-        """Locks the folder for this process, after a check that it belongs to this run."""
-
-    def close(self) -> None:
-        """Releases the lock."""
-
-    def is_empty(self) -> bool:
-        """Returns whether it contains no checkpoint."""
-
-    def save(self, keep: int, reason: str = "") -> Path:
-        """Writes a checkpoint, deletes all but the newest ``keep``, and returns its path."""
-
-
-class TrainedAgent(Protocol):
-    """What the callbacks of this package use of an agent."""
-
-    run: Run
-    history: History
-    seed: int
-    failed_writes: FailedWrites
-    logger: Logger
-    ep_info_buffer: deque[dict[str, float]]
-    """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
-    ep_success_buffer: deque[float]
-    training_call: TrainingCall | None
-
-    @property
-    def env(self) -> VectorEnv | None:
-        """The environments it trains on."""
-
-    @property
-    def n_envs(self) -> int:
-        """How many these are."""
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Wall time spent training, by what it was spent on."""
-
-    def evaluate(self, episodes: int | None = None, env: Any = None, *, seed: int | None = None) -> Evaluation:
-        """Plays whole episodes and returns their returns, lengths and successes."""
-
-    def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
-        """Keeps the present weights if ``score`` is the best so far."""
-
-    def snapshot(self, path: str | Path) -> Callable[[], Path]:
-        """Returns a function that saves the model as it is now."""
-
-    def run_folder(self, folder: str | Path) -> RunFolder:
-        """Returns the folder of its checkpoints."""
-
-
 def crossed(before: int, now: int, every: int) -> bool:
     """Returns whether a multiple of ``every`` lies in ``(before, now]``.
 
@@ -124,7 +62,7 @@ def crossed(before: int, now: int, every: int) -> bool:
     return now // every > before // every
 
 
-def step_before(agent: TrainedAgent, progress: Progress, n_steps: int | None = None) -> int:
+def step_before(agent: Any, progress: Progress, n_steps: int | None = None) -> int:
     """Returns the total environment steps before the first turn of a ``learn`` of ``n_steps`` (None: of more than a turn)."""
     taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
     return max(progress.step - taken, 0)

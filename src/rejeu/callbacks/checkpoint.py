@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 
-from rejeu.callbacks.base import RunFolder, TrainedAgent, TrainingCallback, crossed
+from rejeu.callbacks.base import TrainingCallback, crossed
 from rejeu.errors import NonFiniteError
 from rejeu.io.failed_writes import RETRY_SECONDS
 from rejeu.loops.run import Progress
@@ -56,13 +56,13 @@ class Checkpoint(TrainingCallback):
         self.keep = whole("keep", keep, least=1)
         self.seconds = 0.0
         """Wall time spent saving."""
-        self._run_folder: RunFolder | None = None
+        self._run_folder: Any = None
         self._saved: tuple[int, int] | None = None
         self._last_step = 0
         self._last_time = 0.0
         self._retry_at = math.inf
 
-    def before_training(self, agent: TrainedAgent) -> None:
+    def before_training(self, agent: Any) -> None:
         """Locks the folder, and saves at once if it contains no checkpoint.
 
         Raises:
@@ -76,7 +76,7 @@ class Checkpoint(TrainingCallback):
         if folder.is_empty():
             self.save(agent)
 
-    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
+    def __call__(self, agent: Any, progress: Progress) -> None:
         """Saves if a checkpoint is due."""
         before, self._last_step = self._last_step, progress.step
         by_steps = self.every is not None and crossed(before, progress.step, self.every)
@@ -85,7 +85,7 @@ class Checkpoint(TrainingCallback):
         if by_steps or by_time or now >= self._retry_at:
             self._attempt(agent)
 
-    def after_training(self, agent: TrainedAgent, error: BaseException | None) -> None:
+    def after_training(self, agent: Any, error: BaseException | None) -> None:
         """Saves and releases the folder. After an error that leaves numbers that are not finite, nothing is saved."""
         try:
             if error is None:
@@ -96,7 +96,7 @@ class Checkpoint(TrainingCallback):
             if self._run_folder is not None:
                 self._run_folder.close()
 
-    def save(self, agent: TrainedAgent, reason: str = "") -> Path | None:
+    def save(self, agent: Any, reason: str = "") -> Path | None:
         """Saves now, unless nothing has happened since the last time; returns the path, or None.
 
         Args:
@@ -115,7 +115,7 @@ class Checkpoint(TrainingCallback):
         self.seconds += self._last_time - began
         return path
 
-    def _attempt(self, agent: TrainedAgent, reason: str = "") -> None:
+    def _attempt(self, agent: Any, reason: str = "") -> None:
         """Saves; if that fails, warns and tries again after a minute."""
         what = f"checkpoints in {self.folder}"
         written = agent.failed_writes.attempt(what, lambda: self.save(agent, reason), retry=False)
@@ -124,7 +124,7 @@ class Checkpoint(TrainingCallback):
             self._last_time = time.monotonic()
             self._retry_at = self._last_time + RETRY_SECONDS
 
-    def _save_after(self, error: Exception, agent: TrainedAgent) -> None:
+    def _save_after(self, error: Exception, agent: Any) -> None:
         """Saves what is intact after an error within a step: the resumed run starts with new episodes."""
         if any(array.is_deleted() for array in jax.tree.leaves(agent.run.state)):
             return  # the error came between two states

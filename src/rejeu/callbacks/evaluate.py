@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from rejeu.callbacks.base import TrainedAgent, TrainingCallback, crossed, step_before
+from rejeu.callbacks.base import TrainingCallback, crossed, step_before
 from rejeu.envs.make import VectorEnv, make_vector
 from rejeu.loops.run import Progress
 from rejeu.reporting.evaluation import Evaluation
@@ -78,19 +78,19 @@ class Evaluate(TrainingCallback):
         self._last_step: int | None = None
         self._is_due = False
 
-    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
+    def __call__(self, agent: Any, progress: Progress) -> None:
         """Evaluates if an evaluation is due."""
         before = step_before(agent, progress) if self._last_step is None else self._last_step
         self._last_step = progress.step
         if crossed(before, progress.step, self.every):
             self.run(agent, progress.step)
 
-    def resumed(self, agent: TrainedAgent) -> None:
+    def resumed(self, agent: Any) -> None:
         """Repeats the evaluation at which the run was stopped."""
         if self._is_due:
             self.run(agent, agent.run.step)
 
-    def run(self, agent: TrainedAgent, step: int) -> Evaluated:
+    def run(self, agent: Any, step: int) -> Evaluated:
         """Evaluates now, regardless of ``every``; keeps and returns the result.
 
         Raises:

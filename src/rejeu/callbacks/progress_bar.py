@@ -6,9 +6,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from rejeu.callbacks.base import TrainedAgent, TrainingCallback, step_before
+from rejeu.callbacks.base import TrainingCallback, step_before
 from rejeu.loops.run import Progress, time_shares
 from rejeu.loops.training_call import TrainingCall
 from rejeu.reporting import notebook
@@ -81,7 +81,7 @@ class ProgressBar(TrainingCallback):
         self._taken, self._spent = taken, spent
         self._first_step = 0
         self._step_before: int | None = None
-        self._latest: tuple[TrainedAgent, int] | None = None
+        self._latest: tuple[Any, int] | None = None
         self._shown_step = -1
         self._marks: deque[_Mark] = deque()
 
@@ -90,11 +90,11 @@ class ProgressBar(TrainingCallback):
         """Returns the bar of a call of ``learn``, of which ``taken`` steps were taken before it was resumed."""
         return cls(call.n_steps, call.seconds, taken=taken, spent=call.spent)
 
-    def before_training(self, agent: TrainedAgent) -> None:
+    def before_training(self, agent: Any) -> None:
         """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""
         self._step_before = agent.run.step
 
-    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
+    def __call__(self, agent: Any, progress: Progress) -> None:
         """Refreshes the bar if it is due."""
         now = time.perf_counter()
         if self._latest is None:
@@ -103,7 +103,7 @@ class ProgressBar(TrainingCallback):
         if now >= self._refresh_at:
             self._refresh(agent, progress.step, now)
 
-    def after_training(self, agent: TrainedAgent, error: BaseException | None) -> None:
+    def after_training(self, agent: Any, error: BaseException | None) -> None:
         """Closes it."""
         self.close()
 
@@ -117,7 +117,7 @@ class ProgressBar(TrainingCallback):
         if self._animated:
             self._bar.stop()
 
-    def _start(self, agent: TrainedAgent, progress: Progress, now: float) -> None:
+    def _start(self, agent: Any, progress: Progress, now: float) -> None:
         before = self._step_before
         if before is None:
             before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
@@ -128,7 +128,7 @@ class ProgressBar(TrainingCallback):
         elif self._display is None:
             self._refresh_at = now + LINE_SECONDS
 
-    def _refresh(self, agent: TrainedAgent, step: int, now: float) -> None:
+    def _refresh(self, agent: Any, step: int, now: float) -> None:
         self._shown_step = step
         self._refresh_at = now + self._period
         self._marks.append(_Mark(now, step, agent.seconds))

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from rejeu.callbacks.base import TrainedAgent, crossed, step_before
+from rejeu.callbacks.base import crossed, step_before
 from rejeu.loops.run import Progress
 from rejeu.reporting.video import record_video
 from rejeu.validation import whole
@@ -63,7 +63,7 @@ class RecordVideo:
         self._last_step: int | None = None
         self._n_episodes = 0
 
-    def __call__(self, agent: TrainedAgent, progress: Progress) -> None:
+    def __call__(self, agent: Any, progress: Progress) -> None:
         """Records a video if one is due."""
         before = step_before(agent, progress) if self._last_step is None else self._last_step
         self._last_step = progress.step

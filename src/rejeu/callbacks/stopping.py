@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from rejeu.callbacks.base import Callback, TrainedAgent
+from rejeu.callbacks.base import Callback
 from rejeu.loops.run import Episode, Progress
 from rejeu.validation import whole
 
@@ -38,14 +39,14 @@ def stop_on_success(rate: float, episodes: int = 100) -> Callback:
 def _stop_on_mean(least: float, episodes: int, value: Callable[[Episode], float]) -> Callback:
     whole("episodes", episodes, least=1)
 
-    def stop(agent: TrainedAgent, progress: Progress) -> bool:
+    def stop(agent: Any, progress: Progress) -> bool:
         last = agent.history.last(episodes) if progress.episodes else []
         return not (len(last) == episodes and np.mean([value(episode) for episode in last]) >= least)
 
     return stop
 
 
-def print_records(agent: TrainedAgent, progress: Progress) -> None:
+def print_records(agent: Any, progress: Progress) -> None:
     """Prints a line for every record, an episode with a higher return than all before it in the agent's history.
 
     It is a callback for ``learn``. ``agent.history.records()`` returns the same episodes.
