@@ -55,7 +55,7 @@ def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeyp
     assert tune("--trials", "2", "--final-seeds", "0", out=tmp_path / "study") == 0
     printed = capsys.readouterr().out
     assert "1 of 2 trials have ended, best return" in printed
-    assert "hyperparameters" in printed
+    assert "of 40 steps, return" in printed
     assert "trial   1  complete" in printed
 
 

@@ -4,7 +4,7 @@ import pytest
 
 import rejeu
 from rejeu.experiments.jobs import MAX_JOBS
-from rejeu.experiments.plan import PlanError, line_of, read_plan
+from rejeu.experiments.plan import PlanError, read_plan
 
 PLAN = """\
 # two algorithms
@@ -77,48 +77,56 @@ def test_a_setting_for_some_algorithms():
 
 
 MISTAKES = [
-    ("learning_rate", "learning_rat", 11, "DQN has no setting 'learning_rat'; did you mean learning_rate?"),
-    ("1e-3", "-1", 11, "learning_rate=-1 must not fall below 0"),
-    ("steps = 1e3", "steps = 1.5", 5, "expected `int"),
-    ("steps =", "stepz =", 5, "did you mean steps?"),
-    ('"DQN", "PPO"', '"DQN", "PPP"', 3, "did you mean PPO?"),
-    ('"DQN", "PPO"', '"DQN", "TQC"', 2, "TQC needs a Box action space"),
-    ("Acrobot-v1", "Acrobat-v1", 2, "did you mean Acrobot-v1"),
-    ("Acrobot-v1", "os:Acrobot-v1", 2, "no file may name a module"),
-    ("Acrobot-v1", "CartPole-v1", 2, "names one twice"),
-    ("train_freq = 8", "train_freq = 'x'", 17, "train_freq='x' must be"),
-    ("  8,", "  'x',", 12, "net_arch=['x'] must hold"),
-    ("memory", "memori", 20, "did you mean memory?"),
-    ("2 GB", "2 XB", 20, "such as '4 GB'"),
-    ("seeds = 2", "seeds = [1, 1]", 4, "different seeds"),
-    ("seeds = 2", "seeds = nan", 4, "finite"),
-    ("seeds = 2", "seeds = 2021-01-01", 4, "must be a number, a string"),
-    ("seeds = 2", "seeds = [", 5, "expected TOML"),
-    ("[settings.fast]", "[settings.default]", 10, "twice"),
-    ("evaluate_every = 500", "minutes = 3", 6, "exclude each other"),
-    ("evaluate_every = 500", "log = ['jsn']", 6, "expected any of"),
-    ("evaluate_every = 500", "backend = 'envpol'", 6, "must be 'auto'"),
-    ("evaluate_every = 500", "env_kwargs = {render_mode = 'human'}", 6, "render_mode=human"),
-    ("evaluate_every = 500", "env_kwargs = {foo = 1}", 2, "unexpected keyword argument"),
-    ("evaluate_every = 500", "threads = 0", 6, "threads=0 must be"),
-    ("train_freq = 8", "buffer_size = 1_000_000_000_000_000", 17, "at most 1000000000000"),
+    (
+        "learning_rate",
+        "learning_rat",
+        "settings.fast",
+        "DQN has no setting 'learning_rat'; did you mean learning_rate?",
+    ),
+    ("1e-3", "-1", "settings.fast", "learning_rate=-1 must not fall below 0"),
+    ("steps = 1e3", "steps = 1.5", "", "steps=1.5: expected `int"),
+    ("steps =", "stepz =", "", "did you mean steps?"),
+    ('"DQN", "PPO"', '"DQN", "PPP"', "algorithms", "did you mean PPO?"),
+    ('"DQN", "PPO"', '"DQN", "TQC"', "environments.CartPole-v1", "TQC needs a Box action space"),
+    ("Acrobot-v1", "Acrobat-v1", "environments.Acrobat-v1", "did you mean Acrobot-v1"),
+    ("Acrobot-v1", "os:Acrobot-v1", "environments.os:Acrobot-v1", "no file may name a module"),
+    ("Acrobot-v1", "CartPole-v1", "environments", "names one twice"),
+    ("train_freq = 8", "train_freq = 'x'", "settings.fast", "train_freq='x' must be"),
+    ("  8,", "  'x',", "settings.fast", "net_arch=['x'] must hold"),
+    ("memory", "memori", "resources", "did you mean memory?"),
+    ("2 GB", "2 XB", "resources", "such as '4 GB'"),
+    ("seeds = 2", "seeds = [1, 1]", "", "different seeds"),
+    ("seeds = 2", "seeds = 'x'", "", "seeds='x': expected"),
+    ("seeds = 2", "seeds = nan", "", "not JSON compliant"),
+    ("seeds = 2", "seeds = 2021-01-01", "", "date is not JSON serializable"),
+    ("seeds = 2", "seeds = [", "", "line 5, column 1); expected TOML"),
+    ("[settings.fast]", "[settings.default]", "", "line 10"),
+    ("evaluate_every = 500", "minutes = 3", "", "exclude each other"),
+    ("evaluate_every = 500", "log = ['jsn']", "", "expected any of"),
+    ("evaluate_every = 500", "backend = 'envpol'", "", "must be 'auto'"),
+    ("evaluate_every = 500", "ray = 'HOST:6379'", "", "ray='HOST:6379' must be 'auto'"),
+    ("evaluate_every = 500", "preset = true", "", "preset=True must be the path of a file"),
+    ("evaluate_every = 500", "env_kwargs = {render_mode = 'human'}", "environments.CartPole-v1", "render_mode=human"),
+    ("evaluate_every = 500", "env_kwargs = {foo = 1}", "environments.CartPole-v1", "unexpected keyword argument"),
+    ("evaluate_every = 500", "threads = 0", "", "threads=0: expected `int` >= 1"),
+    ("train_freq = 8", "buffer_size = 1_000_000_000_000_000", "settings.fast", "at most 1000000000000"),
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "line", "problem"), MISTAKES, ids=[one[1] for one in MISTAKES])
-def test_a_mistake_is_one_line_with_its_place(tmp_path, old, new, line, problem):
+@pytest.mark.parametrize(("old", "new", "place", "problem"), MISTAKES, ids=[one[1] for one in MISTAKES])
+def test_a_mistake_is_one_line_with_its_place(tmp_path, old, new, place, problem):
     assert old in PLAN
     path = write(tmp_path, PLAN.replace(old, new, 1))
     with pytest.raises(PlanError) as raised:
         read_plan(path)
     message = str(raised.value)
-    assert message.startswith(f"{path}, line {line}: ")
+    assert message.startswith(f"{path}, {place}: " if place else f"{path}: ")
     assert problem in message
     assert "\n" not in message
 
 
 def test_a_mistake_in_a_dict_is_named_by_its_path():
-    with pytest.raises(PlanError, match=r"plan, settings\.a\.gama: PPO has no setting 'gama'; did you mean gamma"):
+    with pytest.raises(PlanError, match=r"plan, settings\.a: PPO has no setting 'gama'; did you mean gamma"):
         read_plan({"environments": ["CartPole-v1"], "algorithms": ["PPO"], "settings": {"a": {"gama": 1}}})
 
 
@@ -135,35 +143,8 @@ def test_sizes_are_limited(tmp_path):
         read_plan({"environments": "CartPole-v1", "seeds": 1000, "settings": {f"s{i}": {} for i in range(11)}})
     with pytest.raises(PlanError, match="bytes"):
         read_plan(write(tmp_path, "#" * 300_000))
-    with pytest.raises(PlanError, match="lines"):
-        read_plan(write(tmp_path, "\n" * 2000))
-    with pytest.raises(PlanError, match="nested"):
-        read_plan({"environments": "CartPole-v1", "settings": {"a": {"b": deep(30)}}})
     with pytest.raises(FileNotFoundError):
         read_plan(tmp_path / "none.toml")
-
-
-def deep(n):
-    return {"b": deep(n - 1)} if n else 1
-
-
-def test_a_line_is_found_in_tables_and_across_lines():
-    text = "a = 1\n[b]\nc = [\n 1,\n]\n\n[b.d]\n'e f'.g = 2\n"
-    assert line_of(text, ("b", "c")) == 3
-    assert line_of(text, ("b", "d", "e f", "g")) == 8
-    assert line_of(text, ("b", "d", "missing")) == 7
-    assert line_of(text, ()) == 1
-
-
-def test_a_line_that_is_not_certain_is_that_of_the_table():
-    text = (
-        '[a]\n# b = 1\n\'b = 2\' = 0\nb = 3\n"e\\tf" = 4\n["g\\t".h]\nc = 5\n[i . "j.k"]\nrows = [\n [1],\n]\nc = 6\n'
-    )
-    assert line_of(text, ("a", "b")) == 4  # neither the comment nor the key that contains a =
-    assert line_of(text, ("a", "e\tf")) == 1
-    assert line_of(text, ("a", "c")) == 1
-    assert line_of(text, ("i", "j.k", "rows")) == 9
-    assert line_of(text, ("i", "j.k", "c")) == 8
 
 
 def test_an_invalid_plan_starts_nothing(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 
@@ -12,16 +13,15 @@ import pytest
 import rejeu
 from rejeu import cluster
 from rejeu.errors import ClusterError
-from rejeu.experiments import ray as launcher
+from rejeu.experiments import process, ray as launcher
 from rejeu.experiments.jobs import Resources
 from tests import ray_cluster
 from tests.cli.test_sweep import assert_equal, models
 
-pytestmark = [
-    pytest.mark.exhaustive,  # starts a cluster
-    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning"),
-]
-pytest.importorskip("ray")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::FutureWarning"
+)
+starts_a_cluster = pytest.mark.exhaustive
 
 PLAN = {
     "environments": ["CartPole-v1"],
@@ -39,6 +39,7 @@ PLAN = {
 
 @pytest.fixture
 def nodes():
+    pytest.importorskip("ray")
     with ray_cluster.running(num_cpus=1) as (running, nodes):
         yield running, nodes
 
@@ -75,6 +76,7 @@ def checkpoints(folder, job):
     return list((folder / job / "checkpoints").glob("run_*")) if (folder / job).is_dir() else []
 
 
+@starts_a_cluster
 def test_a_lost_node_and_a_killed_run_change_nothing(nodes, undisturbed, tmp_path):
     running, (first, _) = nodes
     out = tmp_path / "sweep"
@@ -89,6 +91,7 @@ def test_a_lost_node_and_a_killed_run_change_nothing(nodes, undisturbed, tmp_pat
     assert trained_processes(out) == []
 
 
+@starts_a_cluster
 def test_a_killed_run_and_a_killed_worker_change_nothing(nodes, undisturbed, tmp_path):
     running, _ = nodes
     out = tmp_path / "sweep"
@@ -106,21 +109,7 @@ def test_a_killed_run_and_a_killed_worker_change_nothing(nodes, undisturbed, tmp
     assert_equal(undisturbed, models(out))
 
 
-def test_nodes_that_do_not_see_the_folder_copy_the_runs_back(nodes, undisturbed, tmp_path, monkeypatch):
-    running, (first, _) = nodes
-    out = tmp_path / "sweep"
-    real = launcher.write_marker
-    monkeypatch.setattr(launcher, "write_marker", lambda folder: (real(folder)[0], "another"))
-    thread = when(
-        lambda: checkpoints(out, "CartPole-v1-DQN-small-seed0") and checkpoints(out, "CartPole-v1-PPO-small-seed0"),
-        lambda: running.remove_node(first, allow_graceful=False),
-    )
-    result = rejeu.sweep(PLAN, out, ray=running.address)
-    thread.join()
-    assert result.is_complete, result.table()
-    assert_equal(undisturbed, models(out))
-
-
+@starts_a_cluster
 def test_mistakes_are_one_line(nodes, tmp_path, monkeypatch):
     running, _ = nodes
     with pytest.raises(ClusterError, match="no node of the Ray cluster has room for a run with CPU=64"):
@@ -131,9 +120,68 @@ def test_mistakes_are_one_line(nodes, tmp_path, monkeypatch):
         rejeu.sweep(PLAN, tmp_path / "b", ray=running.address)
 
 
+@starts_a_cluster
+def test_a_node_that_does_not_see_the_folder_is_one_line(nodes, tmp_path, monkeypatch):
+    running, _ = nodes
+    real = launcher.write_marker
+    monkeypatch.setattr(launcher, "write_marker", lambda folder: real(folder)._replace(token="another"))
+    with pytest.raises(
+        ClusterError, match=r"the node .* does not see .*a, the folder of the sweep; name one with --out"
+    ):
+        rejeu.sweep(PLAN, tmp_path / "a", ray=running.address)
+
+
+@starts_a_cluster
+def test_ctrl_c_stops_the_runs_with_a_checkpoint(nodes, undisturbed, tmp_path):
+    running, _ = nodes
+    out = tmp_path / "sweep"
+    thread = when(
+        lambda: len(checkpoints(out, "CartPole-v1-DQN-small-seed0")) > 1, lambda: os.kill(os.getpid(), signal.SIGINT)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        rejeu.sweep(PLAN, out, ray=running.address)
+    thread.join()
+    assert trained_processes(out) == []
+    result = rejeu.sweep(PLAN, out, ray=running.address)
+    assert result.is_complete, result.table()
+    assert_equal(undisturbed, models(out))
+
+
+@starts_a_cluster
 def test_an_unreachable_cluster_is_one_line(tmp_path):
     with pytest.raises(ClusterError, match="cannot be reached"):
         rejeu.sweep(PLAN, tmp_path / "a", ray="127.0.0.1:1")
+
+
+def make_spec(tmp_path, code, **changes):
+    marker = launcher.write_marker(tmp_path)
+    (tmp_path / "task").write_text(code, encoding="utf-8")
+    paths = (str(tmp_path / name) for name in ("task", "log", "lock", "stop"))
+    spec = launcher.Spec(*paths, marker, str(tmp_path), {}, cluster.versions(launcher.PACKAGES))
+    return spec._replace(**changes)
+
+
+def test_a_node_trains_in_the_folder_until_it_is_asked_to_stop(tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "program", lambda task: [sys.executable, str(task)])
+    monkeypatch.setattr(launcher, "POLL", 0.01)
+    assert launcher.train(make_spec(tmp_path, "print('trained')")) == 0
+    assert (tmp_path / "log").read_text(encoding="utf-8") == "trained\n"
+    waits = "import sys; sys.stdin.read(); sys.exit(143)"
+    (tmp_path / "stop").touch()
+    assert launcher.train(make_spec(tmp_path, waits)) == 143
+
+
+def test_a_node_that_has_other_versions_or_another_folder_is_refused(tmp_path):
+    with pytest.raises(ClusterError, match=r"the node .* has jax .* and not 0\.0\.1"):
+        launcher.train(make_spec(tmp_path, "", versions={**cluster.versions(launcher.PACKAGES), "jax": "0.0.1"}))
+    with pytest.raises(ClusterError, match="does not see"):
+        launcher.train(make_spec(tmp_path, "", marker=launcher.Marker(str(tmp_path / "a" / "none"), "")))
+
+
+def test_a_node_does_not_import_jax():
+    code = "import sys, rejeu.experiments.ray; print('jax' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
 
 
 def test_room():

@@ -29,8 +29,7 @@ def make(tmp_path):
 def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     coordinator = make(tmp_path)
     with Progress(TextColumn("{task.description} {task.fields[text]}")) as bars:
-        bars.add_task("all steps", total=None, text="")
-        sweep.draw(bars, coordinator)
+        sweep.draw(bars, sweep.rows(coordinator))
         everything, one = bars.tasks
     assert (one.description, one.completed, one.total) == ("job-2", 500, 1000)
     assert (everything.completed, everything.total) == (1500, 3000)  # the failed run is not trained
@@ -43,7 +42,6 @@ def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     while coordinator.scheduler.running:
         coordinator.scheduler.turn()
     with Progress() as bars:
-        bars.add_task("all steps", total=None, text="")
         bars.add_task("job-2", text="")
-        sweep.draw(bars, coordinator)
+        sweep.draw(bars, sweep.rows(coordinator))
         assert "job-2" not in {task.description for task in bars.tasks}

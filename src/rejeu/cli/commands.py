@@ -36,7 +36,6 @@ Return = Annotated[float | None, Shown("RETURN")]
 Folder = Annotated[Path | None, Shown("DIR")]
 Imports = Annotated[tuple[str, ...], Shown("MODULE", "import")]
 Assignments = tuple[str, ...]
-Measure = Annotated[Literal["return", "success"], Shown("{return,success}")]
 NoReport = Annotated[bool, Shown(help="Write no report.html at the end.")]
 NoVideo = Annotated[bool, Shown(help="Record no video at the end.")]
 Json = Annotated[bool, Shown(help="Print the result as one JSON document, and messages to standard error.")]
@@ -123,94 +122,75 @@ class Resume(RunOptions):
     json: Json = False
 
 
-@dataclass(frozen=True)
-class Tune(EnvironmentOptions):
-    """Searches hyperparameters with Optuna, and compares the best ones with the default on fresh seeds.
-
-    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu tune Pendulum-v1 --algo SAC --trials 30
-    """
+@dataclass(frozen=True, kw_only=True)
+class Search(EnvironmentOptions):
+    """What studies and populations search, and how each agent is trained. Abstract."""
 
     env: EnvironmentId
     """Id of an environment, as for rejeu train."""
     algo: Algorithm = None
-    trials: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 30
-    """How many trials; of a study that exists, how many in all."""
-    steps: Count = None
-    """Environment steps of a trial; by default the preset's, else 100000."""
     envs: EnvCount = None
-    """Environments stepped at once; by default the preset's, else 1."""
+    """Environments that each agent steps at once; by default the preset's, else 1."""
     backend: Name = None
     """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
     preset: Annotated[Path | None, Shown("FILE")] = None
-    """What trials start from and the winner is compared with; by default rejeu's preset, else the algorithm's defaults."""
+    """Where the search starts, and the other hyperparameters; by default rejeu's preset, else the algorithm's defaults."""
     assignments: Annotated[Assignments, Shown("NAME=VALUE ...", "set")] = ()
     """Hyperparameters to set instead of searching them, as for rejeu train."""
     search: Annotated[Assignments, Shown("NAME=LOW..HIGH ...")] = ()
     """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 "batch_size=[64,128]" tau=log:0.001..0.1"""
     only: Annotated[Assignments, Shown("NAME ...")] = ()
     """Search these hyperparameters and no others."""
-    trial_seeds: Annotated[int, Meta(ge=1, le=1000), Shown("K")] = 1
-    """Seeds of each trial, trained at once, whose evaluations are averaged."""
-    final_seeds: Annotated[int, Meta(ge=0, le=1000), Shown("K")] = 5
-    """Fresh seeds on which the winner is compared with the default, at least 5; 0 for no comparison."""
-    pruner: Annotated[Literal["median", "halving", "none"], Shown("{median,halving,none}")] = "median"
-    """Stop trials that are below the median of the others, or by successive halving, or none."""
-    measure: Measure = "return"
-    """Maximize the mean return of the last evaluation, or its success rate."""
-    evaluate_every: Count = None
-    """Environment steps between two evaluations; by default a tenth of --steps."""
+    measure: Annotated[Literal["return", "success"], Shown("{return,success}")] = "return"
+    """Maximize the mean return of the last evaluation of a trial or round, or its success rate."""
     evaluate_episodes: EpisodeCount = None
     checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M")] = 5.0
     """Minutes between two checkpoints of a training; 0 for none."""
     seed: Annotated[Seed, Shown("N")] = 0
     """Determines what is sampled and the seeds of all trainings."""
     workers: Several = None
-    """Trials at once; by default half as many as there are cores."""
-    out: Folder = None
-    """Study folder; an existing one is continued or joined. By default a new one under runs."""
+    """Agents trained at once; by default half as many as there are cores."""
     json: Json = False
 
 
-@dataclass(frozen=True)
-class Pbt(EnvironmentOptions):
+@dataclass(frozen=True, kw_only=True)
+class Tune(Search):
+    """Searches hyperparameters with Optuna, and compares the best ones with the default on fresh seeds.
+
+    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu tune Pendulum-v1 --algo SAC --trials 30
+    """
+
+    trials: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 30
+    """How many trials; of a study that exists, how many in all."""
+    steps: Count = None
+    """Environment steps of a trial; by default the preset's, else 100000."""
+    evaluate_every: Count = None
+    """Environment steps between two evaluations; by default a tenth of --steps."""
+    trial_seeds: Annotated[int, Meta(ge=1, le=1000), Shown("K")] = 1
+    """Seeds of each trial, trained at once, whose evaluations are averaged."""
+    final_seeds: Annotated[int, Meta(ge=0, le=1000), Shown("K")] = 5
+    """Fresh seeds on which the winner is compared with the default, at least 5; 0 for no comparison."""
+    pruner: Annotated[Literal["median", "halving", "none"], Shown("{median,halving,none}")] = "median"
+    """Stop trials that are below the median of the others, or by successive halving, or none."""
+    out: Folder = None
+    """Study folder; an existing one is continued or joined. By default a new one under runs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pbt(Search):
     """Trains a population: after each round the worst members copy the best, and their hyperparameters are perturbed.
 
     Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu pbt Pendulum-v1 --algo SAC --members 8 --round-steps 5000
     """
 
-    env: EnvironmentId
-    """Id of an environment, as for rejeu train."""
-    algo: Algorithm = None
     members: Annotated[int, Meta(ge=2, le=1000), Shown("K")] = 8
     """Agents that are trained."""
     rounds: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 10
     """Rounds of training."""
     round_steps: Annotated[Positive, Shown("N")] = 10_000
     """Environment steps of each member in a round."""
-    envs: EnvCount = None
-    """Environments that each member steps at once; by default the preset's, else 1."""
-    backend: Name = None
-    """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
-    preset: Annotated[Path | None, Shown("FILE")] = None
-    """Hyperparameters that do not change; by default those of rejeu's preset, else the algorithm's defaults."""
-    assignments: Annotated[Assignments, Shown("NAME=VALUE ...", "set")] = ()
-    """Hyperparameters to set instead of changing them, as for rejeu train."""
-    search: Annotated[Assignments, Shown("NAME=LOW..HIGH ...")] = ()
-    """Other ranges, or further hyperparameters, as for rejeu tune."""
-    only: Annotated[Assignments, Shown("NAME ...")] = ()
-    """Change these hyperparameters and no others."""
-    measure: Measure = "return"
-    """Compare members by the mean return of the evaluation at the end of a round, or by its success rate."""
-    evaluate_episodes: EpisodeCount = None
-    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M")] = 5.0
-    """Minutes between two checkpoints within a round."""
-    seed: Annotated[Seed, Shown("N")] = 0
-    """Determines all hyperparameters and the seeds of all members."""
-    workers: Several = None
-    """Members trained at once; by default half as many as there are cores."""
     out: Folder = None
     """Folder of the population, new or empty; by default a new one under runs."""
-    json: Json = False
 
 
 @dataclass(frozen=True)

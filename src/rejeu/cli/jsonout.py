@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
+import msgspec
 import numpy as np
 
 
@@ -30,29 +28,19 @@ def messages(is_json: bool) -> Iterator[Callable[[Any], None]]:
 def dumps(value: Any) -> str:
     """Returns a value as indented JSON text. NaN and infinities become null, since JSON has none.
 
-    >>> print(dumps({"steps": np.int64(3), "return": math.nan}))
+    >>> import math, pathlib
+    >>> print(dumps({"steps": np.int64(3), "return": math.nan, "path": pathlib.PurePosixPath("runs/a")}))
     {
       "steps": 3,
-      "return": null
+      "return": null,
+      "path": "runs/a"
     }
     """
-    return json.dumps(plain(value), indent=2, allow_nan=False)
+    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=2).decode()
 
 
 def plain(value: Any) -> Any:
-    """Returns a value as JSON values: dicts, lists, strings, numbers, true, false and null.
-
-    >>> plain((True, np.array([1.0, math.inf])))
-    [True, [1.0, None]]
-    """
+    """Returns a NumPy array or number as Python's, a mapping as a dict, and anything else as text."""
     if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(one) for one in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
+        return value.tolist()
+    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from rich.markup import escape
+from typing import Any
 
 from rejeu import presets
 from rejeu.agents import AGENTS, agent_of_file, find_agent, modules_of
@@ -26,18 +23,15 @@ from rejeu.experiments.process import default_workers
 from rejeu.experiments.search import Watch
 from rejeu.experiments.study import Outcome, Study, StudyFolder
 from rejeu.experiments.study_plan import Plan
+from rejeu.experiments.sweep import Row, bars
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.presets import Preset
 from rejeu.reporting import notebook
 from rejeu.reporting.formatting import counted, number
-from rejeu.reporting.report.sections import duration
 from rejeu.runs import values
 from rejeu.runs.config import RunConfig
 from rejeu.runs.folder import check_free
 from rejeu.runs.values import quoted
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
@@ -154,59 +148,37 @@ def common(made: Environment, algorithm: str) -> RunConfig:
 
 @contextmanager
 def display(study: Study) -> Iterator[Watch]:
-    """Returns a function that prints a line for each trial that has ended and, on a terminal, a table of those that run."""
-    from rich.live import Live
-
+    """Returns a function that prints a line for each trial that has ended and, on a terminal, shows those that run."""
     lines, console = tuning.lines(echo, study), notebook.console()
     if not console.is_terminal:
         yield lines
         return
-    began, before = time.monotonic(), sum(is_ended(one) for one in study.outcomes())
-    with Live(console=console, auto_refresh=False, transient=True) as live:
+    with bars(console) as show:
 
         def watch(outcomes: list[Outcome]) -> None:
             lines(outcomes)
-            ended = sum(is_ended(one) for one in outcomes)
-            pace = (time.monotonic() - began) / (ended - before) if ended > before else math.nan
-            live.update(table(outcomes, study.plan, pace * (study.plan.trials - ended)), refresh=True)
+            show(rows(outcomes, study.plan))
 
         yield watch
 
 
-def is_ended(outcome: Outcome) -> bool:
-    """Returns whether a trial has ended."""
-    return outcome.state in ("complete", "pruned", "failed")
+def rows(outcomes: list[Outcome], plan: Plan) -> list[Row]:
+    """Returns a row for the whole study, and one for each trial that runs.
 
-
-def table(outcomes: list[Outcome], plan: Plan, seconds_left: float) -> Table:
-    """Returns the trials that run, with the state of the study below."""
-    from rich import box
-    from rich.table import Table
-
-    found = Table(box=box.SIMPLE, caption=progress(outcomes, plan, seconds_left), caption_justify="left")
-    for name in ("trial", "step", plan.measure):
-        found.add_column(name, justify="right")
-    found.add_column("hyperparameters", overflow="fold")
+    >>> rows([], plans.make("Pendulum-v1"))
+    [Row(name='trials', done=0, total=30, text='0 of 30 trials have ended')]
+    """
+    ended = sum(one.state in ("complete", "pruned", "failed") for one in outcomes)
+    text = f"{ended} of {plan.trials} trials have ended"
+    if (best := studies.best_of(outcomes)) is not None:
+        text += f", best {plan.measure} {number(best.value)} (trial {best.index})"
+    found = [Row("trials", ended, plan.trials, text)]
     for one in outcomes:
         if one.state == "running":
-            values = " ".join(f"{name}={tuning.short(value)}" for name, value in one.values.items())
-            step = f"{max(one.evaluations, default=0):,} of {plan.steps:,}"
-            found.add_row(str(one.index), step, number(one.value), escape(values))
+            step = max(one.evaluations, default=0)
+            about = f"{step:,} of {plan.steps:,} steps, {plan.measure} {number(one.value)}  {tuning.settings(one)}"
+            found.append(Row(f"trial {one.index}", step, plan.steps, about))
     return found
-
-
-def progress(outcomes: list[Outcome], plan: Plan, seconds_left: float) -> str:
-    """Returns how far a study is.
-
-    >>> progress([], plans.make("Pendulum-v1"), math.nan)
-    '0 of 30 trials have ended'
-    """
-    parts = [f"{sum(is_ended(one) for one in outcomes)} of {plan.trials} trials have ended"]
-    if (best := studies.best_of(outcomes)) is not None:
-        parts.append(f"best {plan.measure} {number(best.value)} (trial {best.index})")
-    if math.isfinite(seconds_left):
-        parts.append(f"about {duration(seconds_left)} left")
-    return ", ".join(parts)
 
 
 def header(study: Study, made: Environment) -> list[str]:

@@ -14,10 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rejeu.agents import modules_of
-from rejeu.experiments.folder import JobProgress, State, Sweep, SweepFolder, open_folder, read_folder
+from rejeu.experiments.folder import HIDDEN, JobProgress, State, Sweep, SweepFolder, open_folder, read_folder
 from rejeu.experiments.jobs import Job, again
 from rejeu.experiments.plan import read_plan
 from rejeu.experiments.process import LOST, LocalLauncher, default_workers, threads_of
@@ -29,6 +29,7 @@ from rejeu.runs.config import RunConfig, Task
 from rejeu.runs.values import quoted
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.progress import Progress
 
 STATES = ("running", "done", "failed", "stopped", "waiting")
@@ -230,7 +231,7 @@ def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> 
     if ray is not None:
         from rejeu.experiments.ray import RayLauncher  # Ray is an extra
 
-        return RayLauncher(ray, folder, workers)
+        return RayLauncher(ray, folder.path / HIDDEN, folder.sweep.resources, folder.sweep.threads, workers)
     return LocalLauncher(min(workers or default_workers(), len(folder.jobs)), folder.sweep.threads)
 
 
@@ -278,6 +279,15 @@ def sweep(
     return SweepResult(found.path, tuple(coordinator.outcomes()))
 
 
+class Row(NamedTuple):
+    """A bar about a run, or about all of them."""
+
+    name: str
+    done: int
+    total: int | None
+    text: str
+
+
 @contextmanager
 def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]]:
     """Context in which progress is shown; returns a function to call often, and one to call with each event."""
@@ -287,18 +297,31 @@ def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]
     elif not console.is_terminal:
         yield seldom(lambda coordinator: echo(line(coordinator)), LINES, time.monotonic() + LINES), echo
     else:
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=console, speed_estimate_period=600) as bars:
-            bars.add_task("all steps", total=None, text="")
+        with bars(console) as show:
             say = partial(console.print, highlight=False, markup=False)
-            yield seldom(partial(draw, bars), REFRESH), say
+            yield seldom(lambda coordinator: show(rows(coordinator)), REFRESH), say
+
+
+@contextmanager
+def bars(console: Console) -> Iterator[Callable[[Sequence[Row]], None]]:
+    """Context in which a terminal shows bars; returns a function to call with all of them, the first of which is for all."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    names, texts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[text]}", markup=False)
+    with Progress(
+        names, BarColumn(), texts, TimeRemainingColumn(), console=console, speed_estimate_period=600
+    ) as drawn:
+        yield partial(draw, drawn)
+
+
+def draw(drawn: Progress, found: Sequence[Row]) -> None:
+    """Draws a bar for each row, and removes those that have none."""
+    known = {task.description: task.id for task in drawn.tasks}
+    for name in known.keys() - {row.name for row in found}:
+        drawn.remove_task(known[name])
+    for row in found:
+        task = known[row.name] if row.name in known else drawn.add_task(row.name, text="")
+        drawn.update(task, total=row.total, completed=row.done, text=row.text)
 
 
 def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
@@ -314,22 +337,17 @@ def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
     return call
 
 
-def draw(bars: Progress, coordinator: Coordinator) -> None:
-    """Draws a bar for each run that trains, and one for all steps of the sweep, by which the remaining time is estimated."""
-    running = {job.name: job for job in coordinator.running()}
-    of_runs = {task.description: task.id for task in bars.tasks[1:]}
-    for name in of_runs.keys() - running.keys():
-        bars.remove_task(of_runs[name])
-    taken = 0
-    for name, job in running.items():
+def rows(coordinator: Coordinator) -> list[Row]:
+    """Returns a row for all steps of the sweep, by which the remaining time is estimated, and one for each run that trains."""
+    found, taken = [], 0
+    for job in coordinator.running():
         at = coordinator.folder.progress(job)
         taken += at.step
-        task = of_runs[name] if name in of_runs else bars.add_task(name, text="")
-        bars.update(task, total=job.run.steps, completed=at.step, text=text_of(at, job.run.steps))
+        found.append(Row(job.name, at.step, job.run.steps, text_of(at, job.run.steps)))
     outcomes = coordinator.outcomes()
-    asked = [one.job.run.steps or 0 for one in outcomes if one.state != "failed"]
+    asked = sum(one.job.run.steps or 0 for one in outcomes if one.state != "failed")
     taken += sum(one.job.run.steps or 0 for one in outcomes if one.state == "done")
-    bars.update(bars.tasks[0].id, total=sum(asked) or None, completed=taken, text=states(coordinator))
+    return [Row("all steps", taken, asked or None, states(coordinator)), *found]
 
 
 def line(coordinator: Coordinator) -> str:

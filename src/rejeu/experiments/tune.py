@@ -277,11 +277,16 @@ def lines(echo: Echo, study: Study) -> Watch:
 
 def line(outcome: Outcome, plan: Plan) -> str:
     """Returns a trial on one line."""
-    values = " ".join(f"{name}={short(value)}" for name, value in outcome.values.items())
+    values = settings(outcome)
     if outcome.state == "failed":
         return f"trial {outcome.index:>3}  failed: {outcome.reason}  {values}"
     at = f" at step {max(outcome.evaluations, default=0):,}" if outcome.state == "pruned" else ""
     return f"trial {outcome.index:>3}  {outcome.state}{at}  {plan.measure} {number(outcome.value)}  {values}"
+
+
+def settings(outcome: Outcome) -> str:
+    """Returns the hyperparameters of a trial, on one line."""
+    return " ".join(f"{name}={short(value)}" for name, value in outcome.values.items())
 
 
 def short(value: Any) -> str:
