@@ -22,8 +22,7 @@ from rejeu.algorithms.config import OffPolicyConfig, to_json
 from rejeu.callbacks import Checkpoint
 from rejeu.core import TD_ERROR, Transition
 from rejeu.errors import CheckpointError
-from rejeu.experiments.folder import NOTHING, Sweep, open_folder
-from rejeu.experiments.jobs import Job
+from rejeu.experiments.folder import NOTHING, Job, Sweep, open_folder
 from rejeu.experiments.plan import PlanError, read_plan
 from rejeu.experiments.sweep import Coordinator
 from rejeu.loops.learner import Learner

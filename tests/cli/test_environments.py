@@ -21,7 +21,7 @@ from rejeu.cli import check, environment, main, parsing
 from rejeu.cli.commands import COMMANDS, Train
 from rejeu.cli.environment import Environment
 from rejeu.errors import WorkerError
-from rejeu.experiments.jobs import Job, again
+from rejeu.experiments.folder import Job, again
 from rejeu.runs.config import RunConfig
 from rejeu.runs.values import quoted
 from tests.cli.test_cli import FEWER_FILES, TINY, error_of

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rejeu import cli
-from rejeu.cli import seeds
+from rejeu.cli import sweep
 from rejeu.cli.commands import Train
 from rejeu.experiments import process, scheduler
 from rejeu.runs.config import RunConfig
@@ -72,7 +72,7 @@ def test_options_are_passed_on():
         hyperparameters={"gamma": 0.9, "train_freq": [1, "episode"]},
         log=("json",),
     )
-    (job,) = seeds.make_jobs(arguments)
+    (job,) = sweep.make_jobs(arguments)
     task = job.task(Path("OUT"), False, arguments.imports)
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
     assert (task.folder, task.run, task.resume) == ("OUT", RunConfig(**given), False)
@@ -81,7 +81,7 @@ def test_options_are_passed_on():
 def test_the_address_of_a_cluster_is_in_no_file(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "")
     arguments = Train(env="CartPole-v1", seeds=2, seed=1, backend="ray", ray="10.0.0.1:6379")
-    assert {job.run.ray for job in seeds.make_jobs(arguments)} == {"auto"}
+    assert {job.run.ray for job in sweep.make_jobs(arguments)} == {"auto"}
     assert os.environ["RAY_ADDRESS"] == "10.0.0.1:6379"
 
 

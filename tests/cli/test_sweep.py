@@ -101,7 +101,7 @@ def test_a_supervised_process_stops_when_its_input_ends(child):
 def test_a_mistake_in_the_plan(tmp_path, capsys):
     path = write_plan(tmp_path, 0)
     assert cli.main(["sweep", str(path), "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err == f"rejeu: error: {path}, line 4: steps=0: expected `int` >= 1\n"
+    assert capsys.readouterr().err == f"rejeu: error: {path}: steps=0: expected `int` >= 1\n"
     assert not (tmp_path / "out").exists()
 
 
@@ -153,11 +153,11 @@ def test_kills_of_runs_and_of_the_sweep_change_nothing(tmp_path):
     folder = read_folder(out)
     sweep.kill()
     sweep.communicate()
-    wait_until(lambda: not any(folder.is_training(job) for job in folder.jobs), 60)
-    assert {folder.state(job) for job in folder.jobs} >= {"stopped"}
+    wait_until(lambda: not any(work.is_training() for work in folder.works()), 60)
+    assert {work.state() for work in folder.works()} >= {"stopped"}
 
     sweep = start("resume", out, "--workers", "2")
-    wait_until(lambda: any(folder.is_training(job) for job in folder.jobs))
+    wait_until(lambda: any(work.is_training() for work in folder.works()))
     time.sleep(3)
     for pid in children(sweep.pid):
         with contextlib.suppress(ProcessLookupError):
@@ -167,7 +167,7 @@ def test_kills_of_runs_and_of_the_sweep_change_nothing(tmp_path):
     printed, _ = sweep.communicate(timeout=120)
     assert sweep.returncode == 130, printed
     assert "rejeu resume" in printed
-    assert not any(folder.is_training(job) for job in folder.jobs)
+    assert not any(work.is_training() for work in folder.works())
 
     printed, _ = (sweep := start("resume", out, "--workers", "1")).communicate(timeout=400)
     assert sweep.returncode == 0, printed

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from rejeu import cli
-from rejeu.cli import seeds
+from rejeu.cli import sweep
 from rejeu.cli.commands import Train
 
 TINY = ["--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=20", "buffer_size=200"]
@@ -53,10 +53,10 @@ def test_seeds_in_one_program_write_a_run_folder_each_and_a_comparison(tmp_path,
 
 
 def test_seeds_are_trained_in_one_program_unless_processes_are_asked_for():
-    assert seeds.fit_together(Train(env="jax/CartPole-v1", seeds=2))
-    assert not seeds.fit_together(Train(env="jax/CartPole-v1", seeds=2, jobs=2))
-    assert not seeds.fit_together(Train(env="CartPole-v1", seeds=2))
-    assert not seeds.fit_together(Train(env="jax/CartPole-v1", seeds=2, wrappers=("my_env:Shaped",)))
+    assert sweep.fit_together(Train(env="jax/CartPole-v1", seeds=2))
+    assert not sweep.fit_together(Train(env="jax/CartPole-v1", seeds=2, jobs=2))
+    assert not sweep.fit_together(Train(env="CartPole-v1", seeds=2))
+    assert not sweep.fit_together(Train(env="jax/CartPole-v1", seeds=2, wrappers=("my_env:Shaped",)))
 
 
 def test_an_unknown_device_is_one_line(capsys):

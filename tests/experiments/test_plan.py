@@ -3,7 +3,7 @@
 import pytest
 
 import rejeu
-from rejeu.experiments.jobs import MAX_JOBS
+from rejeu.experiments.folder import MAX_JOBS
 from rejeu.experiments.plan import PlanError, read_plan
 
 PLAN = """\

@@ -14,7 +14,7 @@ import rejeu
 from rejeu import cluster
 from rejeu.errors import ClusterError
 from rejeu.experiments import process, ray as launcher
-from rejeu.experiments.jobs import Resources
+from rejeu.experiments.folder import Resources
 from tests import ray_cluster
 from tests.cli.test_sweep import assert_equal, models
 

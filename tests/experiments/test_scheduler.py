@@ -10,8 +10,8 @@ from filelock import FileLock
 from rejeu.agents import AGENTS, SAC
 from rejeu.errors import CheckpointError
 from rejeu.experiments import scheduler
-from rejeu.experiments.folder import NOTHING, Sweep, open_folder, read_folder
-from rejeu.experiments.jobs import Job
+from rejeu.experiments.folder import NOTHING, Job, JobWork, Sweep, open_folder, read_folder
+from rejeu.experiments.process import hold
 from rejeu.experiments.scheduler import MAX_LOST, Scheduler, Work
 from rejeu.experiments.sweep import Coordinator
 from rejeu.interrupt import Interrupt
@@ -177,14 +177,15 @@ def test_a_stop_ends_all_runs_and_starts_no_more(tmp_path):
 
 def test_jobs_that_another_process_holds_are_left_to_it(tmp_path):
     folder = make_folder(tmp_path)
-    claim = read_folder(folder.path).claim(folder.jobs[1])
+    held = folder.works()[1]
+    claim = hold(held.claim)
     assert claim is not None
-    assert folder.claim(folder.jobs[1]) is None
+    assert hold(held.claim) is None
     launcher = Launcher()
     states, _ = work(folder, launcher)
     assert states == {"job-0": "done", "job-1": "running", "job-2": "done", "job-3": "done"}
     claim.release()
-    assert folder.state(folder.jobs[1]) == "waiting"
+    assert held.state() == "waiting"
 
 
 def test_a_run_that_cannot_be_started_is_one_line(tmp_path):
@@ -199,7 +200,7 @@ def test_a_run_that_cannot_be_started_is_one_line(tmp_path):
     states, lines = work(folder, launcher)
     assert states == {"job-0": "waiting", "job-1": "done"}  # left to a later process
     assert lines[0] == "job-0 could not be started: [Errno 28] No space left on device"
-    assert folder.exit_status(folder.jobs[0]) is None
+    assert folder.works()[0].exit_status() is None
     states, _ = work(folder, launcher)
     assert states == {"job-0": "done", "job-1": "done"}
 
@@ -222,10 +223,10 @@ def test_a_job_that_cannot_be_claimed_is_one_line_and_stops_no_other(tmp_path, m
 def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
     folder = make_folder(tmp_path, 1)
 
-    def full(self, job, status):
+    def full(self, status):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(type(folder), "write_exit", full)
+    monkeypatch.setattr(JobWork, "write_exit", full)
     states, lines = work(folder, Launcher())
     assert "No space left" in lines[-1]
     assert states == {"job-0": "stopped"}  # the next process finds its last checkpoint

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 import sys
 import time
 from pathlib import Path
@@ -266,19 +265,14 @@ def test_a_journal_nested_too_deeply_is_one_line(tmp_path):
         studies.join(StudyFolder(tmp_path / "study"))
 
 
-def test_a_journal_that_is_a_link_or_a_hole_is_refused(tmp_path):
+def test_a_journal_that_is_a_link_is_refused(tmp_path):
     tuning.open_study(make_plan(), tmp_path / "study")
     journal = tmp_path / "study" / "journal.log"
     journal.unlink()
     journal.symlink_to(tmp_path / "mine")
-    with pytest.raises(CheckpointError, match="is no file of up to 1024 MiB"):
+    with pytest.raises(CheckpointError, match="is a link and no file"):
         studies.join(StudyFolder(tmp_path / "study"))
     assert not (tmp_path / "mine").exists()
-    journal.unlink()
-    journal.touch()
-    os.truncate(journal, 2**42)
-    with pytest.raises(CheckpointError, match="is no file of up to 1024 MiB"):
-        studies.join(StudyFolder(tmp_path / "study"))
 
 
 def test_the_value_of_a_trial_must_be_finite(tmp_path):

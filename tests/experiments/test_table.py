@@ -3,8 +3,7 @@
 from rich.progress import Progress, TextColumn
 
 from rejeu.experiments import sweep
-from rejeu.experiments.folder import Sweep, open_folder
-from rejeu.experiments.jobs import Job
+from rejeu.experiments.folder import Job, Sweep, open_folder
 from rejeu.experiments.sweep import Coordinator
 from rejeu.interrupt import Interrupt
 from rejeu.runs.config import RunConfig
@@ -16,13 +15,14 @@ def make(tmp_path):
     """Returns a coordinator in the middle of a sweep: a run is done, one trains, one has failed, one waits."""
     jobs = tuple(Job(name=f"job-{i}", run=RunConfig(env="CartPole-v1", seed=i, steps=1000)) for i in range(4))
     folder = open_folder(tmp_path / "sweep", Sweep(jobs=jobs, threads=1), None, RunConfig(env=""))
-    write_run(folder.run(jobs[0]), level=100.0)
-    folder.write_exit(jobs[0], 0)
-    folder.write_exit(jobs[1], 2)
+    works = folder.works()
+    write_run(works[0].run, level=100.0)
+    works[0].write_exit(0)
+    works[1].write_exit(2)
     coordinator = Coordinator(folder, Launcher(capacity=1, ends={"job-2": [None]}), Interrupt(), RunConfig(env=""))
     coordinator.scheduler.turn()
     metrics = "step,time/time_elapsed,rollout/ep_rew_mean\n250,5,20\n500,10,30\n"
-    (folder.run(jobs[2]) / "metrics.csv").write_text(metrics, encoding="utf-8")
+    (works[2].run / "metrics.csv").write_text(metrics, encoding="utf-8")
     return coordinator
 
 
@@ -37,7 +37,7 @@ def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     assert everything.fields["text"] == states
     assert sweep.line(coordinator) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
     assert sweep.closing_lines(coordinator)[0] == f"4 runs: {states}"
-    (coordinator.folder.run(coordinator.folder.jobs[2]) / "agent.safetensors").touch()
+    (coordinator.tasks[2].run / "agent.safetensors").touch()
     coordinator.scheduler.running[0].handle.status = 0
     while coordinator.scheduler.running:
         coordinator.scheduler.turn()

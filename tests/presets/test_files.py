@@ -82,7 +82,7 @@ def test_train_takes_the_preset_of_a_file(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--algo", "DQN"], "--algo DQN differs from the algorithm of --preset"),
+        (["--algo", "DQN"], "is for PPO, not for DQN"),
         (["--preset", "missing.json"], "there is no preset file missing.json; rejeu tune writes one"),
     ],
 )

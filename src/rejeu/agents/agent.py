@@ -19,9 +19,11 @@ from rejeu.envs import seeds
 from rejeu.envs.masks import split
 from rejeu.io import checkpoint
 from rejeu.reporting import summary
-from rejeu.reporting.evaluation import Evaluation
+from rejeu.reporting.evaluation import Evaluation, evaluate
+from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Logger, Sink
 from rejeu.reporting.report import write_page
+from rejeu.validation import number, whole
 
 
 class Agent(BaseAgent):
@@ -89,7 +91,13 @@ class Agent(BaseAgent):
         Raises:
             ValueError: before ``best_window`` episodes have finished or one evaluation was made.
         """
-        training.restore_best(self)
+        if self.best is None:
+            raise ValueError(
+                f"no best weights are known yet: they are kept after {counted(self.best_window, 'episode')} of training, "
+                "and at every evaluation by rejeu.callbacks.Evaluate"
+            )
+        self.run.state = self.learner.copy(self.best.state)
+        self.drop_rollout()
         return self
 
     def statistics(self) -> dict[str, float]:
@@ -156,9 +164,17 @@ class Agent(BaseAgent):
 
         A callback may call it during ``learn``. If it uses the training environments, training continues in new
         episodes.
+
+        Raises:
+            ValueError: if there are no environments, or their spaces or a missing ``VecNormalize`` do not match.
         """
-        with devices.chosen(self.device):
-            return policy.play(self, episodes, env, deterministic, seed, success_threshold, minutes)
+        threshold = self.success_threshold if success_threshold is None else success_threshold
+        if episodes is None and minutes is None:
+            episodes = policy.USUAL_EPISODES
+        episodes = None if episodes is None else whole("episodes", episodes, least=1)
+        seconds = None if minutes is None else 60 * number("minutes", minutes, above=0)
+        with devices.chosen(self.device), policy.evaluation_env(self, env, episodes, seed) as (vector, again):
+            return evaluate(policy.policy(self, deterministic), vector, episodes, threshold, again, seconds)
 
     def report(self, path: str | Path, evaluations: Iterable[tuple[int, Evaluation]] = ()) -> Path:
         """Writes a page about the training so far, one HTML file that needs no network, and returns its path.

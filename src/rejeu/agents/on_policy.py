@@ -18,8 +18,9 @@ from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import Masked
 from rejeu.envs.make import Backend, VectorEnv, make_vector
-from rejeu.envs.masks import make_masked, mask_leaf, n_choices
+from rejeu.envs.masks import make_masked, mask_leaf, n_choices, split
 from rejeu.exploration.noise import Noise
+from rejeu.loops import nonfinite
 from rejeu.loops.device import chunks
 from rejeu.loops.on_policy import begin_episodes, on_policy
 from rejeu.loops.run import Progress
@@ -55,8 +56,16 @@ class OnPolicyAgent(Agent):
         >>> agent.value(np.zeros((50, 4), np.float32)).shape
         (50,)
         """
+        if self.takes_masks:
+            observation, _ = split(observation, None)
+        obs, single = policy.as_batch(observation, self.observation_space, self.obs_leaves)
+        n = len(jax.tree.leaves(obs)[0])
+        ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
         with devices.chosen(self.device):
-            return policy.value(self, observation, state, episode_start)
+            nonfinite.settle(self)
+            memory = policy.memory_of(self, state, n)
+            values = np.asarray(self.learner.state_value(self.run.state, memory, obs, ended))
+        return values[0] if single else values
 
     def make_envs(
         self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None

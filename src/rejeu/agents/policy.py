@@ -14,13 +14,10 @@ from rejeu import spaces
 from rejeu.agents.base import BaseAgent
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
-from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
 from rejeu.loops import nonfinite
 from rejeu.loops.run import clock_of
-from rejeu.reporting.evaluation import Evaluation, evaluate
 from rejeu.spaces import Leaf
-from rejeu.validation import number, whole
 
 CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "min": lambda values: values.min(axis=0),
@@ -93,12 +90,7 @@ def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.
     has_memory = learner.algorithm.recall is not None
     if deterministic and not has_memory:
         return np.asarray(learner.exploit(run.state, obs)), None
-    if not has_memory:
-        memory = ()
-    elif memory is None:
-        memory = learner.initial_carry(n)
-    else:
-        check_memory(agent, memory, n)
+    memory = memory_of(agent, memory, n)
     if deterministic:
         action, memory = learner.recall(run.state, memory, obs, ended)
         return np.asarray(action), memory
@@ -146,27 +138,16 @@ def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
     return spaces.unscale_action(space, array)
 
 
-def value(agent: BaseAgent, observation: Any, memory: Any, episode_start: Any) -> np.ndarray:
-    """Returns the critic's values of observations; see :meth:`OnPolicyAgent.value`."""
-    if agent.takes_masks:
-        observation, _ = split(observation, None)
-    obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
-    n = len(jax.tree.leaves(obs)[0])
-    learner = agent.learner
-    nonfinite.settle(agent)
-    if learner.algorithm.recall is None:
-        memory = ()
-    elif memory is None:
-        memory = learner.initial_carry(n)
-    else:
-        check_memory(agent, memory, n)
-    ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
-    values = np.asarray(learner.state_value(agent.run.state, memory, obs, ended))
-    return values[0] if single else values
+def memory_of(agent: BaseAgent, memory: Any, n: int) -> Any:
+    """Returns the state of the agent's policy for ``n`` episodes: what was given, else that at their start.
 
-
-def check_memory(agent: BaseAgent, memory: Any, n: int) -> None:
-    """Raises ``ValueError`` unless ``memory`` is the state of the agent's recurrent policy for ``n`` episodes."""
+    Raises:
+        ValueError: if the shapes of ``memory`` are others.
+    """
+    if agent.learner.algorithm.recall is None:
+        return ()
+    if memory is None:
+        return agent.learner.initial_carry(n)
     if agent.carry_shapes is None:  # once: it takes longer than a prediction
         agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_carry(1))
     given = jax.tree.map(np.shape, memory)
@@ -176,6 +157,7 @@ def check_memory(agent: BaseAgent, memory: Any, n: int) -> None:
             f"{agent.name}.predict was given a state of the shapes {given}, expected {expected}; give what its last call "
             "returned for as many observations, or None where episodes begin"
         )
+    return memory
 
 
 def refuse_masks(masks: Any, name: str) -> None:
@@ -188,49 +170,6 @@ USUAL_EPISODES = 100
 """Number of episodes if neither a number nor a time is given."""
 MOST_ENVS = 16
 """Upper limit on the environments that are made for an evaluation."""
-
-
-def play(
-    agent: BaseAgent,
-    episodes: int | None,
-    env: Any,
-    deterministic: bool,
-    seed: int | None,
-    success_threshold: float | None,
-    minutes: float | None,
-) -> Evaluation:
-    """Plays whole episodes and returns their results; the arguments are those of :meth:`Agent.evaluate`.
-
-    Raises:
-        ValueError: if there are no environments, or their spaces or a missing ``VecNormalize`` do not match.
-    """
-    threshold = agent.success_threshold if success_threshold is None else success_threshold
-    run = agent.run
-    if episodes is None and minutes is None:
-        episodes = USUAL_EPISODES
-    episodes = None if episodes is None else whole("episodes", episodes, least=1)
-    seconds = None if minutes is None else 60 * number("minutes", minutes, above=0)
-    n_envs = MOST_ENVS if episodes is None else min(episodes, MOST_ENVS)
-    made_here = isinstance(env, str) or callable(env)
-    if env is not None:
-        vector = agent.make_envs(env, n_envs if isinstance(env, str) else 1, seed=seed)
-    elif run.env is None:
-        vector = agent.make_envs(trained_on(agent), n_envs, seed=seed)
-        made_here = True
-    elif agent.made_from_id:
-        vector = agent.make_envs(run.env.env_id, n_envs, run.env.backend, seed)
-        made_here = True
-    else:
-        vector = run.env
-    try:
-        agent.check_spaces(vector, "the environment to evaluate in")
-        check_scaled(agent, vector)
-        again = None if made_here else seed  # new environments have this seed already
-        with lent(agent, vector, seeded=again is not None):
-            return evaluate(policy(agent, deterministic), vector, episodes, threshold, again, seconds)
-    finally:
-        if made_here:
-            vector.close()
 
 
 def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
@@ -248,6 +187,39 @@ def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
             "an environment: evaluate(env=...)"
         )
     return maker(env_id, **env_kwargs) if env_kwargs else env_id
+
+
+@contextmanager
+def evaluation_env(
+    agent: BaseAgent, env: Any, episodes: int | None, seed: int | None
+) -> Iterator[tuple[VectorEnv, int | None]]:
+    """Context in which episodes may be played; returns the environments, and the seed that they must still be given.
+
+    The arguments are those of :meth:`Agent.evaluate`. Environments that are made here are closed at the end.
+
+    Raises:
+        ValueError: if there are no environments, or their spaces or a missing ``VecNormalize`` do not match.
+    """
+    run = agent.run
+    n_envs = MOST_ENVS if episodes is None else min(episodes, MOST_ENVS)
+    made_here = isinstance(env, str) or callable(env) or (env is None and (run.env is None or agent.made_from_id))
+    if env is not None:
+        vector = agent.make_envs(env, n_envs if isinstance(env, str) else 1, seed=seed)
+    elif run.env is None:
+        vector = agent.make_envs(trained_on(agent), n_envs, seed=seed)
+    elif agent.made_from_id:
+        vector = agent.make_envs(run.env.env_id, n_envs, run.env.backend, seed)
+    else:
+        vector = run.env
+    try:
+        agent.check_spaces(vector, "the environment to evaluate in")
+        check_scaled(agent, vector)
+        again = None if made_here else seed  # new environments have this seed already
+        with lent(agent, vector, seeded=again is not None):
+            yield vector, again
+    finally:
+        if made_here:
+            vector.close()
 
 
 @contextmanager

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import difflib
 import sys
+import warnings
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
+
+import gymnasium as gym
 
 from rejeu import presets as all_presets
 from rejeu.agents import model_files
@@ -18,6 +21,7 @@ from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, Recurr
 from rejeu.algorithms import config as configs
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
+from rejeu.io.records import shown
 from rejeu.presets import Preset
 
 A = TypeVar("A", bound=type[Agent])
@@ -134,6 +138,39 @@ def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
         f"{algorithm} is registered in this program only, and each run is a process of its own; write the algorithm into a "
         "file, and name that: imports=['my_algorithm.py'], or --import my_algorithm.py"
     )
+
+
+def find_preset(env_id: str, algorithm: str | None, path: str | Path | None) -> Preset | None:
+    """Returns the preset of a file, else that of the environment and the algorithm, None if there is none.
+
+    Raises:
+        CheckpointError: if the algorithm of the file is not registered.
+        ValueError: if the file is a preset of another algorithm.
+    """
+    if path is None:
+        return all_presets.find(env_id, algorithm)
+    preset = all_presets.read(path)
+    agent_of_file(preset.algorithm, path)
+    if algorithm not in (None, preset.algorithm):
+        raise ValueError(f"the preset {path} is for {preset.algorithm}, not for {algorithm}; leave out one of them")
+    if preset.env_id != env_id:
+        warnings.warn(f"the preset {path} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
+    return preset
+
+
+def choose_algorithm(preset: Preset | None, env_id: str, actions: gym.Space) -> str:
+    """Returns the algorithm of a preset, else the default for a space of actions.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if preset is not None:
+        return preset.algorithm
+    kind = type(actions).__name__
+    if kind not in all_presets.ALGORITHM_FOR:
+        known = ", ".join(f"{name} takes {space}" for space, name in all_presets.ALGORITHM_FOR.items())
+        raise ValueError(f"{env_id} has the actions {actions}, which no algorithm here takes; {known}")
+    return all_presets.ALGORITHM_FOR[kind]
 
 
 def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:

@@ -19,8 +19,7 @@ from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
 from rejeu.agents.device import require_memory
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.callbacks import calling
-from rejeu.callbacks.base import Callback
+from rejeu.callbacks.base import Callback, in_order, listed
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.envs.functional import is_functional
 from rejeu.envs.functional.protocol import FunctionalEnv
@@ -118,7 +117,7 @@ def train_seeds(
             agent.learn(total_timesteps, called, log_interval, progress_bar=progress_bar, minutes=minutes)
         return agents
     calls = [training.start_call(agent, total_timesteps, None, minutes, log_interval, True) for agent in agents]
-    callbacks = [calling.listed(None if callback is None else callback(agent)) for agent in agents]
+    callbacks = [listed(None if callback is None else callback(agent)) for agent in agents]
     learn_together(agents, calls, callbacks, progress_bar=progress_bar, differing=tuple(lists))
     return agents
 
@@ -202,7 +201,7 @@ def learn_together(
     """
     first = agents[0]
     check_differing(first, differing)
-    ordered = [calling.in_order(one) for one in callbacks]
+    ordered = [in_order(one) for one in callbacks]
     if progress_bar:
         ordered[0] = [*ordered[0], ProgressBar.of(calls[0])]
     stops = common_stops(agents, calls, ordered)

@@ -12,8 +12,7 @@ import numpy as np
 from rejeu.agents import device
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.agents.outputs import open_outputs, run_config, statistics_row
-from rejeu.callbacks import calling
-from rejeu.callbacks.base import Callback
+from rejeu.callbacks.base import Callback, called, in_order, listed, listening, stateful
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.interrupt import Interrupt
@@ -21,7 +20,6 @@ from rejeu.loops import nonfinite
 from rejeu.loops.nonfinite import NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress
 from rejeu.loops.training_call import TrainingCall, checked_limits
-from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Sink
 
 
@@ -95,10 +93,10 @@ def train(
     The other arguments are those of :meth:`Agent.learn`.
     """
     warn_without_noise(agent)
-    callbacks = calling.listed(callback)
+    callbacks = listed(callback)
     if progress_bar:
         callbacks.append(ProgressBar.of(call, taken=agent.run.step - call.first_step))
-    callbacks = calling.in_order(callbacks)
+    callbacks = in_order(callbacks)
     agent.stops, agent.n_together = device.stops_of(agent, call, callbacks), 1
     if agent.stops is not None:
         device.require_memory(agent)
@@ -127,7 +125,7 @@ def session(
     Yields a function that is called after every turn of the loop. It records the turn, calls the callbacks, and returns
     whether training is over.
     """
-    agent.training_call, agent.callbacks = call, calling.stateful(callbacks)
+    agent.training_call, agent.callbacks = call, stateful(callbacks)
     agent.interrupted, agent.interrupted_by = False, None
     agent.run.success_threshold = agent.success_threshold
     agent.failed_writes.forget_written()
@@ -138,11 +136,11 @@ def session(
         for output in outputs:
             output.write_config(run_config(agent, call))
         stack.enter_context(marked_as_learning(agent, outputs))
-        stack.enter_context(calling.listening(agent, callbacks))
+        stack.enter_context(listening(agent, callbacks))
 
         def record(turn: Progress) -> bool:
             record_turn(agent, call, turn, outputs)
-            answers = [calling.called(callback, agent, turn) for callback in callbacks]
+            answers = [called(callback, agent, turn) for callback in callbacks]
             agent.failed_writes.retry_if_due()
             stopped = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
             return stopped or call.is_over(turn.step, agent.run.episode)
@@ -201,21 +199,6 @@ def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str) -
     nonfinite.settle(agent)
     agent.best = Best(score, by, agent.run.step, agent.learner.copy(agent.run.state))
     return True
-
-
-def restore_best(agent: BaseAgent) -> None:
-    """Restores the best weights.
-
-    Raises:
-        ValueError: if there are none yet.
-    """
-    if agent.best is None:
-        raise ValueError(
-            f"no best weights are known yet: they are kept after {counted(agent.best_window, 'episode')} of training, "
-            "and at every evaluation by rejeu.callbacks.Evaluate"
-        )
-    agent.run.state = agent.learner.copy(agent.best.state)
-    agent.drop_rollout()
 
 
 def record_episode(agent: BaseAgent, episode: Episode) -> None:

@@ -1,15 +1,28 @@
-"""Callbacks: functions of ``(agent, progress)``, and objects that are also told when training starts and ends."""
+"""Callbacks: functions of ``(agent, progress)``, objects that are also told when training starts and ends, and their calls."""
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+from rejeu.errors import CheckpointError
+from rejeu.interrupt import Stopped
+from rejeu.io.records import WRONG, brief, shown
 from rejeu.loops.run import Progress
 
 Callback = Callable[[Any, Progress], bool | None]
 """Called after every step of the environments as ``callback(agent, progress)``. Only ``False`` stops training."""
+HIDDEN = (
+    "rejeu: progress.action, progress.result and progress.last_obs are None, because callbacks are called between chunks of "
+    "turns here; to be called after every step, set agent.on_device = False, or derive the callback from "
+    "rejeu.callbacks.TrainingCallback with every_step = True"
+)
+"""What is added to the error of a callback that needs what a chunk hides."""
+RENAMED_CALLBACKS = {"Film": "RecordVideo"}
+"""Classes of callbacks that older checkpoints know by another name."""
 
 
 class TrainingCallback(ABC):
@@ -66,3 +79,112 @@ def step_before(agent: Any, progress: Progress, n_steps: int | None = None) -> i
     """Returns the total environment steps before the first turn of a ``learn`` of ``n_steps`` (None: of more than a turn)."""
     taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
     return max(progress.step - taken, 0)
+
+
+def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:
+    """Returns one callback, several or none as a list."""
+    return [] if callback is None else [callback] if callable(callback) else [*callback]
+
+
+def in_order(callbacks: Iterable[Callback]) -> list[Callback]:
+    """Returns callbacks in the order in which they are called: those that run last after the others."""
+    return sorted(callbacks, key=lambda callback: isinstance(callback, TrainingCallback) and callback.runs_last)
+
+
+def stateful(callbacks: Iterable[Any]) -> list[Stateful]:
+    """Returns the callbacks whose state a checkpoint contains."""
+    return [one for one in callbacks if isinstance(one, Stateful)]
+
+
+def called(callback: Callback, agent: Any, turn: Progress) -> bool | None:
+    """Returns the answer of a callback, ``False`` if Ctrl-C or SIGTERM ended it.
+
+    An error because it looked at a single step of a chunk says so.
+    """
+    try:
+        return callback(agent, turn)
+    except Stopped:
+        return False
+    except (AttributeError, TypeError) as error:
+        if turn.result is None and "NoneType" in str(error):
+            error.add_note(HIDDEN)
+        raise
+
+
+@contextmanager
+def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
+    """Tells callbacks that training starts and, on exit, that it has ended; restores their state in a resumed run."""
+    started: list[TrainingCallback] = []
+    error: BaseException | None = None
+    saved = None if agent.saved_callbacks is None else unpacked(agent.saved_callbacks, callbacks)
+    try:
+        for callback in callbacks:
+            if isinstance(callback, TrainingCallback):
+                callback.before_training(agent)
+                started.append(callback)
+            if saved is not None and isinstance(callback, Stateful):
+                restore_one(callback, saved)
+        agent.saved_callbacks = None
+        if saved is not None:
+            for one in started:
+                one.resumed(agent)
+        if saved:
+            names = shown(", ".join(name for name, _ in saved))
+            warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=6)
+        yield
+    except BaseException as raised:
+        error = raised
+        raise
+    finally:
+        with ExitStack() as ends:
+            for one in reversed(started):
+                ends.callback(one.after_training, agent, error)
+
+
+def restore(agent: Any, callbacks: Sequence[Callback]) -> None:
+    """Restores the state of callbacks of a resumed run that is not trained further.
+
+    Raises:
+        CheckpointError: if a saved state is damaged.
+    """
+    saved = unpacked(agent.saved_callbacks or (), callbacks)
+    for callback in callbacks:
+        if isinstance(callback, Stateful):
+            restore_one(callback, saved)
+
+
+def unpacked(saved: Sequence[tuple[str, Any]], callbacks: Sequence[Callback]) -> list[tuple[str, Any]]:
+    """Returns the saved states of callbacks under the present names of their classes.
+
+    Older checkpoints hold several callbacks with hooks as one ``CallbackList``.
+
+    Raises:
+        CheckpointError: if such a list is damaged.
+    """
+    given = {type(callback).__name__ for callback in callbacks}
+    states: list[tuple[str, Any]] = []
+    for name, state in saved:
+        try:
+            inside = state["inside"] if name == "CallbackList" and name not in given else [(name, state)]
+            states += [(RENAMED_CALLBACKS.get(inner, inner), part) for inner, part in inside]
+        except WRONG as error:
+            raise CheckpointError(f"the saved state of {name} is damaged: {brief(error)}") from error
+    return states
+
+
+def restore_one(callback: Stateful, saved: list[tuple[str, Any]]) -> None:
+    """Restores a callback from the first saved state of its class, which is removed from ``saved``; warns without one.
+
+    Raises:
+        CheckpointError: if that state is damaged.
+    """
+    name = type(callback).__name__
+    match = next((entry for entry in saved if entry[0] == name), None)
+    if match is None:
+        warnings.warn(f"the run was saved without a {name}; it starts from the beginning", UserWarning, stacklevel=7)
+        return
+    saved.remove(match)
+    try:
+        callback.load_state_dict(match[1])
+    except WRONG as error:
+        raise CheckpointError(f"the saved state of {name} is damaged: {brief(error)}") from error

@@ -440,27 +440,9 @@ class Import(EnvironmentOptions):
     json: Json = False
 
 
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "train": Train,
-    "tune": Tune,
-    "pbt": Pbt,
-    "resume": Resume,
-    "sweep": Sweep,
-    "evaluate": Evaluate,
-    "record": Record,
-    "export": Export,
-    "play": Play,
-    "watch": Watch,
-    "check": Check,
-    "list": List,
-    "compare": Compare,
-    "runs": Runs,
-    "status": Status,
-    "course": Course,
-    "report": Report,
-    "class": Class,
-    "import": Import,
-}
+OF_RUNS = (Train, Tune, Pbt, Resume, Sweep, Evaluate, Record, Export, Play, Watch)
+OTHERS = (Check, List, Compare, Runs, Status, Course, Report, Class, Import)
+COMMANDS: dict[str, Callable[..., Any]] = {kind.__name__.lower(): kind for kind in (*OF_RUNS, *OTHERS)}
 """The arguments of each command, by its name."""
 MODULES = {
     "class": "courses",

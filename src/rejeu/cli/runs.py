@@ -61,12 +61,9 @@ def steps_of(row: Mapping[str, Any]) -> str:
 
 def best_of(row: Mapping[str, Any]) -> str:
     """Returns the best evaluation; of a run without one the mean return of the last training episodes."""
-    best = row["best"]
-    if best is None:
-        return "-" if math.isnan(row["mean_return"]) else f"{row['mean_return']:,.2f} in training"
-    return f"{best['mean_return']:,.2f}" + (
-        "" if math.isnan(best["success_rate"]) else f", {best['success_rate']:.0%} success"
-    )
+    if row["best"] is None and math.isfinite(row["mean_return"]):
+        return f"{row['mean_return']:,.2f} in training"
+    return best_text(row["best"]).partition(" (")[0]
 
 
 def run_status(arguments: Status) -> tuple[int, dict[str, Any]]:
@@ -122,7 +119,7 @@ def best_text(best: dict[str, float] | None) -> str:
     """Returns the best evaluation as text, ``-`` for none."""
     if best is None:
         return "-"
-    success = "" if math.isnan(best["success_rate"]) else f", success {best['success_rate']:.0%}"
+    success = "" if math.isnan(best["success_rate"]) else f", {best['success_rate']:.0%} success"
     return f"{best['mean_return']:,.2f}{success} (step {best['step']:,})"
 
 

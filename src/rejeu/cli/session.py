@@ -16,7 +16,8 @@ import numpy as np
 from rejeu import errors
 from rejeu.agents import Agent, load
 from rejeu.agents.outputs import run_name, tracker_id
-from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo, calling
+from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
+from rejeu.callbacks.base import restore
 from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
@@ -114,7 +115,7 @@ class Session(NamedTuple):
         """
         with self.training(stop) as learning:
             if self.is_over:
-                calling.restore(self.agent, learning.callbacks)
+                restore(self.agent, learning.callbacks)
             else:
                 self.agent.learn(
                     self.limits.steps,

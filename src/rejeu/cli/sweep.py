@@ -1,29 +1,44 @@
-"""``rejeu sweep``: many runs from a plan, and the comparison of them."""
+"""``rejeu sweep`` and ``rejeu train ENV --seeds N``: many runs, in processes or in one program, and their comparison."""
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import re
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-from rejeu.cli.commands import Resume, Sweep
+import numpy as np
+
+from rejeu import devices
+from rejeu.agents import find_agent, training
+from rejeu.agents.device import reason_against, require_memory
+from rejeu.agents.together import learn_together, sibling, start_device
+from rejeu.cli.commands import Resume, Sweep, Train
+from rejeu.cli.importing import find_id
+from rejeu.cli.output import Stopwatch, echo, header
+from rejeu.cli.session import Session, installed_logs, make_evaluation_env
+from rejeu.envs.functional import is_functional
+from rejeu.envs.make import BACKENDS
 from rejeu.errors import MissingExtra
-from rejeu.experiments.folder import SweepFolder, read_folder
-from rejeu.experiments.jobs import again
+from rejeu.experiments import folder as folders
+from rejeu.experiments.folder import Job, JobWork, SweepFolder, again, open_folder, read_folder
+from rejeu.experiments.process import LocalLauncher, default_workers, hold, threads_of
 from rejeu.experiments.scheduler import Launcher
-from rejeu.experiments.sweep import (
-    Coordinator,
-    Outcome,
-    SweepResult,
-    closing_lines,
-    echo,
-    make_launcher,
-    prepare,
-    shown,
-)
+from rejeu.experiments.sweep import Coordinator, Outcome, SweepResult, closing_lines, make_launcher, prepare, shown
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.comparison import By, Comparison, compare
+from rejeu.runs import config as configs
 from rejeu.runs.config import RunConfig
+from rejeu.runs.folder import RunFolder, check_free
 from rejeu.runs.values import quoted
+from rejeu.validation import choice
+
+Begin = Callable[[Train, int, ExitStack], Session]
+"""Makes the session of a seed; see :func:`rejeu.cli.train.begin`."""
 
 
 def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
@@ -107,3 +122,145 @@ def summarize(folder: Path, by: By | None = None) -> Comparison | None:
     except (MissingExtra, OSError) as error:
         echo(f"no compare.html: {error}; rejeu compare {quoted(folder)} --out compare.md writes the tables")
     return comparison
+
+
+def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
+    """Trains all seeds and compares them; returns the exit status and the result."""
+    jobs = make_jobs(arguments)
+    at_once = min(arguments.jobs or default_workers(), len(jobs))
+    path = choose_folder(arguments)
+    folder = open_folder(path, folders.Sweep(jobs=jobs, threads=threads_of(at_once)), None, arguments)
+    echo(f"run folders   {path}, {len(jobs)} seeds from {jobs[0].run.seed}, {at_once} at once")
+    launcher = LocalLauncher(at_once, folder.sweep.threads)
+    status, outcomes, comparison = train(folder, launcher, arguments, replaces=("seed_", "seed "))
+    keys = ("path", "log", "exit_status", "state")
+    runs = [{"seed": one.job.run.seed, **{key: getattr(one, key) for key in keys}} for one in outcomes]
+    return status, {"folder": path, "runs": runs, "comparison": comparison}
+
+
+def make_jobs(arguments: Train) -> tuple[Job, ...]:
+    """Returns one job for each seed.
+
+    Raises:
+        ValueError: for an unknown algorithm, backend, device or log.
+        MissingExtra: if what ``--log`` or ``--video-every`` need is not installed.
+    """
+    assert arguments.seeds is not None
+    first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
+    given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
+    installed_logs(arguments)
+    devices.named(arguments.device, "--device")
+    choice("--backend", arguments.backend or "auto", BACKENDS)
+    if arguments.algorithm is not None:
+        given["algorithm"] = find_agent(arguments.algorithm).algorithm.Config.name
+    if arguments.ray not in (None, "auto"):
+        os.environ["RAY_ADDRESS"] = arguments.ray  # no file may name an address
+    run = RunConfig(**{**given, "ray": None if arguments.ray is None else "auto", "imports": ()})
+    return tuple(
+        Job(
+            name=f"seed_{seed}",
+            run=dataclasses.replace(run, seed=seed),
+            no_report=arguments.no_report,
+            no_video=arguments.no_video,
+        )
+        for seed in range(first, first + arguments.seeds)
+    )
+
+
+def choose_folder(arguments: Train) -> Path:
+    """Returns a new or empty folder for the run folders: ``--out``, or one under ``runs``."""
+    check_free(arguments.out)
+    name = "-".join(filter(None, [arguments.env, arguments.algorithm, "seeds", time.strftime("%Y%m%d-%H%M%S")]))
+    return arguments.out or Path("runs") / re.sub(r"[^\w.-]+", "-", name)
+
+
+def fit_together(arguments: Train) -> bool:
+    """Returns whether seeds are trained in one program: in a JAX environment without wrappers, and without ``--jobs``.
+
+    Imports the environment if it is one of the user's own.
+    """
+    return arguments.jobs is None and not arguments.wrappers and is_functional(find_id(arguments.env))
+
+
+def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
+    """Trains all seeds and compares them; returns the exit status and the result.
+
+    Settings that cannot be trained on the device are trained in processes.
+    """
+    stopwatch, jobs = Stopwatch(), make_jobs(arguments)
+    devices.start_with("--device", arguments.device)
+    path = choose_folder(arguments)
+    start_device(len(jobs))
+    with ExitStack() as stack:
+        first = begin(arguments, jobs[0].seed, stack)
+        if reason := reason_against(first.agent, ()):
+            echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
+            return train_all(arguments)
+        require_memory(first.agent, len(jobs))
+        folder = open_folder(path, folders.Sweep(jobs=jobs, threads=threads_of(1)), None, arguments)
+        sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
+        works = folder.works()
+        sessions = [with_folder(session, work) for session, work in zip(sessions, works, strict=True)]
+        echo(
+            header(
+                first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)
+            )
+        )
+        for work in works:
+            claim = hold(work.claim)
+            assert claim is not None, "another process uses a new folder"
+            stack.callback(claim.release)
+        with Interrupt() as stop:
+            statuses = train_sessions(sessions, stop, stopwatch)
+        if stop.signal is None:
+            for work, status in zip(works, statuses, strict=True):
+                work.write_exit(status)
+    comparison = summarize(path)
+    runs = [
+        {"seed": work.job.seed, "path": work.run, "exit_status": status}
+        for work, status in zip(works, statuses, strict=True)
+    ]
+    result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
+    if stop.signal is not None:
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, arguments)} continues, each seed in a "
+            "process of its own"
+        )
+        return 128 + stop.signal, result
+    return max(statuses), result
+
+
+def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
+    """Returns the session of another seed, whose agent shares the compiled functions of the first; ``stack`` closes it."""
+    config = dataclasses.replace(first.config, seed=seed)
+    env = stack.enter_context(closing(first.environment.vector(config.n_envs, config.backend, seed)))
+    evaluation_env = stack.enter_context(closing(make_evaluation_env(config, first.environment)))
+    return first._replace(agent=sibling(first.agent, env, seed), config=config, evaluation_env=evaluation_env)
+
+
+def with_folder(session: Session, work: JobWork) -> Session:
+    """Returns a session with its new run folder."""
+    work.run.mkdir(parents=True, exist_ok=True)
+    session = session._replace(folder=RunFolder(work.run), label=f"seed {work.job.seed}: ")
+    configs.write(session.folder.config, session.config)
+    return session
+
+
+def train_sessions(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatch) -> list[int]:
+    """Trains the runs together and finishes each; returns their exit statuses."""
+    agents = [session.agent for session in sessions]
+    with ExitStack() as stack:
+        learnings = [stack.enter_context(session.training(stop)) for session in sessions]
+        calls = [
+            training.start_call(one.agent, one.limits.steps, None, one.limits.minutes, one.log_interval, True)
+            for one in sessions
+        ]
+        learn_together(
+            agents,
+            calls,
+            [learning.callbacks for learning in learnings],
+            [learning.sinks for learning in learnings],
+            progress_bar=True,
+        )
+    finished = zip(sessions, learnings, strict=True)
+    return [session.finish(learning, stop, stopwatch)[0] for session, learning in finished]

@@ -5,7 +5,6 @@ The command line decides, then the preset of the environment, then the defaults.
 
 from __future__ import annotations
 
-import warnings
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,10 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu import devices, presets, validation
-from rejeu.agents import AGENTS, agent_of_file, find_agent
+from rejeu.agents import AGENTS, find_agent
+from rejeu.agents.registry import choose_algorithm, find_preset
 from rejeu.algorithms import config as configs
-from rejeu.cli import check, environment, seeds
+from rejeu.cli import check, environment, sweep
 from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, echo, header
@@ -24,7 +24,6 @@ from rejeu.cli.session import Limits, Session, installed_logs, make_evaluation_e
 from rejeu.envs.make import VectorEnv, WorkerOptions
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.interrupt import Interrupt
-from rejeu.io.records import shown
 from rejeu.presets import Preset
 from rejeu.runs import config as runs
 from rejeu.runs.config import DecidedRun
@@ -38,7 +37,7 @@ MANY = 64
 def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains; the exit status is 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
     if arguments.seeds is not None:
-        return seeds.train_together(arguments, begin) if seeds.fit_together(arguments) else seeds.train_all(arguments)
+        return sweep.train_together(arguments, begin) if sweep.fit_together(arguments) else sweep.train_all(arguments)
     stopwatch = Stopwatch()
     devices.start_with("--device", arguments.device)
     check_free(arguments.out)
@@ -57,9 +56,9 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
     logs = installed_logs(arguments)
     algorithm = None if arguments.algorithm is None else find_agent(arguments.algorithm).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
-    preset = find_preset(arguments, made, algorithm)
+    preset = find_preset(made.env_id, algorithm, None if arguments.preset is None else str(arguments.preset))
     env = stack.enter_context(closing(make_env(arguments, made, preset, seed)))
-    algorithm = algorithm or choose_algorithm(preset, env)
+    algorithm = algorithm or choose_algorithm(preset, env.env_id, env.action_space)
     config = make_config(arguments, made, preset, algorithm, env, seed, logs)
     general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
@@ -77,26 +76,6 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
         has_video=not arguments.no_video,
         backend=describe_backend(env, made, preset),
     )
-
-
-def find_preset(arguments: Train, made: Environment, algorithm: str | None) -> Preset | None:
-    """Returns the preset of ``--preset``, else that of the environment, None if there is none.
-
-    Raises:
-        ValueError: if the file's preset is for another algorithm than ``--algo`` says, or one that is not known.
-    """
-    if arguments.preset is None:
-        return presets.find(made.env_id, algorithm)
-    preset = presets.read(Path(str(arguments.preset)))
-    agent_of_file(preset.algorithm, str(arguments.preset))
-    if algorithm not in (None, preset.algorithm):
-        raise ValueError(
-            f"--algo {algorithm} differs from the algorithm of --preset {arguments.preset}, which is {preset.algorithm}; "
-            "leave out one of them"
-        )
-    if preset.env_id != made.env_id:
-        warnings.warn(f"--preset {arguments.preset} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
-    return preset
 
 
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
@@ -126,21 +105,6 @@ def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -
     if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
         return env.backend
     return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
-
-
-def choose_algorithm(preset: Preset | None, env: VectorEnv) -> str:
-    """Returns the preset's algorithm, or the default for the environment's action space.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    if preset is not None:
-        return preset.algorithm
-    kind = type(env.action_space).__name__
-    if kind not in presets.ALGORITHM_FOR:
-        known = ", ".join(f"{name} takes {space}" for space, name in presets.ALGORITHM_FOR.items())
-        raise ValueError(f"{env.env_id} has the actions {env.action_space}, which no algorithm here takes; {known}")
-    return presets.ALGORITHM_FOR[kind]
 
 
 def make_config(

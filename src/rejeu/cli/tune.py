@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rejeu import presets
-from rejeu.agents import AGENTS, agent_of_file, find_agent, modules_of
+from rejeu.agents import AGENTS, find_agent, modules_of
+from rejeu.agents.registry import find_preset
 from rejeu.algorithms.search import Dimension
 from rejeu.cli import environment
 from rejeu.cli.commands import Pbt, Resume, Tune
@@ -25,7 +25,6 @@ from rejeu.experiments.study import Outcome, Study, StudyFolder
 from rejeu.experiments.study_plan import Plan
 from rejeu.experiments.sweep import Row, bars
 from rejeu.interrupt import NAMES, Interrupt
-from rejeu.presets import Preset
 from rejeu.reporting import notebook
 from rejeu.reporting.formatting import counted, number
 from rejeu.runs import values
@@ -89,15 +88,17 @@ def environment_of(plan: Plan, what: str, arguments: Resume) -> Environment:
 
 def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
     """Returns the arguments of a plan that studies and populations share."""
-    preset = None if arguments.preset is None else presets.read(arguments.preset)
+    name = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
+    preset = find_preset(made.env_id, name, arguments.preset)
+    algorithm = name if preset is None else preset.algorithm
     return {
-        "algorithm": arguments.algo,
+        "algorithm": algorithm,
         "env_argument": made.run.env,
         "env_kwargs": made.kwargs,
         "wrappers": made.run.wrappers,
         "preset": preset,
         "fixed": values.apply(arguments.assignments, {}),
-        "search": read_search(arguments.search, algorithm_of(arguments, made, preset)),
+        "search": read_search(arguments.search, algorithm),
         "only": arguments.only,
         "n_envs": arguments.envs,
         "backend": arguments.backend,
@@ -106,17 +107,6 @@ def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
         "measure": arguments.measure,
         "checkpoint_minutes": arguments.checkpoint_minutes,
     }
-
-
-def algorithm_of(arguments: Tune | Pbt, made: Environment, preset: Preset | None) -> str | None:
-    """Returns the name of the algorithm to tune, None if it is not known."""
-    if arguments.algo is not None:
-        return find_agent(arguments.algo).algorithm.Config.name
-    found = preset or presets.find(made.env_id)
-    if found is None:
-        return None
-    agent_of_file(found.algorithm, arguments.preset or "the preset")
-    return found.algorithm
 
 
 def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, Dimension]:

@@ -1,6 +1,6 @@
-"""The folder of a sweep. The state of each job follows from its files, so several processes and machines may work on it.
+"""The jobs of a sweep as data, and the folder in which they are trained.
 
-::
+The state of each job follows from its files, so several processes and machines may work on a folder. ::
 
     sweep.json              the jobs
     plan.toml               copy of the plan
@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -26,16 +28,18 @@ import numpy as np
 from filelock import FileLock
 from msgspec import Meta
 
+from rejeu.envs.registry import are_plain
 from rejeu.errors import CheckpointError
-from rejeu.experiments.jobs import MAX_JOBS, Job, Resources, from_file
-from rejeu.experiments.process import hold
+from rejeu.experiments.process import LOST
+from rejeu.experiments.scheduler import Work
 from rejeu.io import atomic
-from rejeu.io.records import Malformed, convert, parse_json, shown
+from rejeu.io.records import Malformed, convert, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
-from rejeu.runs.config import RunConfig, Task
+from rejeu.runs.config import RENAMED, RunConfig, Task
 from rejeu.runs.folder import newest_step
-from rejeu.runs.values import quoted
+from rejeu.runs.values import quoted, written
+from rejeu.validation import assign
 
 SWEEP, PLAN, HIDDEN = "sweep.json", "plan.toml", ".sweep"
 MAX_BYTES = 2**26
@@ -45,6 +49,143 @@ PATIENCE = 60.0
 
 NOTHING = RunConfig(env="")
 """A command line that names nothing to import."""
+
+MAX_JOBS = 10_000
+"""Most runs of a sweep."""
+MAX_NAME = 150
+"""Most characters of the name of a job, which is also that of a folder."""
+UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+Name = Annotated[str, Meta(pattern=rf"^\w[\w.-]{{0,{MAX_NAME - 1}}}\Z")]
+FILES = ("no_report", "no_video")
+"""Options about the files of a job, which its run does not keep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resources:
+    """What one run needs on a node of a Ray cluster; Ray starts no more runs on a node than fit."""
+
+    cpus: Annotated[float, Meta(gt=0, le=10_000)] = 1
+    """Processor cores."""
+    gpus: Annotated[float, Meta(ge=0, le=1000)] = 0
+    """GPUs; a fraction shares one."""
+    memory: int | str | None = None
+    """Memory in bytes, or as ``"4 GB"``; None reserves none."""
+    custom: Annotated[dict[str, Annotated[float, Meta(gt=0)]], Meta(max_length=100)] = field(default_factory=dict)
+    """Ray's custom resources by name."""
+
+    def __post_init__(self) -> None:
+        assign(self, memory=None if self.memory is None else memory_bytes(self.memory))
+
+
+def memory_bytes(value: Any) -> int:
+    """Returns an amount of memory in bytes.
+
+    Raises:
+        ValueError: if it is none.
+
+    >>> memory_bytes("1.5 GB"), memory_bytes(1000)
+    (1500000000, 1000)
+    """
+    found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?([KMGT]?B)?", str(value))
+    if isinstance(value, bool) or found is None or float(found[1]) <= 0:
+        raise ValueError(f"memory={value!r} must be a number of bytes, or a text such as '4 GB'")
+    return int(float(found[1]) * UNITS[found[2] or ""])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One run of a sweep."""
+
+    name: Name
+    """Of its folder, its log and its locks."""
+    run: RunConfig
+    """Its description; what it imports is named on the command line of the sweep."""
+    setting: str = ""
+    """Name of the hyperparameters."""
+    no_report: bool = False
+    no_video: bool = False
+
+    def __post_init__(self) -> None:
+        if self.run.seed is None:
+            raise ValueError(f"the job {self.name} has no seed")
+        if self.run.env_argument or self.run.imports:
+            raise ValueError(f"the job {self.name} names what is imported, which no file may do")
+        if self.run.ray not in (None, "auto"):
+            raise ValueError(
+                f"ray={self.run.ray!r} must be 'auto': no file may name what is connected to; set RAY_ADDRESS=HOST:PORT"
+            )
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        assert self.run.seed is not None
+        return self.run.seed
+
+    def task(self, folder: Path, resume: bool, imports: tuple[str, ...]) -> Task:
+        """Returns what a process is asked to do: to begin the run in a folder, or to continue it there."""
+        run = replace(self.run, imports=imports)
+        return Task(folder=str(folder), run=run, resume=resume, no_report=self.no_report, no_video=self.no_video)
+
+    def check_code(self, typed: RunConfig, where: object) -> None:
+        """Raises ``CheckpointError`` if the job imports something that the command line does not name."""
+        kwargs, of_line = ({key: written(one) for key, one in run.env_kwargs.items()} for run in (self.run, typed))
+        is_named = self.run.env == typed.env and self.run.wrappers == typed.wrappers and kwargs == (of_line or kwargs)
+        if not self.run.names_code or (is_named and (of_line or are_plain(self.run.env_kwargs))):
+            return
+        options = again([self], RunConfig(env=""))
+        raise CheckpointError(
+            f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
+            f"if you trust it, name it again:{options if len(options) < 500 and options.isprintable() else ' --env ENV'}"
+        )
+
+
+def from_file(content: Any) -> Any:
+    """Returns a job of a ``sweep.json`` in the present form; earlier versions wrote the run between the fields of the job."""
+    if not isinstance(content, dict) or "run" in content:
+        return content
+    options = content.get("options", {})
+    if not isinstance(options, dict):
+        raise Malformed("the options of a job are no table")
+    own = {one.name for one in fields(Job)}
+    run = {RENAMED.get(key, key): one for key, one in {**options, **content}.items() if key not in {*own, "options"}}
+    return {key: one for key, one in {**options, **content, "run": run}.items() if key in own}
+
+
+def again(jobs: Iterable[Job], typed: RunConfig) -> str:
+    """Returns the options with which ``rejeu resume`` imports what jobs need, with a space before each.
+
+    >>> again([Job(name="a", run=RunConfig(env="my_env.py", seed=0))], RunConfig(env="my_env.py"))
+    ' --env my_env.py'
+    >>> again([Job(name="a", run=RunConfig(env="CartPole-v1", seed=0))], RunConfig(env="", imports=("a.py",)))
+    ' --import a.py'
+    """
+    run = next((job.run for job in jobs if job.run.names_code), RunConfig(env="plain"))
+    return replace(run, imports=typed.imports).again()
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the values of a nested mapping by dotted name.
+
+    >>> dict(flat({"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}))
+    {'gamma': 0.9, 'policy_kwargs.net_arch': [8]}
+    """
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def job_name(*parts: object) -> str:
+    """Returns a readable name for a run and its folder.
+
+    >>> job_name("ALE/Pong-v5", "DQN", "", 3)
+    'ALE-Pong-v5-DQN-seed3'
+    """
+    *labels, seed = parts
+    text = "-".join(str(one) for one in labels if one)
+    return f"{re.sub(r'[^A-Za-z0-9_.]+', '-', text).strip('-.')[: MAX_NAME - 20]}-seed{seed}"
+
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]
 
@@ -70,96 +211,91 @@ class JobProgress(NamedTuple):
     """Best mean return of an evaluation."""
 
 
-@dataclass(frozen=True)
-class SweepFolder:
-    """The files of one sweep."""
+class JobWork(Work):
+    """A job in the folder of a sweep, and its files. Mutable."""
 
-    path: Path
-    sweep: Sweep
+    claim: Path
 
-    @property
-    def jobs(self) -> tuple[Job, ...]:
-        """Its jobs, in the order of the plan."""
-        return self.sweep.jobs
+    def __init__(self, folder: Path, job: Job, imports: tuple[str, ...] = (), is_retried: bool = False) -> None:
+        """Starts nothing.
 
-    def run(self, job: Job) -> Path:
-        """Returns the run folder of a job."""
-        return self.path / job.name
+        Args:
+            folder: of the sweep.
+            job: the job.
+            imports: what its process imports first.
+            is_retried: whether it is tried again if it has failed before.
+        """
+        self.folder, self.job, self.imports = folder, job, imports
+        self.name, self.run, self.log = job.name, folder / job.name, folder / f"{job.name}.log"
+        self.lock, self.claim, self.exit = (folder / HIDDEN / f"{job.name}.{end}" for end in ("run", "claim", "exit"))
+        self.is_retried = is_retried and bool(self.exit_status())
 
-    def log(self, job: Job) -> Path:
-        """Returns the file with what the processes of a job printed."""
-        return self.path / f"{job.name}.log"
+    def is_training(self) -> bool:
+        """Returns whether a process trains its run, which may outlive the process that started it."""
+        return self.lock.is_file() and is_locked(self.lock)
 
-    def hidden(self, job: Job, suffix: str) -> Path:
-        """Returns a file about a job: ``claim``, ``run`` or ``exit``."""
-        return self.path / HIDDEN / f"{job.name}.{suffix}"
-
-    def claim(self, job: Job) -> FileLock | None:
-        """Returns the lock of a job, held by this process; None if another process holds it."""
-        return hold(self.hidden(job, "claim"))
-
-    def is_training(self, job: Job) -> bool:
-        """Returns whether a process trains the run of a job, which may outlive the process that started it."""
-        path = self.hidden(job, "run")
-        return path.is_file() and is_locked(path)
-
-    def is_held(self, job: Job) -> bool:
-        """Returns whether a process looks after a job or trains its run."""
-        path = self.hidden(job, "claim")
-        return (path.is_file() and is_locked(path)) or self.is_training(job)
-
-    def exit_status(self, job: Job) -> int | None:
+    def exit_status(self) -> int | None:
         """Returns the exit status of a job that is done or has failed; None for another."""
         try:
-            return int(read_bytes(self.hidden(job, "exit"), 20))
+            return int(read_bytes(self.exit, 20))
         except (OSError, ValueError):
             return None
 
-    def write_exit(self, job: Job, status: int) -> None:
-        """Writes that a job is done or has failed."""
-        with atomic.replacing(self.hidden(job, "exit")) as file:
+    def write_exit(self, status: int) -> None:
+        """Writes that it is done or has failed."""
+        with atomic.replacing(self.exit) as file:
             file.write(f"{status}\n".encode())
 
-    def is_done(self, job: Job) -> bool:
-        """Returns whether the run of a job reached its goal and its process exited with status 0."""
-        return self.exit_status(job) == 0 and (self.run(job) / "agent.safetensors").is_file()
-
-    def state(self, job: Job) -> State:
-        """Returns the state of a job."""
-        if self.is_held(job):
+    def state(self) -> State:
+        """Returns its state, by its files."""
+        if self.is_training() or (self.claim.is_file() and is_locked(self.claim)):
             return "running"
-        if self.is_done(job):
+        status = self.exit_status()
+        if status == 0 and self.has_result():
             return "done"
-        if self.exit_status(job):
+        if status:
             return "failed"
-        return "stopped" if self.run(job).is_dir() else "waiting"
+        return "stopped" if self.run.is_dir() else "waiting"
 
-    def task(self, job: Job, imports: tuple[str, ...]) -> Task:
-        """Returns what trains a job on: from its newest checkpoint, else from the start.
+    def has_result(self) -> bool:
+        return (self.run / "agent.safetensors").is_file()
+
+    def is_open(self) -> bool:
+        status = self.exit_status()
+        return self.is_retried or not (status or (status == 0 and self.has_result()))
+
+    def task(self) -> Task:
+        """Returns what trains it on: from its newest checkpoint, else from the start.
 
         A run folder without a checkpoint is moved aside first.
         """
-        run = self.run(job)
-        has_begun = newest_step(run / "checkpoints") >= 0
-        if not has_begun and run.is_dir() and any(run.iterdir()):
-            self.move_aside(job)
-        return job.task(run, has_begun, imports)
+        self.is_retried = False
+        self.exit.unlink(missing_ok=True)
+        has_begun = newest_step(self.run / "checkpoints") >= 0
+        if not has_begun and self.run.is_dir() and any(self.run.iterdir()):
+            self.move_aside()
+        return self.job.task(self.run, has_begun, self.imports)
 
-    def move_aside(self, job: Job) -> Path:
-        """Moves the run folder of a job out of the way and returns where it is now."""
-        aside = self.path / HIDDEN / "aside"
+    def move_aside(self) -> None:
+        """Moves the run folder out of the way."""
+        aside = self.folder / HIDDEN / "aside"
         aside.mkdir(parents=True, exist_ok=True)
         n = 1
-        while (target := aside / f"{job.name}-{n}").exists():
+        while (target := aside / f"{self.name}-{n}").exists():
             n += 1
-        shutil.move(self.run(job), target)
-        return target
+        shutil.move(self.run, target)
 
-    def progress(self, job: Job) -> JobProgress:
-        """Returns how far the run of a job is."""
-        run = self.run(job)
-        metrics = read_table(run / METRICS, ("step", "time/time_elapsed", "rollout/ep_rew_mean"))
-        evaluations = read_table(run / EVALUATIONS, ("step", "mean_return"))
+    def ended(self) -> None:
+        """Writes that the job is done or has failed; without it the job is looked at again by the next process."""
+        if self.ending == "done":
+            self.write_exit(0)
+        elif self.ending == "failed":
+            self.write_exit(self.status or LOST)
+
+    def progress(self) -> JobProgress:
+        """Returns how far its run is."""
+        metrics = read_table(self.run / METRICS, ("step", "time/time_elapsed", "rollout/ep_rew_mean"))
+        evaluations = read_table(self.run / EVALUATIONS, ("step", "mean_return"))
         values = evaluations.column("mean_return")
         steps = [column[-1] for column in (metrics.column("step"), evaluations.column("step")) if len(column)]
         steps = [one for one in steps if np.isfinite(one)]
@@ -170,6 +306,22 @@ class SweepFolder:
 
         best = float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
         return JobProgress(int(max(steps, default=0)), last("time/time_elapsed"), last("rollout/ep_rew_mean"), best)
+
+
+class SweepFolder(NamedTuple):
+    """The folder of a sweep."""
+
+    path: Path
+    sweep: Sweep
+
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """Its jobs, in the order of the plan."""
+        return self.sweep.jobs
+
+    def works(self, imports: tuple[str, ...] = (), retry: bool = False) -> list[JobWork]:
+        """Returns its jobs as runs that a scheduler trains; ``retry`` tries those again that have failed."""
+        return [JobWork(self.path, job, imports, retry) for job in self.jobs]
 
 
 def is_sweep(path: Path) -> bool:
@@ -232,10 +384,7 @@ def read_folder(path: Path, typed: RunConfig = NOTHING) -> SweepFolder:
     if not is_sweep(path):
         raise FileNotFoundError(f"{path} is no folder of a sweep: it holds no {SWEEP}")
     try:
-        data = read_bytes(path / SWEEP, MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Malformed(f"it has more than {MAX_BYTES:,} bytes")
-        content: Any = parse_json(data)
+        content: Any = read_json(path / SWEEP, MAX_BYTES)
         if isinstance(content, dict) and isinstance(content.get("jobs"), list):
             content["jobs"] = [from_file(job) for job in content["jobs"]]
         sweep = convert(content, Sweep)

@@ -19,9 +19,10 @@ from msgspec import Meta
 
 from rejeu import devices, presets, spaces
 from rejeu.agents import AGENTS, find_agent
+from rejeu.agents.registry import choose_algorithm, find_preset
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
-from rejeu.experiments.jobs import FILES, MAX_JOBS, Job, Resources, flat, job_name
+from rejeu.experiments.folder import FILES, MAX_JOBS, Job, Resources, flat, job_name
 from rejeu.io.records import Seed, convert, shown
 from rejeu.reporting.logging import check_logs, require
 from rejeu.runs.config import RunConfig, options
@@ -152,7 +153,8 @@ def parse(content: Mapping[str, Any], plan: str) -> Plan:
         seeds = seeds_of(found)
         read_run("", {}, common)
     with at(plan, "resources"):
-        resources = build(Resources, found.resources)
+        check_names(found.resources, field_names(Resources), "resources")
+        resources = convert(found.resources, Resources)
     environments = list(read_environments(found, common, plan))
     count = sum(len(one.algorithms) for one in environments) * len(found.settings) * len(seeds)
     with at(plan):
@@ -178,9 +180,12 @@ def expanded(
                 if "algorithms" in setting and algorithm not in read_algorithms(setting["algorithms"]):
                     continue
                 own = convert(setting.get(str(algorithm), {}), Kwargs)
-                chosen = algorithm or choose_algorithm(environment)
+                path = None if environment.run.preset is None else str(environment.run.preset)
+                preset = find_preset(environment.run.env, algorithm, path)
+                chosen = algorithm or choose_algorithm(preset, environment.run.env, environment.action)
                 common = {key: value for key, value in setting.items() if key != "algorithms" and key not in AGENTS}
-                check_hyperparameters(environment, chosen, {**common, **own})
+                base = preset or presets.default(environment.run.env, chosen)
+                check_hyperparameters(environment, chosen, base.hyperparameters, {**common, **own})
             run = replace(environment.run, algorithm=chosen, hyperparameters=dict(flat({**common, **own})))
             for seed in seeds:
                 job = job_name(environment.label, chosen, name, seed)
@@ -282,34 +287,17 @@ def find_spaces(run: RunConfig) -> tuple[gym.Space, gym.Space]:
         env.close()
 
 
-def find_preset(run: RunConfig, algorithm: str | None) -> presets.Preset | None:
-    """Returns the preset of the plan's file, else that of the environment, None if there is none."""
-    if run.preset is None:
-        return presets.find(run.env, algorithm)
-    found: presets.Preset = presets.read(str(run.preset))
-    if algorithm not in (None, found.algorithm):
-        raise ValueError(f"{run.preset} is a preset of {found.algorithm}, not of {algorithm}")
-    return found
-
-
-def choose_algorithm(environment: Environment) -> str:
-    """Returns the algorithm of the preset, or the one that fits the actions."""
-    preset, kind = find_preset(environment.run, None), type(environment.action).__name__
-    if preset is None and kind not in presets.ALGORITHM_FOR:
-        raise ValueError(f"no algorithm here takes the actions {environment.action}")
-    return presets.ALGORITHM_FOR[kind] if preset is None else preset.algorithm
-
-
-def check_hyperparameters(environment: Environment, algorithm: str, given: Mapping[str, Any]) -> None:
-    """Builds the algorithm for the environment's spaces, as ``rejeu train`` would, without training.
+def check_hyperparameters(
+    environment: Environment, algorithm: str, base: Mapping[str, Any], given: Mapping[str, Any]
+) -> None:
+    """Builds the algorithm with ``base`` and the given values for the environment's spaces, as ``rejeu train`` would.
 
     Raises:
         ValueError, TypeError: for an unknown or invalid hyperparameter, or if the algorithm does not take such spaces.
     """
     kind = AGENTS[algorithm]
     check_names(given, field_names(kind.algorithm.Config), algorithm)
-    base = find_preset(environment.run, algorithm) or presets.default(environment.run.env, algorithm)
-    config = build(kind.algorithm.Config, merged(dict(flat(given)), base.hyperparameters))
+    config = build(kind.algorithm.Config, merged(dict(flat(given)), base))
     nested = isinstance(environment.observation, gym.spaces.Dict | gym.spaces.Tuple)
     agent = kind.__new__(kind)
     agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, seed=0)

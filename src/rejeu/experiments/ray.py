@@ -14,14 +14,16 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rejeu import cluster, hardware
 from rejeu.errors import ClusterError
-from rejeu.experiments.jobs import Resources
 from rejeu.experiments.process import LOST, THREADS, Process
 from rejeu.io import atomic
 from rejeu.runs.config import read_task, write_task
+
+if TYPE_CHECKING:
+    from rejeu.experiments.folder import Resources
 
 POLL = 0.5
 """Seconds between two looks at the process on a node."""
@@ -291,6 +293,7 @@ def wanted(resources: Resources) -> dict[str, float]:
 def places(there: Mapping[str, float], resources: Resources) -> int:
     """Returns how many runs a node has room for.
 
+    >>> from rejeu.experiments.folder import Resources
     >>> places({"CPU": 8.0, "GPU": 1.0}, Resources(cpus=2, gpus=0.5))
     2
     """
@@ -300,6 +303,7 @@ def places(there: Mapping[str, float], resources: Resources) -> int:
 def described(resources: Resources) -> str:
     """Returns resources as text.
 
+    >>> from rejeu.experiments.folder import Resources
     >>> described(Resources(gpus=1))
     'CPU=1, GPU=1'
     """

@@ -16,8 +16,6 @@ study continues as it would have without the interruption.
 from __future__ import annotations
 
 import math
-import os
-import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -44,8 +42,6 @@ NAME = "rejeu"
 """Name of the study in its journal."""
 INDEX, REPEATS, REASON = "index", "repeats", "reason"
 """User attributes of trials: the index, the number of the interrupted trial that is repeated, why a trial failed."""
-MAX_JOURNAL_BYTES = 2**30
-"""Upper limit on the size of a journal; a trial takes some kilobytes."""
 STARTUP_TRIALS = 5
 """Trials before the first one is pruned."""
 LOCK = "trial.lock"
@@ -284,23 +280,17 @@ def complete_last_line(journal: Path, lock: Any) -> None:
     """Cuts the part of a line at the end of a journal that a killed process left behind; Optuna cannot read on after it.
 
     Raises:
-        CheckpointError: if it is no regular file, such as a symbolic link, or too large.
+        CheckpointError: if it is a symbolic link.
     """
-    if not os.path.lexists(journal):
+    if journal.is_symlink():
+        raise CheckpointError(f"{journal} is a link and no file; it is from another program")
+    if not journal.is_file():
         return
-    found = journal.lstat()
-    if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_JOURNAL_BYTES:
-        raise CheckpointError(
-            f"{journal} is no file of up to {MAX_JOURNAL_BYTES >> 20} MiB; it is from another program"
-        )
-    lock.acquire()
-    try:
+    with lock:
         content = journal.read_bytes()
         if content and not content.endswith(b"\n"):
             with journal.open("r+b") as file:
                 file.truncate(content.rfind(b"\n") + 1)
-    finally:
-        lock.release()
 
 
 @contextmanager

@@ -17,15 +17,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rejeu.agents import modules_of
-from rejeu.experiments.folder import HIDDEN, JobProgress, State, Sweep, SweepFolder, open_folder, read_folder
-from rejeu.experiments.jobs import Job, again
+from rejeu.experiments.folder import (
+    HIDDEN,
+    Job,
+    JobProgress,
+    JobWork,
+    State,
+    Sweep,
+    SweepFolder,
+    again,
+    open_folder,
+    read_folder,
+)
 from rejeu.experiments.plan import read_plan
-from rejeu.experiments.process import LOST, LocalLauncher, default_workers, threads_of
-from rejeu.experiments.scheduler import Launcher, Scheduler, Work
+from rejeu.experiments.process import LocalLauncher, default_workers, threads_of
+from rejeu.experiments.scheduler import Launcher, Scheduler
 from rejeu.interrupt import Interrupt
 from rejeu.reporting import notebook
 from rejeu.reporting.formatting import counted
-from rejeu.runs.config import RunConfig, Task
+from rejeu.runs.config import RunConfig
 from rejeu.runs.values import quoted
 
 if TYPE_CHECKING:
@@ -51,35 +61,6 @@ class Outcome:
     exit_status: int | None
     path: Path
     log: Path
-
-
-class JobWork(Work):
-    """A job of a sweep. Mutable."""
-
-    def __init__(self, folder: SweepFolder, job: Job, imports: tuple[str, ...], is_retried: bool) -> None:
-        self.folder, self.job, self.imports = folder, job, imports
-        self.is_retried = is_retried
-        """Whether it has failed before, and is to be tried again."""
-        self.name, self.run, self.log = job.name, folder.run(job), folder.log(job)
-        self.lock, self.claim = folder.hidden(job, "run"), folder.hidden(job, "claim")
-
-    def is_open(self) -> bool:
-        return self.is_retried or not (self.folder.is_done(self.job) or self.folder.exit_status(self.job))
-
-    def task(self) -> Task:
-        self.is_retried = False
-        self.folder.hidden(self.job, "exit").unlink(missing_ok=True)
-        return self.folder.task(self.job, self.imports)
-
-    def has_result(self) -> bool:
-        return (self.run / "agent.safetensors").is_file()
-
-    def ended(self) -> None:
-        """Writes that the job is done or has failed; without it the job is looked at again by the next process."""
-        if self.ending == "done":
-            self.folder.write_exit(self.job, 0)
-        elif self.ending == "failed":
-            self.folder.write_exit(self.job, self.status or LOST)
 
 
 class Coordinator:
@@ -111,9 +92,7 @@ class Coordinator:
         modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, typed.imports)}
         self.folder, self.launcher = folder, launcher
         self.typed = dataclasses.replace(typed, imports=tuple(modules) or typed.imports)
-        self.tasks = [
-            JobWork(folder, job, self.typed.imports, retry and bool(folder.exit_status(job))) for job in folder.jobs
-        ]
+        self.tasks = folder.works(self.typed.imports, retry)
         self.scheduler = Scheduler(launcher, stop, say)
         self.scheduler.waiting.extend(task for task in self.tasks if task.is_open())
 
@@ -121,19 +100,19 @@ class Coordinator:
         """Works until nothing is left; ``watch`` is called several times a second."""
         self.scheduler.run(lambda: watch(self))
 
-    def running(self) -> list[Job]:
+    def running(self) -> list[JobWork]:
         """Returns the jobs that this process looks after and that train."""
         attended = {attempt.task for attempt in self.scheduler.running}
-        return [task.job for task in self.tasks if task in attended]
+        return [task for task in self.tasks if task in attended]
 
     def outcomes(self) -> list[Outcome]:
         """Returns the state of every job."""
-        folder, running = self.folder, {job.name for job in self.running()}
+        running = self.running()
         return [
             Outcome(
                 task.job,
-                "running" if task.name in running else folder.state(task.job),
-                folder.exit_status(task.job) if task.status is None else task.status,
+                "running" if task in running else task.state(),
+                task.exit_status() if task.status is None else task.status,
                 task.run,
                 task.log,
             )
@@ -340,10 +319,10 @@ def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
 def rows(coordinator: Coordinator) -> list[Row]:
     """Returns a row for all steps of the sweep, by which the remaining time is estimated, and one for each run that trains."""
     found, taken = [], 0
-    for job in coordinator.running():
-        at = coordinator.folder.progress(job)
+    for task in coordinator.running():
+        at, steps = task.progress(), task.job.run.steps
         taken += at.step
-        found.append(Row(job.name, at.step, job.run.steps, text_of(at, job.run.steps)))
+        found.append(Row(task.name, at.step, steps, text_of(at, steps)))
     outcomes = coordinator.outcomes()
     asked = sum(one.job.run.steps or 0 for one in outcomes if one.state != "failed")
     taken += sum(one.job.run.steps or 0 for one in outcomes if one.state == "done")
@@ -352,8 +331,8 @@ def rows(coordinator: Coordinator) -> list[Row]:
 
 def line(coordinator: Coordinator) -> str:
     """Returns one line: the steps and the return of the runs that train, and how many are in each state."""
-    jobs = coordinator.running()[:MAX_NAMED]
-    parts = [f"{job.name} {text_of(coordinator.folder.progress(job), job.run.steps)}" for job in jobs]
+    tasks = coordinator.running()[:MAX_NAMED]
+    parts = [f"{task.name} {text_of(task.progress(), task.job.run.steps)}" for task in tasks]
     return "; ".join([*parts, states(coordinator)])
 
 
