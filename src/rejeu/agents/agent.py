@@ -76,14 +76,7 @@ class Agent(BaseAgent):
             training.train(self, call, callback, tb_log_name, progress_bar, sinks)
         return self
 
-    def remember_best(self, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
-        """Keeps the current weights for :meth:`restore_best` if ``score`` is the best so far; returns whether it is.
-
-        ``learn`` calls it with the mean return of the last ``best_window`` training episodes, and
-        :class:`rejeu.callbacks.Evaluate` with success rate and mean return. After the first evaluation only evaluations
-        count. Scores of one kind must be comparable.
-        """
-        return training.remember_best(self, score, by)
+    remember_best = training.remember_best
 
     def restore_best(self) -> Self:
         """Restores the best weights so far: networks, targets and optimizers of one moment.

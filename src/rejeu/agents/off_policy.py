@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
-from rejeu import devices, spaces
+from rejeu import spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
 from rejeu.agents.policy import refuse_masks
@@ -82,35 +82,7 @@ class OffPolicyAgent(Agent):
         self.run.td_errors = []  # of transitions that are gone
         self.abandon_episodes()
 
-    def q_values(
-        self, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
-    ) -> np.ndarray:
-        """Returns the critics' values of actions, that is, the expected discounted return, as ``float32``.
-
-        With ``normalize``, observations are scaled as in training; if rewards are scaled, so are the values. Those of SAC,
-        TQC and CrossQ include the entropy of future actions. The online networks are used, not the targets.
-
-        Args:
-            observation: one of the environment's space, or a batch of them with a leading axis.
-            action: one for each observation, in the environment's own range. None: all Discrete actions.
-            critics: with several, the ``"min"`` of their values, as in TD targets, their ``"mean"``, or ``"all"``. The
-                value of a critic of TQC or QR-DQN is the mean of its quantiles.
-
-        Returns:
-            ``(batch,)``, or ``(batch, n_actions)`` without ``action``. There is no batch axis if the observation has none.
-            With ``"all"`` the first axis is that of the critics.
-
-        Raises:
-            ValueError: if observations or actions are not in their spaces, or actions are missing.
-
-        >>> import gymnasium as gym, rejeu
-        >>> agent = rejeu.DDPG("MlpPolicy", gym.make("Pendulum-v1"), seed=0)
-        >>> obs = np.zeros((50, 3), np.float32)
-        >>> agent.q_values(obs, np.ones((50, 1))).shape, agent.q_values(obs[0], [1.0]).shape
-        ((50,), ())
-        """
-        with devices.chosen(self.device):
-            return policy.q_values(self, observation, action, critics)
+    q_values = policy.q_values
 
     def make_envs(
         self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -171,28 +171,4 @@ class PQN(OnPolicyAgent):
 
     algorithm: ClassVar[ModuleType] = pqn
 
-    def q_values(
-        self, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
-    ) -> np.ndarray:
-        """Returns the values of actions, that is, the expected discounted return, as ``float32``.
-
-        :meth:`value` returns the highest of each observation.
-
-        Args:
-            observation: one of the environment's space, or a batch of them with a leading axis.
-            action: one for each observation. None: all actions.
-            critics: accepted as for other agents; there is one network. ``"all"`` adds a leading axis of length 1.
-
-        Returns:
-            ``(batch,)``, or ``(batch, n_actions)`` without ``action``. There is no batch axis if the observation has none.
-
-        Raises:
-            ValueError: if observations or actions are not in their spaces.
-
-        >>> import gymnasium as gym, rejeu
-        >>> agent = rejeu.PQN("MlpPolicy", gym.make("CartPole-v1"), seed=0)
-        >>> agent.q_values(np.zeros((50, 4), np.float32)).shape
-        (50, 2)
-        """
-        with devices.chosen(self.device):
-            return policy.q_values(self, observation, action, critics)
+    q_values = policy.q_values

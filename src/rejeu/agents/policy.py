@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import spaces
+from rejeu import devices, spaces
 from rejeu.agents.base import BaseAgent
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
@@ -100,8 +100,37 @@ def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.
     return np.asarray(action), memory if has_memory else None
 
 
-def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> np.ndarray:
-    """Returns the critics' values of actions; see :meth:`OffPolicyAgent.q_values`."""
+def q_values(
+    agent: BaseAgent, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
+) -> np.ndarray:
+    """Returns the critics' values of actions, that is, the expected discounted return, as ``float32``.
+
+    With ``normalize``, observations are scaled as in training; if rewards are scaled, so are the values. Those of SAC, TQC
+    and CrossQ include the entropy of future actions. The online networks are used, not the targets. PQN has one network.
+
+    Args:
+        agent: the agent, of which this is a method.
+        observation: one of the environment's space, or a batch of them with a leading axis.
+        action: one for each observation, in the environment's own range. None: all Discrete actions.
+        critics: with several, the ``"min"`` of their values, as in TD targets, their ``"mean"``, or ``"all"``. The value of
+            a critic of TQC or QR-DQN is the mean of its quantiles.
+
+    Returns:
+        ``(batch,)``, or ``(batch, n_actions)`` without ``action``. There is no batch axis if the observation has none. With
+        ``"all"`` the first axis is that of the critics.
+
+    Raises:
+        ValueError: if observations or actions are not in their spaces, or actions are missing.
+
+    >>> import gymnasium as gym, rejeu
+    >>> agent = rejeu.DDPG("MlpPolicy", gym.make("Pendulum-v1"), seed=0)
+    >>> obs = np.zeros((50, 3), np.float32)
+    >>> agent.q_values(obs, np.ones((50, 1))).shape, agent.q_values(obs[0], [1.0]).shape
+    ((50,), ())
+    >>> agent = rejeu.PQN("MlpPolicy", gym.make("CartPole-v1"), seed=0)
+    >>> agent.q_values(np.zeros((50, 4), np.float32)).shape
+    (50, 2)
+    """
     if critics not in CRITICS:
         raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
@@ -111,8 +140,9 @@ def q_values(agent: BaseAgent, observation: Any, action: Any, critics: str) -> n
     if action is None and not is_discrete:
         raise ValueError(f"q_values needs actions of {space}; only for Discrete actions it returns the values of all")
     given = None if action is None else _actions(space, action, single, n)
-    nonfinite.settle(agent)
-    values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
+    with devices.chosen(agent.device):
+        nonfinite.settle(agent)
+        values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
     if is_discrete and given is not None:
         values = values[:, np.arange(n), given]
     if single:

@@ -192,8 +192,13 @@ def note_training_return(agent: BaseAgent, ended: int) -> None:
         remember_best(agent, float(means.max()), "training")
 
 
-def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str) -> bool:
-    """Keeps the current weights if ``score`` is the best of its kind so far; returns whether it is."""
+def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
+    """Keeps the current weights for :meth:`Agent.restore_best` if ``score`` is the best so far; returns whether it is.
+
+    ``learn`` calls it with the mean return of the last ``best_window`` training episodes, and
+    :class:`rejeu.callbacks.Evaluate` with success rate and mean return. After the first evaluation only evaluations count.
+    Scores of one kind must be comparable.
+    """
     if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
         return False
     nonfinite.settle(agent)
