@@ -13,6 +13,7 @@ from rejeu import validation
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.sac import Config
 from rejeu.buffers.hindsight import HindsightConfig
+from rejeu.errors import MissingObjectError
 from rejeu.schedules import Linear
 
 
@@ -139,3 +140,12 @@ def test_every_setting_is_documented_and_shown_by_help():
     parameters = inspect.signature(rejeu.SAC).parameters
     assert set(docs) < set(parameters)
     assert parameters["gamma"].default == 0.99
+
+
+def test_a_strategy_of_a_file_that_nobody_registered_is_named_with_the_way_to_give_it():
+    saved = {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": {"goal_selection_strategy": "mine"}}
+    with pytest.raises(MissingObjectError, match=r"goal_selection_strategy is your own, 'mine'.*--import MODULE"):
+        configs.rebuild(Config, saved, {})
+    for name in ("random", "future"):
+        saved["replay_buffer_kwargs"]["goal_selection_strategy"] = name
+        assert configs.rebuild(Config, saved, {}).replay_buffer_kwargs.goal_selection_strategy == name

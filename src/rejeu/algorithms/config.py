@@ -20,6 +20,7 @@ from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.search import SearchSpace
 from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
+from rejeu.buffers.strategies import STRATEGIES
 from rejeu.errors import MissingObjectError
 from rejeu.exploration import noise as action_noises
 from rejeu.networks import ENCODERS, PolicyConfig, Widths, reads_image, settled
@@ -39,6 +40,8 @@ registered: dict[str, Any] = {}
 """The configurations of algorithms that are not rejeu's, by name; :func:`rejeu.register` adds to it."""
 OWN_MODULES = ("encoder", "torso", "head")
 """Settings of ``policy_kwargs`` that are modules of the user's own."""
+NAMED: Mapping[str, Mapping[str, Any]] = {"encoder": ENCODERS, "goal_selection_strategy": STRATEGIES}
+"""Settings that a registered name may stand for, and what is registered."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +179,7 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
             argument = f"{key}=dict({argument})"
         raise MissingObjectError(
             f"its {keys[-1]} is your own, {name!r}, and no file holds code; give it again: load(path, {argument})"
-            + (", or import the module that registers it (--import MODULE)" if keys[-1] == "encoder" else "")
+            + (", or import the module that registers it (--import MODULE)" if keys[-1] in NAMED else "")
         )
     return build(kind, merged)
 
@@ -186,7 +189,7 @@ def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]
     for key, value in saved.items():
         if isinstance(value, Mapping) and set(value) == {OWN}:
             yield (key,), str(value[OWN])[:40]
-        elif key in OWN_MODULES and isinstance(value, str) and (key != "encoder" or value not in ENCODERS):
+        elif isinstance(value, str) and key in (*OWN_MODULES, *NAMED) and value not in ("random", *NAMED.get(key, ())):
             # Older files mention a torso in this way.
             yield (key,), value[:40]
         elif isinstance(value, Mapping):

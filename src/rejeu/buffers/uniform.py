@@ -110,11 +110,11 @@ class BaseReplayBuffer(ABC):
         if goals is not None:
             for leaves in (obs, next_obs):
                 leaves[self.desired][goals.which] = goals.goal
-        reward, discount = rewards, bootstrap_discount(self.gamma, steps, terminated)
-        powers = self.gamma ** np.arange(self.n_steps)
+        reward, each, discount = rewards, None, bootstrap_discount(self.gamma, steps, terminated)
         if self.n_steps > 1:
+            powers = self.gamma ** np.arange(self.n_steps)
             reward = (rewards @ powers).astype(np.float32)
-        each = (rewards * powers).astype(np.float32) if self.each_reward else None
+            each = (rewards * powers).astype(np.float32) if self.each_reward else None
         flat = Transition(ring.tree(obs), step["action"], reward, ring.tree(next_obs), discount, weight, each)
         shaped = flat if len(shape) == 1 else jax.tree.map(lambda array: array.reshape(shape + array.shape[1:]), flat)
         if weight is not None:
