@@ -311,3 +311,20 @@ def test_utilities():
     assert utils.is_vectorized_observation(np.zeros((2, 3)), spaces.Box(0, 1, (3,)))
     assert utils.explained_variance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 1.0
     assert utils.Tensor.of([1.0]).detach().cpu().numpy().tolist() == [1.0]
+
+
+def test_trust_regions_and_random_search_are_at_their_paths():
+    from rejeu.sb3_contrib.ars import LinearPolicy
+    from rejeu.sb3_contrib.trpo import MlpPolicy
+
+    from rejeu.sb3_contrib import ARS, TRPO
+
+    assert TRPO(MlpPolicy, "CartPole-v1", n_steps=32, batch_size=32, seed=0).learn(64).num_timesteps == 64
+    linear = ARS(LinearPolicy, "CartPole-v1", n_delta=1, seed=0).learn(100)
+    assert {array.shape for array in linear.get_parameters().values() if array.ndim == 2} == {(4, 2)}
+    hidden = ARS("MlpPolicy", "CartPole-v1", n_delta=1, seed=0)
+    assert {array.shape for array in hidden.get_parameters().values() if array.ndim == 2} == {
+        (4, 64),
+        (64, 64),
+        (64, 2),
+    }

@@ -34,7 +34,21 @@ from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import encoder_of, register_again
 from rejeu.sb3.policy import BasePolicy
 
-__all__ = ["A2C", "DDPG", "DQN", "PPO", "QRDQN", "SAC", "TD3", "TQC", "CrossQ", "MaskablePPO", "RecurrentPPO"]
+__all__ = [
+    "A2C",
+    "ARS",
+    "DDPG",
+    "DQN",
+    "PPO",
+    "QRDQN",
+    "SAC",
+    "TD3",
+    "TQC",
+    "TRPO",
+    "CrossQ",
+    "MaskablePPO",
+    "RecurrentPPO",
+]
 
 SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "critic_learning_rate", "beta")
 """The hyperparameters that can be schedules."""
@@ -145,6 +159,9 @@ class Original(Agent):
         if isinstance(policy, type):
             env, policy, made = self._prepared(policy, env, settings)
         name = policy.replace("LstmPolicy", "Policy") if isinstance(policy, str) else policy
+        if self.name == "ARS":  # whose policy is linear without hidden layers
+            widths, name = ([], "MlpPolicy") if name == "LinearPolicy" else ([64, 64], name)
+            settings["policy_kwargs"] = {"net_arch": widths, **(settings.get("policy_kwargs") or {})}
         super().__init__(name, env, **settings)
         self.device = utils.Device(self.device)
         if made is not None:
@@ -627,6 +644,14 @@ class TQC(Original, agents.TQC):
 
 class CrossQ(Original, agents.CrossQ):
     """:class:`rejeu.CrossQ` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class TRPO(Original, agents.TRPO):
+    """:class:`rejeu.TRPO` with Stable-Baselines3's arguments, attributes and methods."""
+
+
+class ARS(Original, agents.ARS):
+    """:class:`rejeu.ARS` with Stable-Baselines3's arguments, attributes and methods."""
 
 
 class RecurrentPPO(Original, agents.RecurrentPPO):

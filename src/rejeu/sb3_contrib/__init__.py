@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.sb3 import define
-from rejeu.sb3.algorithms import QRDQN, TQC, CrossQ, MaskablePPO, RecurrentPPO
+from rejeu.sb3.algorithms import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from rejeu.sb3.common import distributions
 from rejeu.sb3.common.callbacks import EvalCallback
 from rejeu.sb3.common.envs import InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete
@@ -24,7 +24,7 @@ from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
 from rejeu.sb3.common.policies import ActorCriticPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 
-__all__ = ["QRDQN", "TQC", "CrossQ", "MaskablePPO", "RecurrentPPO"]
+__all__ = ["ARS", "QRDQN", "TQC", "TRPO", "CrossQ", "MaskablePPO", "RecurrentPPO"]
 
 
 class ActionMasker(gym.Wrapper):
@@ -174,10 +174,12 @@ MODULES: dict[str, dict[str, Any]] = {
     },
 }
 """Names by the module in which sb3-contrib has them."""
-for kind, folder in ((QRDQN, "qrdqn"), (TQC, "tqc"), (CrossQ, "crossq"), (MaskablePPO, "ppo_mask")):
+for kind, folder in ((QRDQN, "qrdqn"), (TQC, "tqc"), (CrossQ, "crossq"), (MaskablePPO, "ppo_mask"), (TRPO, "trpo")):
     named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
     MODULES |= {folder: {kind.__name__: kind, **named}, f"{folder}.{folder}": {kind.__name__: kind}}
     MODULES[f"{folder}.policies"] = named
+linear = {"LinearPolicy": "LinearPolicy", "MlpPolicy": "MlpPolicy"}
+MODULES |= {"ars": {"ARS": ARS, **linear}, "ars.ars": {"ARS": ARS}, "ars.policies": linear}
 lstm = {"CnnLstmPolicy": CnnPolicy, "MlpLstmPolicy": MlpPolicy, "MultiInputLstmPolicy": MultiInputPolicy}
 MODULES |= {"ppo_recurrent": {"RecurrentPPO": RecurrentPPO, **lstm}, "ppo_recurrent.policies": lstm}
 MODULES["ppo_recurrent.ppo_recurrent"] = {"RecurrentPPO": RecurrentPPO}
