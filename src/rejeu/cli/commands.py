@@ -440,8 +440,32 @@ class Import(EnvironmentOptions):
     json: Json = False
 
 
+@dataclass(frozen=True)
+class Push:
+    """Uploads a model with its curve, evaluation and video to a repository of the Hugging Face hub, with a model card.
+
+    hf auth login, of the package huggingface-hub, signs in. Example: rejeu push runs/NAME USER/MODEL
+    """
+
+    run: ModelPath
+    repo: Annotated[str, Shown("USER/MODEL", is_positional=True)]
+    private: bool = False
+    """Make a new repository private."""
+    json: Json = False
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Downloads a model from the Hugging Face hub to a new folder and checks it. Nothing from it is executed."""
+
+    repo: Annotated[str, Shown("USER/MODEL", is_positional=True)]
+    out: Folder = None
+    """New folder; by default MODEL."""
+    json: Json = False
+
+
 OF_RUNS = (Train, Tune, Pbt, Resume, Sweep, Evaluate, Record, Export, Play, Watch)
-OTHERS = (Check, List, Compare, Runs, Status, Course, Report, Class, Import)
+OTHERS = (Check, List, Compare, Runs, Status, Course, Report, Class, Import, Push, Pull)
 COMMANDS: dict[str, Callable[..., Any]] = {kind.__name__.lower(): kind for kind in (*OF_RUNS, *OTHERS)}
 """The arguments of each command, by its name."""
 MODULES = {
@@ -450,9 +474,11 @@ MODULES = {
     "course": "courses",
     "evaluate": "models",
     "export": "models",
-    "import": "converting",
+    "import": "exchange",
     "pbt": "tune",
     "play": "models",
+    "pull": "exchange",
+    "push": "exchange",
     "record": "models",
     "status": "runs",
     "watch": "models",

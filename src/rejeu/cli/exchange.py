@@ -1,4 +1,4 @@
-"""``rejeu import``: models of Stable-Baselines3."""
+"""``rejeu import``, ``push`` and ``pull``: models from and for others."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from contextlib import closing, nullcontext
 from typing import Any
 
 from rejeu.cli import environment
-from rejeu.cli.commands import Import
+from rejeu.cli.commands import Import, Pull, Push
 from rejeu.cli.output import echo
 from rejeu.reporting.formatting import counted
+from rejeu.runs.values import quoted
 
 
 def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
@@ -28,3 +29,25 @@ def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
     for note in agent.notes:  # type: ignore[attr-defined]
         echo(f"note: {note}")
     return 0, {"model": path, "algorithm": agent.name, "notes": agent.notes}  # type: ignore[attr-defined]
+
+
+def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:
+    """Uploads a model and prints its address."""
+    from rejeu import hub
+
+    address = hub.push(arguments.run, arguments.repo, arguments.private, echo)
+    echo(address)
+    return 0, {"address": address}
+
+
+def run_pull(arguments: Pull) -> tuple[int, dict[str, Any]]:
+    """Downloads a model and prints what to do with it."""
+    from rejeu import hub
+
+    folder = hub.pull(arguments.repo, arguments.out)
+    models = sorted([*folder.glob("*.safetensors"), *folder.glob("*.zip")])
+    scaler = "".join(f" --vecnormalize {quoted(path)}" for path in sorted(folder.glob("*.pkl"))[:1])
+    for model in models:
+        is_zip = model.suffix == ".zip"
+        echo(f"rejeu import {quoted(model)}{scaler}" if is_zip else f"rejeu evaluate {quoted(model)}")
+    return 0, {"folder": folder, "models": models}
