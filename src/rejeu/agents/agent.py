@@ -214,10 +214,11 @@ class Agent(BaseAgent):
 
         Args:
             path: of the file. An older one is replaced only when the new one is complete.
-            to: ``"onnx"``, ``"c"`` or ``"stablehlo"``; None goes by the suffix: ``.onnx``, ``.c`` (with a header beside it) or
-                ``.stablehlo``.
+            to: ``"onnx"``, ``"c"``, ``"stablehlo"`` or ``"web"``; None goes by the suffix: ``.onnx``, ``.c`` (with a header
+                beside it), ``.stablehlo`` or ``.html``. A page contains the environment too, which must be CartPole, Pendulum,
+                MountainCar, MountainCarContinuous, Ball or parking.
             noise: sample from the policy, with the random numbers as further inputs; else take its mode.
-            batch: observations at once; None for any number. C takes one.
+            batch: observations at once; None for any number. C and pages take one.
 
         Raises:
             ValueError: if a part of the policy cannot be expressed in the format, or the file acts otherwise than

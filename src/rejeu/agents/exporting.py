@@ -19,14 +19,14 @@ from rejeu.core import Masked
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
-from rejeu.export import c_file, check, stablehlo_file
+from rejeu.export import c_file, check, stablehlo_file, web_file
 from rejeu.export.check import Check, Recording, Run
 from rejeu.export.contract import CARD, Policy, policy_of
 from rejeu.io import atomic
 from rejeu.loops import nonfinite
 
-Target = Literal["onnx", "c", "stablehlo"]
-SUFFIXES: dict[str, str] = {"onnx": ".onnx", "c": ".c", "stablehlo": ".stablehlo"}
+Target = Literal["onnx", "c", "stablehlo", "web"]
+SUFFIXES: dict[str, str] = {"onnx": ".onnx", "c": ".c", "stablehlo": ".stablehlo", "web": ".html"}
 """Of the file of each format."""
 MOST_SECONDS = 60.0
 """Wall time after which no further observation is recorded, in a slow environment."""
@@ -95,7 +95,9 @@ def export(
     path = Path(path)
     target = target_of(path, to)
     path = path if path.suffix else path.with_suffix(SUFFIXES[target])
-    if target == "c":
+    if target == "web" and noise:
+        raise ValueError("noise=True: a page contains the deterministic policy; leave it out")
+    if target in ("c", "web"):
         if batch not in (None, 1):
             raise ValueError(f"batch={batch}: {target} takes one observation at a time; leave it out")
         batch = 1
@@ -105,7 +107,7 @@ def export(
     one = made if batch == 1 else policy_for(agent, noise, 1)
     recording, duration = record(agent, one, make_env)
     card = card_of(agent, made, target, source, duration)
-    contents, run = written(made, one, card, target, path.stem)
+    contents, run = written(made, one, card, target, path.stem, made_from(agent) or (None, {}))
     found = None if run is None else check.compare(one, recording, run)
     if found is not None and not found.difference <= check.LARGEST_DIFFERENCE:
         raise ValueError(
@@ -122,12 +124,17 @@ def export(
     return Exported(path, card_path, target, len(contents[0]), found, note)
 
 
-MISSING = {"onnx": "onnxruntime", "c": "a C compiler (cc, gcc or clang)", "stablehlo": "JAX"}
+MISSING = {"onnx": "onnxruntime", "c": "a C compiler (cc, gcc or clang)", "stablehlo": "JAX", "web": "Node.js"}
 """What runs the files of each format."""
 
 
 def written(
-    made: Policy, one: Policy, card: dict[str, Any], target: str, stem: str
+    made: Policy,
+    one: Policy,
+    card: dict[str, Any],
+    target: str,
+    stem: str,
+    origin: tuple[str | None, dict[str, Any]] = (None, {}),
 ) -> tuple[tuple[bytes, ...], Run | None]:
     """Returns the contents of the files of a policy, and the run of the first; None if it cannot be run here.
 
@@ -137,11 +144,15 @@ def written(
         card: about it.
         target: the format.
         stem: the name of the files without suffix.
+        origin: id and arguments of the environment, for a page.
     """
     single = made.batch in (None, 1)
     if target == "c":
         c, header = c_file.write(one, card, stem)
         return (c, header), check.c_run(one, c, header, stem)
+    if target == "web":
+        script = web_file.script(one, web_file.environment(*origin), card)
+        return (web_file.write(script),), check.node_run(one, script)
     if target == "stablehlo":
         content = stablehlo_file.write(made, card)
         again = content if single else stablehlo_file.write(one, card)
@@ -228,15 +239,20 @@ def record(agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None) ->
 
 def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:
     """Returns a new environment like those of training, None if none can be made, and the duration of its steps."""
-    made_from = agent.trained_on if agent.run.env is None else agent.run.env.made_from
-    if make_env is None and made_from is not None and register(made_from[0]):
-        make_env = maker(made_from[0], **made_from[1])
+    origin = made_from(agent)
+    if make_env is None and origin is not None and register(origin[0]):
+        make_env = maker(origin[0], **origin[1])
     if make_env is None:
         return None, None
     env = make_env()
     vector = agent.make_envs(env, 1, seed=0)
     agent.check_spaces(vector, "the environment to record observations in")
     return vector, seconds_per_step(env)
+
+
+def made_from(agent: BaseAgent) -> Any:
+    """Returns the id and the arguments of the environments of an agent, None if they were not made from an id."""
+    return agent.trained_on if agent.run.env is None else agent.run.env.made_from
 
 
 def seconds_per_step(env: Any) -> float | None:

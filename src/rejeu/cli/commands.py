@@ -216,21 +216,21 @@ class Evaluate(RunOptions):
 
 @dataclass(frozen=True)
 class Export(RunOptions):
-    """Writes the policy of a trained agent to a file that acts without rejeu: ONNX, C or StableHLO.
+    """Writes the policy of a trained agent to a file that acts without rejeu: ONNX, C, StableHLO or a web page.
 
     The file is compared with predict on 1,000 observations before it is kept. Example: rejeu export runs/NAME --to onnx
     """
 
     run: ModelPath
-    to: Annotated[Literal["onnx", "c", "stablehlo"] | None, Shown("{onnx,c,stablehlo}")] = None
+    to: Annotated[Literal["onnx", "c", "stablehlo", "web"] | None, Shown("{onnx,c,stablehlo,web}")] = None
     """Format; by default that of the suffix of --out, else onnx."""
     out: Annotated[Path | None, Shown("PATH")] = None
-    """File to write, or an existing folder; by default policy.onnx, .c or .stablehlo in the folder of the run, or
+    """File to write, or an existing folder; by default policy.onnx, .c, .stablehlo or .html in the folder of the run, or
     next to the model under its name."""
     noise: bool = False
     """Sample from the policy, with the random numbers as inputs, instead of taking its mode."""
     batch: Count = None
-    """Observations at once; by default any number. C takes one."""
+    """Observations at once; by default any number. C and web pages take one."""
     which: Which = "best"
     json: Json = False
 

@@ -220,25 +220,30 @@ def node_run(policy: Policy, script: str) -> Run | None:
     def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         n = len(next(iter(inputs.values())))
         given = [port.name for port in policy.inputs if port.role == "observation"]
-        rows = [[inputs[name][i].ravel().tolist() for name in given] for i in range(n)]
-        with tempfile.TemporaryDirectory() as name:
-            (Path(name) / "main.js").write_text(f"{script}\n{NODE}", encoding="utf-8")
-            text = json.dumps(rows)
-            command = ["node", str(Path(name) / "main.js")]
-            found = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
-        actions, seconds = json.loads(found)
+        starts = next((inputs[port.name] for port in policy.of("episode_start")), np.zeros(n, bool)).tolist()
+        rows = [([inputs[name][i].ravel().tolist() for name in given], starts[i]) for i in range(n)]
+        actions, seconds = node(f"{script}\n{NODE}", rows)
         action = policy.outputs[0]
         return np.array(actions, action.dtype).reshape(n, *action.shape), np.array(seconds)
 
     return run
 
 
+def node(script: str, given: Any) -> Any:
+    """Returns what a script writes as JSON, which reads JSON, both by standard input and output."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "main.js"
+        path.write_text(script, encoding="utf-8")
+        found = subprocess.run(["node", path], input=json.dumps(given), capture_output=True, text=True, check=True)
+    return json.loads(found.stdout)
+
+
 NODE = """
-const actions = [], seconds = [];
-for (const row of JSON.parse(require("fs").readFileSync(0, "utf8"))) {
-  const start = process.hrtime.bigint();
-  const action = policy(...row);
-  seconds.push(Number(process.hrtime.bigint() - start) * 1e-9);
+const agent = makeAgent(), actions = [], seconds = [];
+for (const [observations, start] of JSON.parse(require("fs").readFileSync(0, "utf8"))) {
+  const begin = process.hrtime.bigint();
+  const action = agent(observations, start);
+  seconds.push(Number(process.hrtime.bigint() - begin) * 1e-9);
   actions.push(Array.from(action));
 }
 console.log(JSON.stringify([actions, seconds]));

@@ -1,0 +1,141 @@
+"""A policy with its environment as one page of HTML, which acts in a browser without a network."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array, ShapeDtypeStruct
+
+from rejeu import spaces
+from rejeu.envs import functional
+from rejeu.envs.functional import FunctionalEnv
+from rejeu.export.contract import Policy
+from rejeu.export.loops import Language, Printer, contiguous, indented
+from rejeu.export.program import Program, trace
+
+FOLDER = Path(__file__).parent
+ENVIRONMENTS = {
+    name: f"jax/{name.removeprefix('rejeu/')}"
+    for name in ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "rejeu/Ball-v0")
+} | {"parking-v0": "jax/Parking-v0"}
+"""Environments that a page can contain, with the ids of their equals in JAX, which it contains too."""
+TYPES = {
+    "float32": "Float32Array",
+    "int8": "Int8Array",
+    "int16": "Int16Array",
+    "int32": "Int32Array",
+    "uint8": "Uint8Array",
+    "uint16": "Uint16Array",
+    "uint32": "Uint32Array",
+    "bool": "Uint8Array",
+}
+JAVASCRIPT = Language(
+    name="JavaScript",
+    types=TYPES,
+    variable=lambda dtype: "let",
+    functions={"mod": "fmod", "rint": "rint"},
+    prefix="Math.",
+    suffix="",
+    missing=("erf",),
+)
+KEY = ShapeDtypeStruct((2,), np.uint32)
+
+
+def environment(env_id: str | None, kwargs: Mapping[str, Any]) -> FunctionalEnv:
+    """Returns the environment in JAX that a page contains.
+
+    Raises:
+        ValueError: if a page cannot contain it.
+    """
+    name = env_id if env_id in ENVIRONMENTS.values() else ENVIRONMENTS.get(env_id or "")
+    if name is None or kwargs.get("dimension", 2) != 2:
+        raise ValueError(
+            f"a page cannot contain {env_id or 'an environment without id'}{dict(kwargs) or ''}; it can contain "
+            f"{', '.join(ENVIRONMENTS)} in two dimensions"
+        )
+    try:
+        return functional.make(name, **kwargs)
+    except TypeError:
+        raise ValueError(f"a page cannot contain {env_id} with the arguments {', '.join(kwargs)}") from None
+
+
+def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
+    """Returns the policy and the environment as JavaScript.
+
+    Raises:
+        ValueError: if the policy does not take the observations of the environment alone, or cannot be written.
+    """
+    expected = [(leaf.path or "observation", leaf.shape) for leaf in spaces.leaves(env.observation_space)]
+    if expected != [(port.name, port.shape) for port in policy.inputs if port.role in ("observation", "action_mask")]:
+        raise ValueError("a page cannot contain a policy with wrappers around its environment, frame stacks or masks")
+    action = policy.outputs[0]
+    state, obs = jax.eval_shape(env.reset, KEY)
+    taken = ShapeDtypeStruct(action.shape, spaces.narrow(action.dtype))
+
+    def step(state: Any, action: Array, key: Array) -> Any:
+        return env.step(key, state, action)
+
+    reset, stepped = trace(env.reset, KEY, draws=True), trace(step, state, taken, KEY, draws=True)
+    about = {
+        "environment": type(env).__name__,
+        "card": card,
+        "n_state": len(jax.tree.leaves(state)),
+        "n_obs": len(jax.tree.leaves(obs)),
+        "memory": [math.prod(port.shape) for port in policy.of("state")],
+        "reset_draws": draws_of(reset),
+        "step_draws": draws_of(stepped),
+    }
+    constant = json.dumps(about).replace("<", "\\u003c")
+    functions = (("policy", policy.program), ("resetWorld", reset), ("stepWorld", stepped))
+    parts = [function(name, program) for name, program in functions]
+    shared = (FOLDER / "web.js").read_text(encoding="utf-8")
+    return "\n".join(['"use strict";', f"const ABOUT = {constant};", *parts, shared])
+
+
+def write(script: str) -> bytes:
+    """Returns the page with a script."""
+    return (FOLDER / "web.html").read_text(encoding="utf-8").replace("/* script */", script).encode()
+
+
+def draws_of(program: Program) -> list[tuple[str, int]]:
+    """Returns distribution and number of the random numbers that a program takes."""
+    return [(kind, math.prod(value.sizes)) for kind, value in program.draws]
+
+
+def function(name: str, program: Program) -> str:
+    """Returns a function from arrays to arrays."""
+    printer, arguments = Printer(JAVASCRIPT), [f"a{i}" for i in range(len(program.arguments))]
+    results = []
+    for i, (value, one) in enumerate(zip(program.outputs, printer.run(program, arguments), strict=True)):
+        out = contiguous(f"out{i}", one.shape, value.dtype)
+        results.append(out.base)
+        printer.lines.append(f"const {out.base} = {array(out.dtype, max(math.prod(out.shape), 1))};")
+        printer.copy(one, out)
+    lines = [
+        f"const {name} = (() => {{",
+        *(f"const {key} = {array(str(data.dtype), numbers(data))};" for key, data in printer.constants.items()),
+        *(f"const {key} = {array(dtype, n)};" for key, dtype, n in printer.buffers),
+        f"return ({', '.join(arguments)}) => {{",
+        *printer.lines,
+        f"return [{', '.join(results)}];",
+        "};",
+        "})();",
+    ]
+    return indented(lines, 0)
+
+
+def array(dtype: str, content: int | Sequence[float]) -> str:
+    """Returns a new array of a number of zeros, or of numbers."""
+    return f"new {TYPES[dtype]}({json.dumps(content)})"
+
+
+def numbers(data: np.ndarray) -> list[float]:
+    """Returns the elements of an array, with as many digits as float32 needs."""
+    is_float = data.dtype.kind == "f"
+    return [float(f"{one:.9g}") if is_float else int(one) for one in data.ravel().tolist()]
