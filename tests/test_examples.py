@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "examples"
-EXAMPLES = sorted(path for path in FOLDER.glob("*.py") if path.stem != "awac")
-"""``awac.py`` registers an algorithm; ``test_own_algorithm`` tests it."""
+TESTED_ELSEWHERE = ("awac", "fastapi_service", "ros2_node")
+"""``awac.py`` registers an algorithm (``test_own_algorithm``); two need other systems (``export/test_deployment``)."""
+EXAMPLES = sorted(path for path in FOLDER.glob("*.py") if path.stem not in TESTED_ELSEWHERE)
 ARGUMENTS = {"many_agents": ["--agents", "3", "--steps", "2000"]}
 """Arguments that shorten an example which does not call ``learn``."""
 

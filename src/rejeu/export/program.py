@@ -132,6 +132,8 @@ class _Tracing:
     def __init__(self) -> None:
         self.operations: list[Operation] = []
         self.draws: list[tuple[str, Value]] = []
+        self.where = ""
+        """The line that called the function whose operations are added."""
 
     def inline(self, jaxpr: Any, arguments: Sequence[Value]) -> list[Value]:
         """Adds the operations of a jaxpr with these constants and arguments, and returns its outputs."""
@@ -157,9 +159,13 @@ class _Tracing:
             kept = {key: params[key] for key in params if name == "stack"}
             return self.inline(jax.make_jaxpr(partial(REWRITTEN[name], **kept))(*examples).jaxpr, inputs)
         inner = next((params[key] for key in INLINED if key in params), None)
+        before, where = self.where, _line(equation.source_info) or self.where
         if inner is not None and name not in ("scan", "while", "cond"):
             constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in getattr(inner, "consts", ())]
-            return self.inline(getattr(inner, "jaxpr", inner), [*constants, *inputs])
+            self.where = where
+            found = self.inline(getattr(inner, "jaxpr", inner), [*constants, *inputs])
+            self.where = before
+            return found
         avals = [one.aval for one in equation.outvars]
         sizes = [aval.size for aval in avals]
         is_static = all(isinstance(size, int) for size in sizes) and not any("random" in str(a.dtype) for a in avals)
@@ -170,9 +176,7 @@ class _Tracing:
                 arrays = found if equation.primitive.multiple_results else [found]
                 return [Value(array.shape, array.dtype, np.asarray(array)) for array in arrays]
         outputs = tuple(Value(aval.shape, _dtype(aval)) for aval in avals)
-        self.operations.append(
-            Operation(equation.primitive, tuple(inputs), outputs, params, _line(equation.source_info))
-        )
+        self.operations.append(Operation(equation.primitive, tuple(inputs), outputs, params, where))
         return outputs
 
     def draw(self, kind: str, aval: Any, bounds: Sequence[Value]) -> Sequence[Value]:

@@ -19,7 +19,11 @@ MODULE, EXPORTED, CARD = "module.mlir.bc", "exported.jax", "card.json"
 
 
 def write(policy: Policy, card: dict[str, Any]) -> bytes:
-    """Returns the zip file of a policy. The module takes and returns arrays in the order of the card."""
+    """Returns the zip file of a policy. The module takes and returns arrays in the order of the card.
+
+    Raises:
+        ValueError: if a part of it is a function of Python that JAX calls back.
+    """
 
     def act(inputs: dict[str, Array]) -> dict[str, Array]:
         found = policy.program(*(inputs[port.name] for port in policy.inputs))
@@ -29,7 +33,12 @@ def write(policy: Policy, card: dict[str, Any]) -> bytes:
         port.name: ShapeDtypeStruct(value.shape, value.dtype)
         for port, value in zip(policy.inputs, policy.program.arguments, strict=True)
     }
-    made = export.export(jax.jit(act), platforms=["cpu", "cuda", "tpu"])(examples)
+    try:
+        made = export.export(jax.jit(act), platforms=["cpu", "cuda", "tpu"])(examples)
+    except NotImplementedError as error:
+        raise ValueError(
+            f"the policy cannot be exported to stablehlo ({error}); write the part that calls Python with operations of JAX"
+        ) from None
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(MODULE, made.mlir_module_serialized)

@@ -1,0 +1,133 @@
+"""Compares exported policies with ``predict``, and measures their sizes and latencies.
+
+    python benchmarks/export.py
+
+Every algorithm with every kind of action that matters to its policy and every form of observations, with random weights of
+small networks; SAC with two layers of 64 units is for the latencies. Each in every format that has it, on 1,000 samples of
+the observation space, one at a time, on one thread. Latencies are those of the fastest of five rounds. The results are
+written to ``benchmarks/results/export.json``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from rejeu import load_policy, spaces
+from rejeu.agents import Agent, exporting
+from rejeu.errors import CheckpointError
+from rejeu.export import check
+from rejeu.export.check import Run
+from rejeu.runs.config import versions
+from tests.export.policies import KINDS, agent_of
+from trials.provenance import machine, provenance, write
+
+OUT = Path(__file__).parent / "results" / "export.json"
+FORMS: dict[str, dict[str, Any]] = {
+    "MLP": {},
+    "MLP, normalized": {"normalize": True},
+    "CNN": {"observation": "CNN"},
+    "Dict": {"observation": "Dict"},
+    "small Dict, normalized": {"observation": "small Dict", "normalize": True},
+}
+TIMED = "SAC, Box, 64-64"
+"""The policy whose latencies are reported."""
+SHOWN = ("bytes", "p50", "p99")
+
+
+def cases() -> Iterator[tuple[str, str, str, dict[str, Any]]]:
+    """Yields algorithm, kind of action, form and settings."""
+    yield "SAC", "Box", "64-64", {"policy_kwargs": {"net_arch": [64, 64]}}
+    for name, action in KINDS:
+        for form, settings in FORMS.items():
+            yield name, action, form, settings
+
+
+def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, Any]]:
+    """Returns the check of each format, with the size of its file."""
+    one = exporting.policy_for(agent, False, 1)
+    recording, _ = exporting.record(agent, one, None)
+    runs: dict[str, tuple[Run, int]] = {}
+    card = exporting.card_of(agent, one, "c", "", None)
+    for target in ("onnx", "c", "stablehlo"):
+        made = one if target == "c" else exporting.policy_for(agent, False, None)
+        contents, run = exporting.written(made, one, card, target, "policy")
+        if run is not None:
+            runs[target] = run, len(contents[0])
+    saved = agent.save(folder / "model")
+    acting: dict[str, Any] = {"predict": agent} if is_timed else {}
+    with suppress(CheckpointError):  # images or memory
+        acting["numpy"] = load_policy(saved)
+    structure = spaces.structure(agent.observation_space)
+    names = [port.name for port in one.of("observation")]
+    for target, policy in acting.items():
+
+        def call(inputs: dict[str, np.ndarray], policy: Any = policy) -> dict[str, Any]:
+            obs = jax.tree.unflatten(structure, [inputs[name] for name in names])
+            masks = {"action_masks": inputs["action_mask"]} if "action_mask" in inputs else {}
+            return {"action": policy.predict(obs, deterministic=True, **masks)[0]}
+
+        runs[target] = check.one_by_one(one, call), saved.stat().st_size
+    rounds = 5 if is_timed else 1
+    return {
+        target: {
+            **min((check.compare(one, recording, run) for _ in range(rounds)), key=lambda found: found.p99)._asdict(),
+            "bytes": size,
+        }
+        for target, (run, size) in runs.items()
+    }
+
+
+def summary(rows: list[dict[str, Any]], key: str) -> dict[str, dict[str, Any]]:
+    """Returns for each value of a key the number of policies, the largest difference and the number of ties."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return {
+        value: {
+            "policies": len(group),
+            "largest difference": max(row["difference"] for row in group),
+            "ties": sum(row["ties"] for row in group),
+        }
+        for value, group in groups.items()
+    }
+
+
+def main() -> int:
+    """Runs the command and returns its exit status."""
+    rows = []
+    for name, action, form, settings in cases():
+        with tempfile.TemporaryDirectory() as folder:
+            found = measure(agent_of(name, action, **settings), Path(folder), form == "64-64")
+        policy = f"{name}, {action}, {form}"
+        rows += [
+            {"policy": policy, "algorithm": name, "form": form, "target": target, **one}
+            for target, one in found.items()
+        ]
+        print(policy, {target: one["difference"] for target, one in found.items()}, flush=True)
+    exported = [row for row in rows if row["target"] != "predict"]
+    content = {
+        **provenance(),
+        "machine": machine(),
+        "versions": versions(),
+        "observations": check.OBSERVATIONS,
+        "latency": {row["target"]: {key: row[key] for key in SHOWN} for row in rows if row["policy"] == TIMED},
+        "formats": summary(exported, "target"),
+        "algorithms": summary(exported, "algorithm"),
+        "forms": summary(exported, "form"),
+        "rows": rows,
+    }
+    write(OUT, content, rows="rows")
+    return int(any(row["difference"] > check.LARGEST_DIFFERENCE for row in exported))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
