@@ -87,13 +87,13 @@ def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, A
 
 
 def summary(rows: list[dict[str, Any]], key: str) -> dict[str, dict[str, Any]]:
-    """Returns for each value of a key the number of policies, the largest difference and the number of ties."""
+    """Returns for each value of a key the number of files, the largest difference and the number of ties."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)
     return {
         value: {
-            "policies": len(group),
+            "files": len(group),
             "largest difference": max(row["difference"] for row in group),
             "ties": sum(row["ties"] for row in group),
         }
@@ -103,7 +103,7 @@ def summary(rows: list[dict[str, Any]], key: str) -> dict[str, dict[str, Any]]:
 
 def main() -> int:
     """Runs the command and returns its exit status."""
-    rows = []
+    origin, rows = provenance(), []
     for name, action, form, settings in cases():
         with tempfile.TemporaryDirectory() as folder:
             found = measure(agent_of(name, action, **settings), Path(folder), form == "64-64")
@@ -115,7 +115,7 @@ def main() -> int:
         print(policy, {target: one["difference"] for target, one in found.items()}, flush=True)
     exported = [row for row in rows if row["target"] != "predict"]
     content = {
-        **provenance(),
+        **origin,
         "machine": machine(),
         "versions": versions(),
         "observations": check.OBSERVATIONS,
