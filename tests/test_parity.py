@@ -99,6 +99,13 @@ def pump(obs, t, rng):
     return action
 
 
+def push(obs, t, rng):
+    """Half of the cars push along and reach the goal, the others do not."""
+    action = rng.uniform(-0.1, 0.1, (len(obs), 1)).astype(np.float32)
+    action[::2, 0] = np.where(obs[::2, 1] >= 0, 1.0, -1.0)
+    return action
+
+
 def torque(obs, t, rng):
     return rng.uniform(-2, 2, (len(obs), 1)).astype(np.float32)
 
@@ -127,6 +134,7 @@ REPLAYED = {
     "CartPole-v1": Replayed(put_cart_pole, balance, {FALLS, LIMIT}, every_step=True),
     "Pendulum-v1": Replayed(put_pendulum, torque, {LIMIT}, every_step=True, apart=at_top_speed),
     "MountainCar-v0": Replayed(put_mountain_car, swing, {FALLS, LIMIT}, every_step=True),
+    "MountainCarContinuous-v0": Replayed(put_mountain_car, push, {FALLS, LIMIT}, every_step=True),
     "Acrobot-v1": Replayed(put_acrobot, pump, {FALLS, LIMIT}, every_step=True),
     "parking-v0": Replayed(put_parking, drive, {(True, False, 0.0), (True, False, 1.0), (False, True, 0.0)}, n_envs=64),
     "FetchReach-v4": Replayed(put_fetch, reach, {(False, True, 0.0), (False, True, 1.0)}, n_envs=8),

@@ -160,7 +160,7 @@ ELSEWHERE = {
     "lr": "the step size is called learning_rate",
     "hidden_sizes": "the widths of the layers are policy_kwargs=dict(net_arch=[64, 64])",
     "net_arch": 'it is in policy_kwargs: policy_kwargs=dict(net_arch=[64, 64]), or --set "policy_kwargs.net_arch=[64,64]"',
-    "use_sde": "state-dependent exploration (use_sde) is for PPO and A2C with continuous actions",
+    "use_sde": "state-dependent exploration (use_sde) is for PPO, A2C, TRPO, SAC and TQC with continuous actions",
     "features_extractor_class": "networks of your own are given as policy_kwargs=dict(torso=..., encoder=..., head=...)",
     "features_extractor_kwargs": "networks of your own are given as policy_kwargs=dict(torso=..., encoder=..., head=...)",
     "optimizer_class": "the optimizer is called optimizer: optimizer='adamw', or an Optax optimizer",

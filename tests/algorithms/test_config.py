@@ -21,13 +21,13 @@ from rejeu.schedules import Linear
     ("name", "hint"),
     [
         ("lr", "the step size is called learning_rate"),
-        ("use_sde", r"is for PPO and A2C"),
+        ("use_sde", r"is for PPO, A2C, TRPO, SAC and TQC"),
         ("features_extractor_class", r"policy_kwargs=dict\(torso"),
     ],
 )
 def test_a_setting_of_another_name_elsewhere_is_explained(name, hint):
-    with pytest.raises(TypeError, match=f"SAC has no setting '{name}'; .*{hint}"):
-        rejeu.SAC("MlpPolicy", "Pendulum-v1", **{name: 1})
+    with pytest.raises(TypeError, match=f"TD3 has no setting '{name}'; .*{hint}"):
+        rejeu.TD3("MlpPolicy", "Pendulum-v1", **{name: 1})
 
 
 @pytest.mark.parametrize(

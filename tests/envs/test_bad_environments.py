@@ -248,9 +248,18 @@ def test_subprocesses_explain_too():
 
 
 def test_a_reward_of_goals_that_is_no_number_is_explained():
-    goals = make_vector(RewardWithAxis, 1, "gymnasium").goals()
-    with pytest.raises(BadEnvironmentError, match=r"compute_reward returned an array of shape \(1,\) .* of one goal"):
-        goals.reward(np.zeros((4, 1), np.float32), np.zeros((4, 1), np.float32))
+    """An array of one number is taken as that number, as in Stable-Baselines3."""
+    places = np.arange(4.0, dtype=np.float32)[:, None]
+    with_axis, plain = (make_vector(kind, 1, "gymnasium").goals() for kind in (RewardWithAxis, Line))
+    np.testing.assert_array_equal(with_axis.reward(places, 0 * places), plain.reward(places, 0 * places))
+
+    class TwoRewards(RewardWithAxis):
+        def compute_reward(self, achieved, desired, info):
+            return np.repeat(super().compute_reward(achieved, desired, info), 2, axis=-1)
+
+    goals = make_vector(TwoRewards, 1, "gymnasium").goals()
+    with pytest.raises(BadEnvironmentError, match=r"compute_reward returned an array of shape \(2,\) .* of one goal"):
+        goals.reward(places, places)
 
 
 class Far(Good):

@@ -208,7 +208,7 @@ def test_hooks_that_cannot_write_do_not_end_training(tmp_path, disk):
         for name in ("rl_model_20_", "rl_model_replay", "evaluations.npz", "best_model")
         if name not in str(warned(record))
     ] == []
-    assert (tmp_path / "rl_model_30_steps.safetensors").exists()
+    assert (tmp_path / "rl_model_30_steps.zip").exists()
     assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [15, 30]
     assert rejeu.load(tmp_path / "best_model")
 

@@ -41,7 +41,7 @@ from rejeu.algorithms.actor_critic.steps import (
     samples,
     standardized,
 )
-from rejeu.algorithms.search import NearOne, SearchSpace, Uniform
+from rejeu.algorithms.search import LogUniform, NearOne, SearchSpace
 from rejeu.core import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
@@ -81,7 +81,8 @@ class Config(OnPolicyConfig):
     search_space: ClassVar[SearchSpace] = {
         "gamma": NearOne(0.9, 0.9999),
         "gae_lambda": NearOne(0.8, 0.99),
-        "target_kl": Uniform(0.001, 0.1),
+        "learning_rate": LogUniform(1e-5, 1e-2),
+        "target_kl": LogUniform(1e-3, 1e-1),
     }
 
     def __post_init__(self) -> None:
