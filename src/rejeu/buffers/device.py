@@ -27,7 +27,7 @@ from rejeu.buffers.device_priorities import DevicePriorities
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.buffers.strategies import BUILT_IN, GoalStrategy, HindsightSteps
-from rejeu.buffers.uniform import NewGoals, bootstrap_discount, outcome, replaced
+from rejeu.buffers.uniform import NewGoals, discounts_of, outcome, replaced
 from rejeu.core import PyTree, Transition, copy
 from rejeu.prng import below
 
@@ -278,8 +278,7 @@ class DeviceReplay:
         for leaves in (obs, next_obs) if goals is not None else ():
             leaves[self.desired] = replaced(leaves[self.desired], goals.which, goals.goal)  # type: ignore[union-attr]
         tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
-        table = bootstrap_discount(self.gamma, np.arange(self.n_steps + 1), np.zeros(self.n_steps + 1, bool))
-        discount = jnp.where(ends, jnp.float32(0), jnp.asarray(table)[steps])
+        discount = jnp.where(ends, jnp.float32(0), jnp.asarray(discounts_of(self.gamma, self.n_steps))[steps])
         return Transition(tree(obs), action, rewards, tree(next_obs), discount, None, each)
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:

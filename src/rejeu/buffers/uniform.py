@@ -38,6 +38,8 @@ class BaseReplayBuffer(ABC):
         """Takes a ring; with ``each_reward``, transitions of several steps have :attr:`Transition.rewards`."""
         self.ring, self.gamma, self.n_steps, self.priorities = ring, gamma, n_steps, priorities
         self.each_reward = each_reward and n_steps > 1
+        self.discounts = discounts_of(gamma, n_steps)
+        """Discounts of the next observation, by the number of steps to it, ``float32 (n_steps + 1,)``."""
 
     @abstractmethod
     def draw(
@@ -110,7 +112,7 @@ class BaseReplayBuffer(ABC):
         if goals is not None:
             for leaves in (obs, next_obs):
                 leaves[self.desired][goals.which] = goals.goal
-        reward, each, discount = rewards, None, bootstrap_discount(self.gamma, steps, terminated)
+        reward, each, discount = rewards, None, np.where(terminated, np.float32(0), self.discounts[steps])
         if self.n_steps > 1:
             powers = self.gamma ** np.arange(self.n_steps)
             reward = (rewards @ powers).astype(np.float32)
@@ -148,9 +150,9 @@ class ReplayBuffer(BaseReplayBuffer):
         return self.batch(shape, rows, self.ring.read(rows.position), weight), drawn
 
 
-def bootstrap_discount(gamma: float, steps: int | np.ndarray, terminated: np.ndarray) -> np.ndarray:
-    """Returns ``gamma^steps``, and 0 where the MDP terminated, ``float32``."""
-    return np.where(terminated, np.float32(0.0), np.asarray(gamma**steps, np.float32))
+def discounts_of(gamma: float, n_steps: int) -> np.ndarray:
+    """Returns ``gamma^i`` for ``i`` from 0 to ``n_steps``, ``float32``."""
+    return np.asarray(gamma ** np.arange(n_steps + 1), np.float32)
 
 
 class Window(NamedTuple):
