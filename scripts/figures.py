@@ -207,12 +207,13 @@ def supported(algorithm: str) -> str:
     possible = [name for name, space in actions.items() if can_make(agent, config, box, space)]
     readable = [name for name, space in observations.items() if can_make(agent, config, space, actions[possible[0]])]
     is_off_policy = "replay_buffer_class" in fields
+    maskable = [name for name in possible if name in ("Discrete", "MultiDiscrete", "MultiBinary")]
     rows = [
         ("actions", ", ".join(possible)),
         ("observations", ", ".join(readable)),
         ("several environments", "yes"),
         ("HER, prioritized replay, n-step returns", "yes" if is_off_policy else "no (on-policy)"),
-        ("action masks", "yes" if agent.takes_masks else "no"),
+        ("action masks", ", ".join(maskable) if config.can_mask else "no"),
         ("memory (LSTM, GRU)", "yes" if "cell" in validation.field_names(type(config.policy_kwargs)) else "no"),
         ("normalization, schedules", "yes"),
         ("custom modules as encoder, torso or head", "yes" if takes_modules(agent.algorithm.Config) else "no"),
@@ -232,7 +233,7 @@ def takes_modules(config_class: Any) -> bool:
 def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_space: spaces.Space) -> bool:
     """Returns whether an algorithm accepts these spaces."""
     try:
-        if agent.takes_masks:
+        if config.action_masks:
             n_choices(action_space, "")
         agent.algorithm.make(config, observation_space, action_space)
     except ValueError:

@@ -58,6 +58,18 @@ class Masked(NamedTuple):
     numbers of a MultiDiscrete one, and of MultiBinary the bits that may be 1."""
 
 
+def unmasked(obs: PyTree) -> tuple[PyTree, Any]:
+    """Returns observations and their mask, None where they have none."""
+    return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)
+
+
+def some_allowed(obs: PyTree) -> PyTree:
+    """Returns observations whose masks allow all actions where they allowed none, as after the end of an episode."""
+    if not isinstance(obs, Masked):
+        return obs
+    return Masked(obs.obs, obs.mask | ~obs.mask.any(axis=-1, keepdims=True))
+
+
 class Rollout(NamedTuple):
     """The steps that all environments took under one policy; leaves are ``(steps, n_envs, ...)`` where not said."""
 

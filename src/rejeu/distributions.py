@@ -177,6 +177,11 @@ class Bernoulli(NamedTuple):
         return jnp.sum(share * one + (1.0 - share) * zero, axis=-1)
 
 
+def forbid(values: Array, mask: Array | None) -> Array:
+    """Returns logits or values ``(..., n)`` with :data:`FORBIDDEN` where a mask, ``bool (..., n)``, forbids the action."""
+    return values if mask is None else jnp.where(mask, values, jnp.float32(FORBIDDEN))
+
+
 def log_tanh_slope(unsquashed: Array) -> Array:
     """Returns ``log(1 - tanh(u)^2)`` elementwise, without cancellation for large ``|u|``."""
     return 2.0 * (math.log(2.0) - unsquashed - jax.nn.softplus(-2.0 * unsquashed))

@@ -338,8 +338,13 @@ def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     return scaled.astype(np.float32).reshape(len(action), -1)
 
 
-def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`)."""
+def random_action(space: spaces.Space, n: int, rng: np.random.Generator, mask: np.ndarray | None = None) -> np.ndarray:
+    """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`).
+
+    With ``mask``, ``bool (n, n_actions)``, the actions are Discrete and among the allowed ones.
+    """
+    if mask is not None:
+        return nth_allowed(mask, rng.integers(mask.sum(axis=-1), dtype=np.int32))
     if isinstance(space, spaces.Box):
         return rng.uniform(-1.0, 1.0, (n, int(np.prod(space.shape)))).astype(np.float32)
     if isinstance(space, spaces.Discrete):
@@ -349,6 +354,15 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator) -> np.n
     if isinstance(space, spaces.MultiBinary):
         return rng.integers(2, size=(n, int(np.prod(space.shape))), dtype=np.int32)
     raise TypeError(f"cannot draw random actions of {space}")
+
+
+def nth_allowed(mask: Any, n: Any) -> Any:
+    """Returns the actions that are the ``n``-th allowed ones, counted from 0; arrays of NumPy or of JAX.
+
+    >>> nth_allowed(np.array([[False, True, True]]), np.array([1])).tolist()
+    [2]
+    """
+    return (mask.cumsum(axis=-1) > n[:, None]).argmax(axis=-1).astype(np.int32)
 
 
 def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> None:

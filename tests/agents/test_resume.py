@@ -20,6 +20,8 @@ import rejeu
 from rejeu import xla
 from rejeu.agents.run_files import copy_run
 from rejeu.callbacks import Checkpoint, Evaluate
+from rejeu.envs.functional.gym_env import GymnasiumEnv
+from rejeu.envs.make import InProcess
 from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.io import checkpoint
 from rejeu.runs.folder import run_files
@@ -28,6 +30,7 @@ from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled
 from tests.every_agent import KINDS
 from tests.helpers import small_sac
+from tests.jax_environments import Forbidden
 from tests.sharing import shared_learners
 from tests.tiers import only
 
@@ -72,6 +75,11 @@ CASES = {
     "worker processes": ("SAC", vector("Pendulum-v1", 2, "gymnasium-async"), OFF),
     "first of n": ("SAC", first_of_n, OFF),
     "first of n, noise": ("DDPG", first_of_n, {**OFF, "action_noise": "ou(0.2)", "normalize": True}),
+    "DQN, masks": (
+        "DQN",
+        lambda: InProcess([GymnasiumEnv(Forbidden()), GymnasiumEnv(Forbidden())], 1),
+        {**OFF, "action_masks": True},
+    ),
     "PPO": ("PPO", vector("CartPole-v1"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "PPO, normalised": ("PPO", vector("Pendulum-v1"), {**SMALL, "n_steps": 16, "batch_size": 16, "normalize": True}),
     "PPO, whole episodes": ("PPO", vector("rejeu/Ball-v0"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
@@ -99,7 +107,15 @@ DEFAULT_CASES = {
         "PQN",
         "RecurrentPPO",
     ),
-    *("priorities, n steps", "episodes", "normalised", "EnvPool", "worker processes", "EnvPool, whole episodes"),
+    *(
+        "DQN, masks",
+        "priorities, n steps",
+        "episodes",
+        "normalised",
+        "EnvPool",
+        "worker processes",
+        "EnvPool, whole episodes",
+    ),
     "first of n",
     next(case for case in CASES if case.endswith(" noise")),
 }

@@ -21,8 +21,9 @@ import numpy as np
 from rejeu import devices, hardware, spaces, validation, xla
 from rejeu.algorithms import config as configs, contract
 from rejeu.callbacks.base import Stateful
-from rejeu.core import Algorithm
+from rejeu.core import Algorithm, Masked
 from rejeu.envs.make import Backend, VectorEnv
+from rejeu.envs.masks import mask_leaf, n_choices
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.io.failed_writes import FailedWrites
@@ -94,8 +95,6 @@ class Resumed(NamedTuple):
 class BaseAgent(ABC):
     """What all agents have. Abstract: subclass :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`."""
 
-    takes_masks: ClassVar[bool] = False
-    """Whether its policy takes masks of the allowed actions."""
     algorithm: ClassVar[Any]
     """What has ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
     policy_name: str
@@ -370,9 +369,35 @@ class BaseAgent(ABC):
         """Wall time spent training, in seconds: ``total``, and of it ``env``, ``replay`` and ``update``."""
         return dict(self.run.seconds)
 
-    @abstractmethod
+    @property
+    def takes_masks(self) -> bool:
+        """Whether its policy takes masks of the allowed actions."""
+        return self.config.action_masks
+
     def with_masks(self, obs: Any, masks: Any) -> Any:
-        """Returns a batch of observations together with action masks, if the algorithm takes any."""
+        """Returns a batch of observations together with action masks, if the agent takes any; None allows all actions.
+
+        Raises:
+            TypeError: if masks are given to an agent that takes none.
+            ValueError: if their shape is not that of the actions.
+        """
+        if not self.takes_masks:
+            if masks is not None:
+                raise TypeError(f"{self.name}.predict takes no action_masks; it was made without action_masks=True")
+            return obs
+        n, size = len(jax.tree.leaves(obs)[0]), n_choices(self.action_space, self.name)
+        mask = np.ones((n, size), bool) if masks is None else np.asarray(masks, bool)
+        if mask.size != n * size:
+            raise ValueError(f"action_masks has shape {mask.shape}, expected {(n, size)}")
+        return Masked(obs, mask.reshape(n, size))
+
+    def observed(self, env: VectorEnv) -> tuple[tuple[spaces.Leaf, ...], Any]:
+        """Returns the leaves and the structure of what it acts on in ``env``: observations, and masks if it takes any."""
+        structure = spaces.structure(env.observation_space)
+        if not self.takes_masks:
+            return self.obs_leaves, structure
+        structure = jax.tree.structure(Masked(jax.tree.unflatten(structure, self.obs_leaves), 0))
+        return (*self.obs_leaves, mask_leaf(env.action_space, env.env_id)), structure
 
     def get_vec_normalize_env(self) -> Any:
         """Returns the ``VecNormalize`` around the training environments, or None."""

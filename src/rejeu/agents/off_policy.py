@@ -12,7 +12,6 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
-from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import ring_io
@@ -22,6 +21,7 @@ from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, VectorEnv, make_vector
+from rejeu.envs.masks import make_masked
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
@@ -87,11 +87,11 @@ class OffPolicyAgent(Agent):
     def make_envs(
         self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
     ) -> VectorEnv:
-        return make_vector(env, n_envs, backend, seed, wait_for=wait_for)
-
-    def with_masks(self, obs: Any, masks: Any) -> Any:
-        refuse_masks(masks, self.name)
-        return obs
+        if not self.takes_masks:
+            return make_vector(env, n_envs, backend, seed, wait_for=wait_for)
+        if wait_for is not None:
+            raise ValueError(f"wait_for={wait_for} is not available with action_masks=True; leave out one of them")
+        return make_masked(env, n_envs, backend, seed)
 
     def make_noise(self) -> Noise | None:
         return for_actions(self.config.action_noise, self.action_space)
@@ -118,8 +118,7 @@ class OffPolicyAgent(Agent):
         ring = Ring(
             config.buffer_size,
             env.n_envs,
-            self.obs_leaves,
-            spaces.structure(env.observation_space),
+            *self.observed(env),
             action.shape[1:],
             action.dtype,
             config.frame_stack,

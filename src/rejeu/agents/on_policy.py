@@ -12,13 +12,11 @@ import numpy as np
 from rejeu import devices, spaces
 from rejeu.agents import policy
 from rejeu.agents.agent import Agent
-from rejeu.agents.policy import refuse_masks
 from rejeu.algorithms import a2c, ars, maskable_ppo, ppo, pqn, recurrent_ppo, trpo
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.buffers.rollout import RolloutBuffer
-from rejeu.core import Masked
 from rejeu.envs.make import Backend, VectorEnv, make_vector
-from rejeu.envs.masks import make_masked, mask_leaf, n_choices, split
+from rejeu.envs.masks import make_masked, split
 from rejeu.exploration.noise import Noise
 from rejeu.loops import nonfinite
 from rejeu.loops.device import chunks
@@ -78,16 +76,6 @@ class OnPolicyAgent(Agent):
             )
         return vector
 
-    def with_masks(self, obs: Any, masks: Any) -> Any:
-        if not self.takes_masks:
-            refuse_masks(masks, self.name)
-            return obs
-        n, size = len(jax.tree.leaves(obs)[0]), n_choices(self.action_space, self.name)
-        mask = np.ones((n, size), bool) if masks is None else np.asarray(masks, bool)
-        if mask.size != n * size:
-            raise ValueError(f"action_masks has shape {mask.shape}, expected {(n, size)}")
-        return Masked(obs, mask.reshape(n, size))
-
     def make_noise(self) -> Noise | None:
         return None
 
@@ -108,10 +96,7 @@ class OnPolicyAgent(Agent):
     def make_buffer(self, env: VectorEnv) -> RolloutBuffer:
         config = self.config
         action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
-        structure, obs_leaves = spaces.structure(env.observation_space), self.obs_leaves
-        if self.takes_masks:
-            structure = jax.tree.structure(Masked(jax.tree.unflatten(structure, obs_leaves), 0))
-            obs_leaves = (*obs_leaves, mask_leaf(env.action_space, env.env_id))
+        obs_leaves, structure = self.observed(env)
         n_steps = config.n_steps
         if config.n_episodes is not None:
             n_steps = config.episodes(env.n_envs) * (env.max_episode_steps or config.n_steps)
@@ -160,10 +145,9 @@ class RecurrentPPO(OnPolicyAgent):
 
 
 class MaskablePPO(OnPolicyAgent):
-    """PPO with masks of the allowed actions, which the environment provides (Huang and Ontanon 2022)."""
+    """PPO with ``action_masks=True``: masks of the allowed actions, from the environment (Huang and Ontanon 2022)."""
 
     algorithm: ClassVar[ModuleType] = maskable_ppo
-    takes_masks: ClassVar[bool] = True
 
 
 class PQN(OnPolicyAgent):

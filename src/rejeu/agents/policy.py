@@ -14,6 +14,7 @@ from rejeu import devices, spaces
 from rejeu.agents.base import BaseAgent
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
+from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
 from rejeu.loops import nonfinite
 from rejeu.loops.run import clock_of
@@ -133,6 +134,7 @@ def q_values(
     """
     if critics not in CRITICS:
         raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
+    observation = split(observation, None)[0] if agent.takes_masks else observation
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
     space = agent.action_space
@@ -188,12 +190,6 @@ def memory_of(agent: BaseAgent, memory: Any, n: int) -> Any:
             "returned for as many observations, or None where episodes begin"
         )
     return memory
-
-
-def refuse_masks(masks: Any, name: str) -> None:
-    """Raises ``TypeError`` if masks are given to an agent that takes none."""
-    if masks is not None:
-        raise TypeError(f"{name}.predict takes no action_masks; use MaskablePPO")
 
 
 USUAL_EPISODES = 100

@@ -61,6 +61,9 @@ class AlgorithmConfig:
     nonfinite: Literal["stop", "skip"] = "stop"
     """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
     it and saves what was learned from, or ``"skip"`` that update and count it."""
+    action_masks: bool = False
+    """Take masks of the allowed actions from the environment (``info["action_mask"]`` or ``action_masks()``) and choose
+    among these only. For Discrete actions; PPO, A2C, TRPO and RecurrentPPO take MultiDiscrete and MultiBinary too."""
     optimizer: Any = "adam"
     """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, a dict of
     such a name and settings (``{"name": "adamw", "weight_decay": 0.01}``), an Optax optimizer such as ``optax.lamb``, or
@@ -71,6 +74,8 @@ class AlgorithmConfig:
     as ``encoder``, ``torso`` and ``head``."""
 
     name: ClassVar[str] = ""
+    can_mask: ClassVar[bool] = False
+    """Whether the algorithm can take masks of the allowed actions."""
     is_checked: ClassVar[bool] = False
     """Whether :meth:`__post_init__` has run; set on each instance."""
     policy_kwargs_class: ClassVar[type[PolicyConfig]] = PolicyConfig
@@ -92,6 +97,11 @@ class AlgorithmConfig:
         assign(self, normalize=normalization.parse(self.normalize))
         coerce(self, "nonfinite", choice, among=("stop", "skip"))
         coerce(self, "policy_kwargs", nested, kind=self.policy_kwargs_class)
+        coerce(self, "action_masks", flag)
+        if self.action_masks and not self.can_mask:
+            raise ValueError(
+                f"action_masks=True: {self.name} takes no masks; use PPO, A2C, TRPO, RecurrentPPO, DQN, QRDQN or SAC"
+            )
         assign(self, is_checked=True)
 
     def doubts(self, n_envs: int) -> str:

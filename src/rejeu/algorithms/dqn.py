@@ -11,6 +11,8 @@ discount ``d`` (0 where the MDP terminated, gamma to the power n for n-step retu
     Q'    <- Q' + tau (Q - Q')                              once every target_update_interval environment steps
     a      = argmax_a Q(s, a), or any with probability epsilon
 
+With masks, every maximum is over the allowed actions, and so are the random ones.
+
 The target moves just before the first gradient step at or after every multiple of ``target_update_interval``: to the
 same numbers as in Stable-Baselines3, where it moves between two gradient steps. If several multiples have passed since
 the last gradient step, so many soft updates are made at once, of ``1 - (1 - tau)^n`` together. Unlike there, the
@@ -48,13 +50,16 @@ from rejeu.core import (
     copy,
     minimize,
     polyak,
+    some_allowed,
+    unmasked,
     weighted_mean,
     without_gradient,
 )
+from rejeu.distributions import forbid
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso
 from rejeu.schedules import Exponential, Linear, Schedule, at
-from rejeu.spaces import Leaf, check_discrete_action
+from rejeu.spaces import Leaf, check_discrete_action, nth_allowed
 from rejeu.validation import choice, coerce, flag, number, whole
 
 HIDDEN_LAYERS = (64, 64)
@@ -86,6 +91,7 @@ class QLearningConfig(OffPolicyConfig):
     ``learn`` was given: steps, episodes or minutes."""
     max_grad_norm: float | None = 10.0
 
+    can_mask: ClassVar[bool] = True
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
     search_space: ClassVar[SearchSpace] = search.Q_LEARNING
@@ -195,10 +201,10 @@ def epsilon_greedy_algorithm(
     """
 
     def explore(network: Any, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key)
+        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key, unmasked(obs)[1])
 
     def exploit(network: Any, obs: PyTree) -> Array:
-        return greedy(network(obs))
+        return greedy(network(obs), unmasked(obs)[1])
 
     def values(state: Any, obs: PyTree, action: None) -> Array:
         return state.network(obs)[None]
@@ -267,7 +273,8 @@ def td_target(
     """Returns the TD targets, ``(batch,)``."""
     next_values = target_network(batch.next_obs)
     chooser = network(batch.next_obs) if double_q else next_values
-    return batch.reward + batch.discount * taken(next_values, greedy(chooser))
+    mask = unmasked(some_allowed(batch.next_obs))[1]
+    return batch.reward + batch.discount * taken(next_values, greedy(chooser, mask))
 
 
 def td_loss(
@@ -288,17 +295,25 @@ def taken(values: Array, action: Array) -> Array:
     return jnp.take_along_axis(values, index, axis=1)[:, 0]
 
 
-def greedy(values: Array) -> Array:
-    """Returns the index of the highest of values ``(batch, n_actions)``, ``int32 (batch,)``; the first of equals."""
-    return jnp.argmax(values, axis=-1).astype(jnp.int32)
+def greedy(values: Array, mask: Array | None = None) -> Array:
+    """Returns the index of the highest of values ``(batch, n_actions)``, ``int32 (batch,)``; the first of equals.
+
+    With ``mask``, ``bool (batch, n_actions)``, among the allowed ones.
+    """
+    return jnp.argmax(forbid(values, mask), axis=-1).astype(jnp.int32)
 
 
-def epsilon_greedy(values: Array, epsilon: Any, key: Array) -> Array:
-    """Returns the best action by values ``(batch, n_actions)``, or any with probability ``epsilon``; ``(batch,)``."""
+def epsilon_greedy(values: Array, epsilon: Any, key: Array, mask: Array | None = None) -> Array:
+    """Returns the best action by values ``(batch, n_actions)``, or any with probability ``epsilon``; ``(batch,)``.
+
+    With ``mask``, ``bool (batch, n_actions)``, both are among the allowed ones.
+    """
     whether_key, which_key = jax.random.split(key)
     batch, n_actions = values.shape
-    random = jax.random.randint(which_key, (batch,), 0, n_actions, jnp.int32)
-    return jnp.where(jax.random.uniform(whether_key, (batch,)) < epsilon, random, greedy(values))
+    n_allowed = n_actions if mask is None else jnp.sum(mask, axis=-1, dtype=jnp.int32)
+    random = jax.random.randint(which_key, (batch,), 0, n_allowed, jnp.int32)
+    random = random if mask is None else nth_allowed(mask, random)
+    return jnp.where(jax.random.uniform(whether_key, (batch,)) < epsilon, random, greedy(values, mask))
 
 
 def check_epsilon(config: Any) -> None:

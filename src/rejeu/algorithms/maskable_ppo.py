@@ -18,6 +18,8 @@ __all__ = ["Config", "make"]
 
 @dataclass(frozen=True, kw_only=True)
 class Config(ppo.Config):
-    """Hyperparameters of PPO with action masks; those of PPO."""
+    """Hyperparameters of PPO with ``action_masks=True``."""
+
+    action_masks: bool = True
 
     name: ClassVar[str] = "MaskablePPO"

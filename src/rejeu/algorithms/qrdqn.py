@@ -40,7 +40,18 @@ from rejeu.algorithms.dqn import (
     taken,
 )
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import TD_ERROR, Algorithm, Clock, Metrics, PyTree, Transition, descend, weighted_mean
+from rejeu.core import (
+    TD_ERROR,
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    descend,
+    some_allowed,
+    unmasked,
+    weighted_mean,
+)
 from rejeu.networks import Network
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import check_discrete_action
@@ -115,7 +126,7 @@ class QuantileNetwork(eqx.Module):
 def td_target(target_network: QuantileNetwork, batch: Transition) -> Array:
     """Returns a sample of what the return may be, under the action of highest mean: ``(batch, n_quantiles)``."""
     following = target_network.quantiles(batch.next_obs)
-    best = taken(following, greedy(jnp.mean(following, axis=-1)))
+    best = taken(following, greedy(jnp.mean(following, axis=-1), unmasked(some_allowed(batch.next_obs))[1]))
     return batch.reward[:, None] + batch.discount[:, None] * best
 
 

@@ -32,12 +32,11 @@ from rejeu.algorithms.actor_critic.network import (
     Distribution,
     checked,
     orthogonal,
-    unmasked,
 )
 from rejeu.algorithms.actor_critic.steps import Samples, flat, shuffled, with_advantages
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
-from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout
+from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, unmasked
 from rejeu.exploration.explorer import renew
 from rejeu.networks import make_encoder
 from rejeu.prng import nth
@@ -218,7 +217,7 @@ class RecurrentActorCritic(eqx.Module):
 
     def remember(self, memory: Memory, obs: PyTree, ended: Array) -> Memory:
         """Returns the memory after observations ``(n, ...)``; reset where ``ended``, ``bool (n,)``."""
-        features = self.features(unmasked(obs)[0])
+        features = self.features(obs)
         memory = renew(ended, self.empty(ended.shape[0]), memory)
         parts = zip(self.cells, memory, features, strict=True)
         return tuple(cell.step(m, cell.project(read)) for cell, m, read in parts)
@@ -232,8 +231,7 @@ class RecurrentActorCritic(eqx.Module):
             started: where an episode begins with an observation, ``bool (steps, n)``.
         """
         n_steps, n = started.shape
-        flat = jax.tree.map(lambda x: x.reshape(n_steps * n, *x.shape[2:]), unmasked(obs)[0])
-        features = [read.reshape(n_steps, n, -1) for read in self.features(flat)]
+        features = [read.reshape(n_steps, n, -1) for read in self.features(flat(obs))]
         after = []
         for cell, first, read in zip(self.cells, memory, features, strict=True):
             fresh = cell.empty(started.shape[1])

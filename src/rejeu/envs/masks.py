@@ -21,7 +21,7 @@ from jax import Array
 from rejeu.core import Masked
 from rejeu.envs import functional, snapshot
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.envs.functional.vector import JaxVector
+from rejeu.envs.functional.vector import JaxVector, goal_functions
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, adapter_of, check_workers, make_vector
 from rejeu.envs.registry import maker
@@ -47,7 +47,9 @@ def n_choices(space: spaces.Space, env_id: str) -> int:
         return int(space.nvec.sum())
     if isinstance(space, spaces.MultiBinary):
         return int(np.prod(space.shape, dtype=int))
-    raise ValueError(f"masks need Discrete, MultiDiscrete or MultiBinary actions; {env_id} has {space}: use PPO")
+    raise ValueError(
+        f"masks need Discrete, MultiDiscrete or MultiBinary actions; {env_id} has {space}: leave action_masks out"
+    )
 
 
 class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
@@ -141,7 +143,9 @@ class MaskedVector(VectorEnv):
         return self.inner.success(step, env)
 
     def goals(self) -> GoalFunctions | None:
-        return None
+        if isinstance(self.inner, JaxVector) and isinstance(self.inner.env, FunctionalMask):
+            return goal_functions(self.inner.env.env)
+        return self.inner.goals()
 
     def snapshot(self) -> Any:
         return self.inner.snapshot()

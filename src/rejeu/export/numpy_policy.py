@@ -63,7 +63,7 @@ class NumpyPolicy:
         if name == "QRDQN":
             hidden.append(lambda x: x.reshape(*x.shape[:-1], -1, config["n_quantiles"]).mean(axis=-1))
         self._steps = hidden
-        self.takes_masks = name == "MaskablePPO"
+        self.takes_masks = config.get("action_masks", name == "MaskablePPO")
         is_squashed = name in ("SAC", "TQC", "CrossQ", "TD3", "DDPG") or self._shape.get("squash_output", False)
         self._choose = chooser(self.action_space, is_squashed)
         self._scale = spaces.action_scaler(self.action_space)

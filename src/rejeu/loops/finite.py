@@ -66,8 +66,8 @@ def batch_like(agent: Any, names: set[str]) -> Transition | Rollout:
     structure = spaces.structure(agent.observation_space)
     obs: Any = jax.tree.unflatten(structure, [0] * structure.num_leaves)
     zero: Any = 0
+    obs = Masked(obs, zero) if agent.takes_masks else obs
     if "ended" not in names:
         return Transition(obs, zero, zero, obs, zero, **{name: zero for name in ("weight", "rewards") if name in names})
-    obs = Masked(obs, zero) if agent.takes_masks else obs
     carry = jax.tree.map(lambda leaf: zero, agent.learner.initial_carry(1))
     return Rollout(obs, zero, zero, obs, zero, zero, zero, zero, zero, carry)

@@ -28,7 +28,7 @@ import numpy as np
 from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.core import Clock, PyTree
+from rejeu.core import Clock, PyTree, unmasked
 from rejeu.envs.base import Step
 from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
@@ -156,7 +156,9 @@ def choose(
     call.
     """
     if run.step < config.learning_starts:
-        return random_action(run.env.action_space, run.env.n_envs if which is None else len(which), run.rng)
+        mask = unmasked(run.obs)[1]
+        mask = mask if mask is None or which is None else mask[which]
+        return random_action(run.env.action_space, run.env.n_envs if which is None else len(which), run.rng, mask)
     if which is None:
         action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
         return action

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import PyTree
+from rejeu.core import PyTree, unmasked
 from rejeu.networks.layers import LayerNorm, Linear, find_encoder, own_module
 from rejeu.networks.shape import PolicyConfig
 from rejeu.spaces import Leaf
@@ -167,7 +167,7 @@ class Encoder(eqx.Module):
         images = iter(self.images)
         parts = [
             encode_leaf(leaf, x, self.shape) if convolutions(leaf, self.shape) is None else next(images)(x)
-            for leaf, x in zip(self.leaves, jax.tree.leaves(obs), strict=True)
+            for leaf, x in zip(self.leaves, jax.tree.leaves(unmasked(obs)[0]), strict=True)
         ]
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
 
@@ -192,7 +192,7 @@ class OwnEncoder(eqx.Module):
 
     def __call__(self, obs: PyTree) -> Array:
         """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
-        return self.module(self.arrange(jax.tree.leaves(obs)))
+        return self.module(self.arrange(jax.tree.leaves(unmasked(obs)[0])))
 
     def arrange(self, arrays: list[Any]) -> Any:
         """Returns what the module is called with: an array, or for a Dict or Tuple space a dict from path to array."""

@@ -25,6 +25,7 @@ from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
+from rejeu.envs.masks import split
 from rejeu.io import checkpoint
 from rejeu.reporting import logging
 from rejeu.sb3 import policy as policies
@@ -446,7 +447,11 @@ class Original(Agent):
         explores = hasattr(self.config, "exploration_final_eps") and not deterministic
         action, memory = super().predict(observation, state, episode_start, deterministic or explores, action_masks)
         if explores and self.run.rng.random() < self.exploration_rate:
-            sampled = [self.action_space.sample() for _ in range(np.size(action))]
+            masks = split(observation, action_masks)[1]
+            each = (
+                [None] * np.size(action) if masks is None else np.asarray(masks, np.int8).reshape(np.size(action), -1)
+            )
+            sampled = [self.action_space.sample(mask) for mask in each]
             action = np.asarray(sampled, action.dtype).reshape(np.shape(action))
         return np.asarray(action), memory
 

@@ -109,6 +109,7 @@ class OnPolicyConfig(RolloutConfig):
     ``log_std_init``, ``share_layers``, ``squash_output``, ``state_dependent_std``, ``layer_norm``, ``architecture``, or
     modules of your own as ``encoder``, ``torso`` and ``head``."""
 
+    can_mask: ClassVar[bool] = True
     policy_kwargs_class: ClassVar[type[PolicyConfig]] = ActorCriticConfig
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     """Default widths of policy and value."""

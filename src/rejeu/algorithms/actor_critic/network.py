@@ -14,8 +14,8 @@ from jax import Array
 
 from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig, OnPolicyConfig, check_value_rate
 from rejeu.algorithms.config import network_inputs
-from rejeu.core import Clock, Explorer, Masked, PyTree
-from rejeu.distributions import FORBIDDEN, Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
+from rejeu.core import Clock, Explorer, PyTree, unmasked
+from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, forbid
 from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
 from rejeu.spaces import Leaf, check_action
 
@@ -134,8 +134,7 @@ class ActorCritic(eqx.Module):
 
     def policy(self, obs: PyTree) -> Distribution:
         """Returns the distribution of actions at observations ``(batch, ...)``, which may be :class:`Masked`."""
-        obs, mask = unmasked(obs)
-        return self.distribution(self.hidden(obs), mask)
+        return self.distribution(self.hidden(obs), unmasked(obs)[1])
 
     def hidden(self, obs: PyTree) -> Array:
         """Returns the policy's last hidden layer at observations ``(batch, ...)``."""
@@ -143,19 +142,17 @@ class ActorCritic(eqx.Module):
 
     def value(self, obs: PyTree) -> Array:
         """Returns the values of observations ``(batch, ...)``, ``(batch,)``."""
-        obs, _ = unmasked(obs)
         encoder = self.encoder if self.value_encoder is None else self.value_encoder
         torso = self.torso if self.value_torso is None else self.value_torso
         return self.value_head(torso(encoder(obs)))[:, 0]
 
     def both(self, obs: PyTree) -> tuple[Distribution, Array]:
         """Returns :meth:`policy` and :meth:`value`, computing what they share once."""
-        obs, mask = unmasked(obs)
         features = self.encoder(obs)
         hidden = self.torso(features)
         value_features = features if self.value_encoder is None else self.value_encoder(obs)
         value_hidden = hidden if self.value_torso is None else self.value_torso(value_features)
-        return self.distribution(hidden, mask), self.value_head(value_hidden)[:, 0]
+        return self.distribution(hidden, unmasked(obs)[1]), self.value_head(value_hidden)[:, 0]
 
     def distribution(self, hidden: Array, mask: Array | None) -> Distribution:
         """Returns the distribution that the last hidden layer ``(batch, width)`` asks for."""
@@ -171,8 +168,7 @@ class ActorCritic(eqx.Module):
                 if not self.shape.learn_std:
                     log_std = jax.lax.stop_gradient(log_std)
             return (TanhNormal if self.shape.squash_output else Normal)(outputs, log_std)
-        if mask is not None:
-            outputs = jnp.where(mask, outputs, jnp.float32(FORBIDDEN))
+        outputs = forbid(outputs, mask)
         if self.action.kind == "binary":
             return Bernoulli(outputs)
         if self.action.single:
@@ -194,11 +190,6 @@ def exploit(actor: ActorCritic, obs: PyTree) -> Array:
 def state_value(carry: PyTree, actor: ActorCritic, obs: PyTree, ended: Array) -> Array:
     """Returns the values of observations, ``(batch,)``."""
     return actor.value(obs)
-
-
-def unmasked(obs: PyTree) -> tuple[PyTree, Array | None]:
-    """Returns an observation and its mask, None where it has none."""
-    return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)
 
 
 def sde_std(log_std: Array, use_expln: bool = False) -> Array:

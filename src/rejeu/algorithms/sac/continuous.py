@@ -115,6 +115,7 @@ class Config(EntropyConfig):
     """Logarithm of the standard deviations of that noise at the start."""
 
     name: ClassVar[str] = "SAC"
+    can_mask: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)

@@ -8,6 +8,7 @@ critics ``Q_i(s)`` with one value per action, target critics ``Q'_i``, temperatu
     J_pi     = mean sum_a pi(a | s) (alpha log pi(a | s) - min_i Q_i(s, a))
     J_alpha  = mean log_alpha (H(pi(. | s)) - target_entropy)
 
+With action masks, ``pi`` is 0 for forbidden actions, and n below is the number of allowed ones in each state.
 ``target_entropy="auto"`` is 0.3 log n. With the paper's 0.98 log n the policy stays nearly uniform and, with few actions,
 never becomes good.
 """
@@ -15,6 +16,7 @@ never becomes good.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,19 @@ from rejeu.algorithms.sac.continuous import (
     metrics_of,
     temperature_and_targets,
 )
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
+from rejeu.core import (
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    minimize,
+    some_allowed,
+    unmasked,
+    weighted_mean,
+    without_gradient,
+)
+from rejeu.distributions import forbid
 from rejeu.networks import Network
 from rejeu.schedules import at
 from rejeu.spaces import leaves
@@ -48,7 +62,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     if config.use_sde:
         raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
     obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
-    target_entropy = config.entropy_target(TARGET_ENTROPY_SHARE * math.log(n_actions))
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array) -> Network:
@@ -59,6 +72,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
+        target_entropy: Any = config.entropy_target(TARGET_ENTROPY_SHARE * mean_log_count(batch.obs, n_actions))
         target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch)
         critics, critics_optimizer, critic_loss, values = minimize(
             critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
@@ -80,12 +94,23 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
 
 def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
     """Returns actions sampled from the policy, ``int32 (batch,)``."""
-    return jax.random.categorical(key, actor(obs)).astype(jnp.int32)
+    return jax.random.categorical(key, logits(actor, obs)).astype(jnp.int32)
 
 
 def exploit(actor: Network, obs: PyTree) -> Array:
     """Returns the most likely actions, ``int32 (batch,)``."""
-    return jnp.argmax(actor(obs), axis=-1).astype(jnp.int32)
+    return jnp.argmax(logits(actor, obs), axis=-1).astype(jnp.int32)
+
+
+def logits(actor: Network, obs: PyTree) -> Array:
+    """Returns the logits of all actions, ``(batch, n_actions)``."""
+    return forbid(actor(obs), unmasked(obs)[1])
+
+
+def mean_log_count(obs: PyTree, n_actions: int) -> Any:
+    """Returns the mean entropy in nats of choosing uniformly: ``log(n_actions)``, or that of the allowed ones."""
+    mask = unmasked(some_allowed(obs))[1]
+    return math.log(n_actions) if mask is None else jnp.mean(jnp.log(jnp.sum(mask, axis=-1, dtype=jnp.float32)))
 
 
 def all_values(critics: PyTree, obs: PyTree) -> Array:
@@ -95,7 +120,7 @@ def all_values(critics: PyTree, obs: PyTree) -> Array:
 
 def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Transition) -> Array:
     """Returns the TD targets, ``(batch,)``."""
-    log_probabilities = jax.nn.log_softmax(actor(batch.next_obs))
+    log_probabilities = jax.nn.log_softmax(logits(actor, some_allowed(batch.next_obs)))
     soft_values = jnp.min(all_values(target_critics, batch.next_obs), axis=0) - alpha * log_probabilities
     return batch.reward + batch.discount * jnp.sum(jnp.exp(log_probabilities) * soft_values, axis=-1)
 
@@ -111,7 +136,7 @@ def critics_loss(critics: PyTree, batch: Transition, target: Array) -> tuple[Arr
 
 def actor_loss(actor: Network, values: Array, alpha: Array, obs: PyTree) -> tuple[Array, Array]:
     """Returns the soft policy loss and the entropies in nats, ``(batch,)``; ``values`` is ``(batch, n_actions)``."""
-    log_probabilities = jax.nn.log_softmax(actor(obs))
+    log_probabilities = jax.nn.log_softmax(logits(actor, obs))
     probabilities = jnp.exp(log_probabilities)
     loss = jnp.mean(jnp.sum(probabilities * (alpha * log_probabilities - values), axis=-1))
     return loss, -jnp.sum(probabilities * log_probabilities, axis=-1)

@@ -23,8 +23,9 @@ from rejeu.buffers.device import DeviceReplay, DeviceRing, DeviceRows, download,
 from rejeu.buffers.device_priorities import Pending, noted
 from rejeu.buffers.hindsight import HerReplayBuffer
 from rejeu.buffers.prioritized import Draw
-from rejeu.core import Clock, PyTree, Transition
+from rejeu.core import Clock, PyTree, Transition, unmasked
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
+from rejeu.envs.masks import FunctionalMask
 from rejeu.loops.device.program import Carry, Learned, Limits, Loop, Program, capacity_of, random_action, step_envs
 from rejeu.loops.off_policy import begin_episodes
 from rejeu.loops.run import Run
@@ -80,7 +81,8 @@ class OffPolicyProgram(Program):
 
         def random() -> tuple[Array, PyTree]:
             key = jax.random.fold_in(draws(carry.key, clock.step), 0)
-            return random_action(env.action_space, self.n_envs, key).astype(before.dtype), carry.explorer
+            mask = unmasked(episodes.obs)[1]
+            return random_action(env.action_space, self.n_envs, key, mask).astype(before.dtype), carry.explorer
 
         if self.config.learning_starts:
             action, explorer = jax.lax.cond(clock.step < self.config.learning_starts, random, explored)
@@ -92,6 +94,7 @@ class OffPolicyProgram(Program):
         """Returns a batch and its rows; with hindsight, the rewards of new goals are those of ``env``."""
         if self.replay.strategy is None:
             return self.replay.draw(ring, key, progress)
+        env = env.env if isinstance(env, FunctionalMask) else env
         assert isinstance(env, GoalEnv)
         goal = ring.obs[self.replay.achieved][:1]
         judges = jax.eval_shape(env.compute_terminated, goal, goal) is not None

@@ -423,8 +423,11 @@ def scale(space: gym.Space, action: Array) -> Array:
     return action.reshape(-1, *space.shape).astype(jnp.int8)
 
 
-def random_action(space: gym.Space, n: int, key: Array) -> Array:
+def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = None) -> Array:
     """Returns ``n`` uniformly random actions in the range of algorithms, like :func:`rejeu.spaces.random_action`."""
+    if mask is not None:
+        n_allowed = jnp.sum(mask, axis=-1, dtype=jnp.int32)
+        return spaces.nth_allowed(mask, below(jax.random.bits(key, (n,), jnp.uint32), n_allowed))
     if isinstance(space, gym.spaces.Box):
         bits = jax.random.bits(key, (n, int(np.prod(space.shape))), jnp.uint32)
         return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-23) - 1.0
