@@ -19,9 +19,10 @@ from rejeu.core import Masked, Transition
 from rejeu.envs.functional.bit_flipping import BitFlipping
 from rejeu.envs.make import InProcess
 from rejeu.sb3 import DQN
-from rejeu.sb3_contrib import MaskablePPO
+from rejeu.sb3_contrib import MaskablePPO, MaskableRecurrentPPO
 from tests.helpers import assert_same_parameters
 from tests.jax_environments import Forbidden
+from tests.tiers import crossed
 from tests.worker_environments import Rules
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -65,8 +66,7 @@ def test_what_is_forbidden_is_never_done_and_nothing_becomes_infinite(name):
     assert max(np.abs(value).max() for value in floats) < 1e6
 
 
-@pytest.mark.parametrize("on_device", [True, False])
-@pytest.mark.parametrize("name", ["DQN", "QRDQN", "SAC", "RecurrentPPO"])
+@pytest.mark.parametrize(("name", "on_device"), crossed(["DQN", "QRDQN", "SAC", "RecurrentPPO"], [True, False]))
 def test_on_the_device_too(name, on_device):
     agent = KINDS[name]("MlpPolicy", rejeu.make_vector(Forbidden(), 2, seed=0))
     agent.on_device = on_device
@@ -81,8 +81,7 @@ class Lenient(Forbidden):
         return jnp.ones(3, bool)
 
 
-@pytest.mark.parametrize("on_device", [True, False])
-@pytest.mark.parametrize("name", ["DQN", "QRDQN", "SAC", "PPO"])
+@pytest.mark.parametrize(("name", "on_device"), crossed(["DQN", "QRDQN", "SAC", "RecurrentPPO"], [True, False]))
 def test_masks_that_allow_everything_change_nothing(name, on_device):
     agents = []
     for masks in (True, False):
@@ -264,6 +263,18 @@ def test_maskable_ppo_is_ppo_with_masks():
     ]
     assert_same_parameters(agents[0], agents[1])
     assert_same_parameters(agents[0], agents[2])
+
+
+def test_maskable_recurrent_ppo_is_recurrent_ppo_with_masks(tmp_path):
+    settings = {key: value for key, value in KINDS["RecurrentPPO"].keywords.items() if key != "action_masks"}
+    agent = MaskableRecurrentPPO("MlpLstmPolicy", vector(), **settings).learn(64)
+    assert_same_parameters(agent, KINDS["RecurrentPPO"]("MlpPolicy", vector()).learn(64))
+    loaded = MaskableRecurrentPPO.load(agent.save(tmp_path / "model"))
+    assert loaded.takes_masks
+    obs, mask, memory = np.zeros((9, 2), np.float32), np.tile([False, True, True, False, False], (9, 1)), None
+    for _ in range(3):
+        action, memory = loaded.predict(obs, memory, action_masks=mask)
+        assert set(action.tolist()) <= {1, 2}
 
 
 def test_dqn_of_sb3_acts_at_random_among_the_allowed_actions():

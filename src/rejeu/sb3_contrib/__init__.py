@@ -9,6 +9,7 @@ To port a script, replace ``sb3_contrib`` by ``rejeu.sb3_contrib`` in its import
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -24,7 +25,11 @@ from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
 from rejeu.sb3.common.policies import ActorCriticPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 
-__all__ = ["ARS", "QRDQN", "TQC", "TRPO", "CrossQ", "MaskablePPO", "RecurrentPPO"]
+__all__ = ["ARS", "QRDQN", "TQC", "TRPO", "CrossQ", "MaskablePPO", "MaskableRecurrentPPO", "RecurrentPPO"]
+
+MaskableRecurrentPPO: Any = partial(RecurrentPPO, action_masks=True)
+"""RecurrentPPO with masks of the allowed actions."""
+MaskableRecurrentPPO.load = RecurrentPPO.load
 
 
 class ActionMasker(gym.Wrapper):
