@@ -278,7 +278,7 @@ class DeviceReplay:
         for leaves in (obs, next_obs) if goals is not None else ():
             leaves[self.desired] = replaced(leaves[self.desired], goals.which, goals.goal)  # type: ignore[union-attr]
         tree = lambda leaves: jax.tree.unflatten(self.obs_structure, leaves)  # noqa: E731
-        discount = jnp.where(ends, jnp.float32(0), jnp.asarray(discounts_of(self.gamma, self.n_steps))[steps])
+        discount = jnp.asarray(discounts_of(self.gamma, self.n_steps))[2 * steps + ends]
         return Transition(tree(obs), action, rewards, tree(next_obs), discount, None, each)
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:

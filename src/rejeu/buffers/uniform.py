@@ -39,7 +39,7 @@ class BaseReplayBuffer(ABC):
         self.ring, self.gamma, self.n_steps, self.priorities = ring, gamma, n_steps, priorities
         self.each_reward = each_reward and n_steps > 1
         self.discounts = discounts_of(gamma, n_steps)
-        """Discounts of the next observation, by the number of steps to it, ``float32 (n_steps + 1,)``."""
+        """Discounts of the next observation: at ``2 i`` after ``i`` steps, at ``2 i + 1`` if the MDP terminated with them."""
 
     @abstractmethod
     def draw(
@@ -112,7 +112,7 @@ class BaseReplayBuffer(ABC):
         if goals is not None:
             for leaves in (obs, next_obs):
                 leaves[self.desired][goals.which] = goals.goal
-        reward, each, discount = rewards, None, np.where(terminated, np.float32(0), self.discounts[steps])
+        reward, each, discount = rewards, None, self.discounts.take(2 * steps + terminated)
         if self.n_steps > 1:
             powers = self.gamma ** np.arange(self.n_steps)
             reward = (rewards @ powers).astype(np.float32)
@@ -151,8 +151,8 @@ class ReplayBuffer(BaseReplayBuffer):
 
 
 def discounts_of(gamma: float, n_steps: int) -> np.ndarray:
-    """Returns ``gamma^i`` for ``i`` from 0 to ``n_steps``, ``float32``."""
-    return np.asarray(gamma ** np.arange(n_steps + 1), np.float32)
+    """Returns ``gamma^i`` for ``i`` from 0 to ``n_steps``, each with a 0 behind it, ``float32 (2 * n_steps + 2,)``."""
+    return (gamma ** np.arange(n_steps + 1)[:, None] * np.array([1, 0])).astype(np.float32).reshape(-1)
 
 
 class Window(NamedTuple):
@@ -200,7 +200,7 @@ class Outcome(NamedTuple):
     steps: Any
     """Number of steps to the next observation, ``(batch,)``, or 1 for all."""
     terminated: Any
-    """Whether the MDP terminated, ``bool (batch,)``."""
+    """1 where the MDP terminated, else 0, of any dtype, ``(batch,)``."""
 
 
 def outcome(
@@ -210,7 +210,7 @@ def outcome(
     if goals is not None and not len(goals.goal):
         goals = None
     if n_steps == 1:
-        rewards, terminated = ring.reward[rows.position], ring.kind[rows.position] == TERMINATED
+        rewards, terminated = ring.reward[rows.position], ring.kind[rows.position]  # which is STEP or TERMINATED
         if goals is not None:
             reached = ring.obs[goals.achieved][index(rows.env[goals.which], rows.time[goals.which] + 1)]
             rewards = replaced(rewards, goals.which, goals.reward(reached, goals.goal))
