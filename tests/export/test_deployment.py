@@ -160,6 +160,26 @@ class Calling(Sorting):
         return jax.pure_callback(np.tanh, shape, self.first(x), vmap_method="sequential")
 
 
+class Convolving(eqx.Module):
+    """An encoder of images with Equinox's convolutions, which the formats have as products of patches."""
+
+    layer: eqx.nn.Conv2d
+    n_outputs: int = eqx.field(static=True, default=75)
+
+    def __init__(self, key, leaves):
+        self.layer = eqx.nn.Conv2d(2, 3, 4, stride=3, padding=1, dilation=(1, 2), key=key)
+
+    def __call__(self, obs):
+        x = jax.vmap(self.layer)(obs.reshape(-1, 2, 16, 16).astype(jnp.float32) / 255)
+        return x.reshape(*obs.shape[:-3], -1)
+
+
+@pytest.mark.parametrize("target", ["onnx", "c"])
+def test_convolutions_of_own_encoders_are_exported(target, tmp_path):
+    agent = agent_of("PPO", "Box", "CNN", policy_kwargs={"encoder": Convolving, "net_arch": [8]})
+    assert agent.export(tmp_path / "policy", target).check.difference <= 1e-5
+
+
 @pytest.mark.parametrize(
     ("torso", "target", "message"),
     [

@@ -5,33 +5,21 @@ from __future__ import annotations
 import json
 import math
 import re
+from string import Template
 from typing import Any
 
 import numpy as np
 
 from rejeu.export.contract import Policy, Port
-from rejeu.export.loops import Language, Printer, as_float, contiguous, indented
+from rejeu.export.loops import TEMPLATES, Language, Printer, indented, memory
 
 TYPES = {
     "float32": "float",
-    "int8": "int8_t",
-    "int16": "int16_t",
-    "int32": "int32_t",
+    **{f"{sign}int{bits}": f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32)},
     "int64": "int64_t",
-    "uint8": "uint8_t",
-    "uint16": "uint16_t",
-    "uint32": "uint32_t",
     "bool": "uint8_t",
 }
-C = Language(
-    name="C",
-    types=TYPES,
-    variable=lambda dtype: "int" if dtype == "index" else TYPES[dtype],
-    functions={"abs": "fabsf", "mod": "fmodf"},
-    prefix="",
-    suffix="f",
-    missing=(),
-)
+C = Language("C", TYPES)
 
 
 def identifier(name: str) -> str:
@@ -44,90 +32,64 @@ def identifier(name: str) -> str:
     return name if name[:1].isalpha() else f"p{name}"
 
 
+def filled(template: str, **texts: Any) -> bytes:
+    """Returns a file made of one of the templates."""
+    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(texts).encode()
+
+
 def write(policy: Policy, card: dict[str, Any], stem: str) -> tuple[bytes, bytes]:
     """Returns the C file of a policy and its header; ``stem`` is the name of the files without suffix."""
-    name = identifier(stem)
-    names = dict(
-        zip(
-            [port.name for port in policy.inputs],
-            unique([identifier(port.name) for port in policy.inputs]),
-            strict=True,
-        )
-    )
-    printer = Printer(C)
+    printer, names = Printer(C), names_of(policy)
     found = printer.run(policy.program, list(names.values()))
     action, after = policy.outputs[0], policy.of("state")
-    given = [port for port in policy.inputs if port.role not in ("state", "episode_start")]
-    takes = [f"const {TYPES[port.dtype]} {names[port.name]}[{size(port)}]" for port in given]
-    signature = f"void {name}_act({', '.join([*takes, f'{TYPES[action.dtype]} action[{size(action)}]'])})"
-    reset = f"void {name}_reset(void)"
-    out = contiguous("action", found[0].shape, action.dtype)
-    last = [printer.stored(one) if names and one.base in names.values() else one for one in found[1:]]
-    printer.copy(found[0], out)
+    last = [printer.stored(one) if one.name in names.values() else one for one in found[1:]]
+    printer.copy(found[0], memory("action", found[0].shape, action.dtype))
     for port, one in zip(after, last, strict=True):
-        printer.copy(one, contiguous(names[port.name], one.shape, port.dtype))
-    unused = [
-        names[port.name] for port in given if not any(re.search(rf"\b{names[port.name]}\[", x) for x in printer.lines)
-    ]
-    statics = [f"static {TYPES[port.dtype]} {names[port.name]}[{size(port)}];" for port in after]
+        printer.copy(one, memory(names[port.name], one.shape, port.dtype))
+    given = [port for port in policy.inputs if port.role not in ("state", "episode_start")]
+    code = "\n".join(printer.lines)
+    body = [f"(void){names[port.name]};" for port in given if not re.search(rf"\b{names[port.name]}\[", code)]
     starts = [names[port.name] for port in policy.of("episode_start")]
-    statics += [f"static uint8_t {one}[1] = {{1}};" for one in starts]
-    buffers = [f"static {TYPES[dtype]} {one}[{n}];" for one, dtype, n in printer.buffers]
-    body = [f"(void){one};" for one in unused] + printer.lines + [f"{one}[0] = 0;" for one in starts]
-    source = "\n".join(
-        [
-            comment(card),
-            f'#include "{stem}.h"',
-            "",
-            "#include <math.h>",
-            "",
-            *(array(one, data) for one, data in printer.constants.items()),
-            *statics,
-            *buffers,
-            "",
-            signature + " {",
-            indented(body),
-            "}",
-            "",
-            reset + " {",
-            *(f"\t{one}[0] = 1;" for one in starts),
-            "}",
-            "",
-        ]
+    arrays = [array(one, data) for one, data in printer.constants.items()]
+    arrays += [declaration(port, names[port.name], "static ") + ";" for port in after]
+    arrays += [f"static uint8_t {one}[1] = {{1}};" for one in starts]
+    arrays += [f"static {TYPES[dtype]} {one}[{n}];" for one, dtype, n in printer.buffers]
+    name = identifier(stem)
+    takes = [declaration(port, names[port.name], "const ") for port in given]
+    upper, sizes = name.upper(), [*((names[port.name], size(port)) for port in given), ("action", size(action))]
+    texts = {
+        "name": name,
+        "stem": stem,
+        "upper": upper,
+        "card": json.dumps(card, indent=1).replace("*/", "* /").replace("/*", "/ *"),
+        "signature": f"void {name}_act({', '.join([*takes, declaration(action, 'action')])})",
+        "arrays": "\n".join(arrays),
+        "body": indented([*body, *printer.lines, *(f"{one}[0] = 0;" for one in starts)]),
+        "resets": "".join(f"\t{one}[0] = 1;\n" for one in starts),
+        "sizes": "\n".join(f"#define {upper}_{one.upper()}_SIZE {n}" for one, n in sizes),
+    }
+    return filled("policy.c", **texts), filled("policy.h", **texts, rejeu=card["rejeu"], weights=card["weights"])
+
+
+def main_of(policy: Policy, stem: str) -> bytes:
+    """Returns a program that reads inputs from standard input, and writes actions and times to standard output."""
+    given = [port for port in policy.inputs if port.role != "state"]
+    starts = [i for i, port in enumerate(given) if port.role == "episode_start"]
+    arrays = [declaration(port, f"a{i}", "static ") + ";" for i, port in enumerate(given)]
+    return filled(
+        "main.c",
+        stem=stem,
+        name=identifier(stem),
+        arrays="\n".join([*arrays, declaration(policy.outputs[0], "action", "static ") + ";"]),
+        reads=" && ".join(f"fread(a{i}, sizeof a{i}, 1, stdin)" for i in range(len(given))),
+        starts=" ".join(f"if (a{i}[0]) {identifier(stem)}_reset();" for i in starts),
+        arguments=", ".join([*(f"a{i}" for i in range(len(given)) if i not in starts), "action"]),
     )
-    guard = f"{name.upper()}_H"
-    lengths = [f"#define {name.upper()}_{names[port.name].upper()}_SIZE {size(port)}" for port in given]
-    header = "\n".join(
-        [
-            comment(card),
-            f"#ifndef {guard}",
-            f"#define {guard}",
-            "",
-            "#include <stdint.h>",
-            "",
-            *lengths,
-            f"#define {name.upper()}_ACTION_SIZE {size(action)}",
-            f'#define {name.upper()}_REJEU "{card["rejeu"]}"',
-            f'#define {name.upper()}_WEIGHTS "{card["weights"]}"',
-            "",
-            "#ifdef __cplusplus",
-            'extern "C" {',
-            "#endif",
-            "",
-            "/* Computes the action for an observation. Arrays are in C order. Not reentrant: its memory is static. */",
-            signature + ";",
-            "",
-            "/* Starts an episode: a policy with memory forgets. The first episode needs no call. */",
-            reset + ";",
-            "",
-            "#ifdef __cplusplus",
-            "}",
-            "#endif",
-            "#endif",
-            "",
-        ]
-    )
-    return source.encode(), header.encode()
+
+
+def declaration(port: Port, name: str, kind: str = "") -> str:
+    """Returns the declaration of an input or output."""
+    return f"{kind}{TYPES[port.dtype]} {name}[{size(port)}]"
 
 
 def size(port: Port) -> int:
@@ -135,28 +97,20 @@ def size(port: Port) -> int:
     return max(math.prod(port.shape), 1)
 
 
-def unique(names: list[str]) -> list[str]:
-    """Returns names in which later ones that are equal to earlier ones, or to names of the file, get an underscore."""
-    taken = {"action", "x", "sum", "best"}
-    result = []
-    for name in names:
-        while name in taken or re.fullmatch(r"vc?\d+|i\d+", name):
+def names_of(policy: Policy) -> dict[str, str]:
+    """Returns names of C for the inputs, by their own; those that are taken already get an underscore."""
+    result, taken = {}, {"action", "x", "sum", "best"}
+    for port in policy.inputs:
+        name = identifier(port.name)
+        while name in taken or re.fullmatch(r"[vci]\d+", name):
             name += "_"
         taken.add(name)
-        result.append(name)
+        result[port.name] = name
     return result
-
-
-def comment(card: dict[str, Any]) -> str:
-    """Returns the card as a comment."""
-    text = json.dumps(card, indent=1).replace("*/", "* /").replace("/*", "/ *")
-    return f"/* Made by rejeu. The contract of this policy:\n{text}\n*/"
 
 
 def array(name: str, data: np.ndarray) -> str:
     """Returns the declaration of a constant array."""
-    is_float = data.dtype.kind == "f"
-    numbers = [as_float(one) + "f" if is_float else str(int(one)) for one in data.ravel().tolist()]
-    lines = [", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8)]
-    text = ",\n".join(lines)
+    numbers = [C.literal(one) for one in data.ravel()]
+    text = ",\n".join(", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8))
     return f"static const {TYPES[str(data.dtype)]} {name}[{data.size}] = {{\n{text}}};"

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.export.c_file import TYPES, identifier, size
+from rejeu.export.c_file import main_of
 from rejeu.export.contract import Policy
+from rejeu.export.loops import TEMPLATES
 from rejeu.export.program import Value
 
 LARGEST_DIFFERENCE = 1e-5
@@ -164,7 +165,7 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
             folder = Path(name)
             (folder / f"{stem}.c").write_bytes(source)
             (folder / f"{stem}.h").write_bytes(header)
-            (folder / "main.c").write_text(main_of(policy, stem), encoding="utf-8")
+            (folder / "main.c").write_bytes(main_of(policy, stem))
             options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", f"{stem}.c"]
             for arguments in (options, ["-O2", "main.c", f"{stem}.o", "-lm", "-o", "main"]):
                 made = subprocess.run([compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False)
@@ -183,35 +184,6 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
     return run
 
 
-def main_of(policy: Policy, stem: str) -> str:
-    """Returns a program that reads inputs from standard input, and writes actions and times to standard output."""
-    name, given = identifier(stem), [port for port in policy.inputs if port.role != "state"]
-    lines, arguments = [], []
-    for i, port in enumerate(given):
-        kind = "uint8_t" if port.role == "episode_start" else TYPES[port.dtype]
-        lines.append(f"static {kind} a{i}[{size(port)}];")
-        arguments += [] if port.role == "episode_start" else [f"a{i}"]
-    reads = " && ".join(f"fread(a{i}, sizeof a{i}, 1, stdin)" for i in range(len(given)))
-    starts = [f"if (a{i}[0]) {name}_reset();" for i, port in enumerate(given) if port.role == "episode_start"]
-    action = policy.outputs[0]
-    return "\n".join(
-        [
-            f'#include "{stem}.h"\n#include <stdio.h>\n#include <time.h>',
-            *lines,
-            f"static {TYPES[action.dtype]} action[{size(action)}];",
-            "int main(void) {\n\tstruct timespec one, two;",
-            f"\twhile ({reads}) {{",
-            *(f"\t\t{line}" for line in starts),
-            "\t\tclock_gettime(CLOCK_MONOTONIC, &one);",
-            f"\t\t{name}_act({', '.join([*arguments, 'action'])});",
-            "\t\tclock_gettime(CLOCK_MONOTONIC, &two);",
-            "\t\tdouble seconds = (double)(two.tv_sec - one.tv_sec) + 1e-9 * (double)(two.tv_nsec - one.tv_nsec);",
-            "\t\tfwrite(action, sizeof action, 1, stdout);\n\t\tfwrite(&seconds, sizeof seconds, 1, stdout);",
-            "\t}\n\treturn 0;\n}\n",
-        ]
-    )
-
-
 def node_run(policy: Policy, script: str) -> Run | None:
     """Returns the run of a policy in JavaScript; None without Node.js."""
     if shutil.which("node") is None:
@@ -222,7 +194,7 @@ def node_run(policy: Policy, script: str) -> Run | None:
         given = [port.name for port in policy.inputs if port.role == "observation"]
         starts = next((inputs[port.name] for port in policy.of("episode_start")), np.zeros(n, bool)).tolist()
         rows = [([inputs[name][i].ravel().tolist() for name in given], starts[i]) for i in range(n)]
-        actions, seconds = node(f"{script}\n{NODE}", rows)
+        actions, seconds = node(script + (TEMPLATES / "node.js").read_text(encoding="utf-8"), rows)
         action = policy.outputs[0]
         return np.array(actions, action.dtype).reshape(n, *action.shape), np.array(seconds)
 
@@ -236,15 +208,3 @@ def node(script: str, given: Any) -> Any:
         path.write_text(script, encoding="utf-8")
         found = subprocess.run(["node", path], input=json.dumps(given), capture_output=True, text=True, check=True)
     return json.loads(found.stdout)
-
-
-NODE = """
-const agent = makeAgent(), actions = [], seconds = [];
-for (const [observations, start] of JSON.parse(require("fs").readFileSync(0, "utf8"))) {
-  const begin = process.hrtime.bigint();
-  const action = agent(observations, start);
-  seconds.push(Number(process.hrtime.bigint() - begin) * 1e-9);
-  actions.push(Array.from(action));
-}
-console.log(JSON.stringify([actions, seconds]));
-"""

@@ -10,6 +10,7 @@ import numpy as np
 
 from rejeu.errors import MissingExtra
 from rejeu.export.contract import Policy
+from rejeu.export.loops import PRIMITIVES
 from rejeu.export.program import Operation, Value, unsupported
 
 try:
@@ -22,23 +23,7 @@ OPSET, IR_VERSION = 18, 8
 """Of December 2022; ONNX Runtime reads them since version 1.14."""
 TO_THE_END = np.iinfo(np.int64).max
 
-ELEMENTWISE = {
-    "abs": "Abs", "acos": "Acos", "acosh": "Acosh", "add": "Add", "add_any": "Add", "and": "And", "asin": "Asin",
-    "asinh": "Asinh", "atan": "Atan", "atanh": "Atanh", "ceil": "Ceil", "cos": "Cos", "cosh": "Cosh", "div": "Div",
-    "eq": "Equal", "erf": "Erf", "exp": "Exp", "floor": "Floor", "ge": "GreaterOrEqual", "gt": "Greater",
-    "le": "LessOrEqual", "log": "Log", "logistic": "Sigmoid", "lt": "Less", "max": "Max", "min": "Min", "mul": "Mul",
-    "neg": "Neg", "not": "Not", "or": "Or", "pow": "Pow", "sign": "Sign", "sin": "Sin", "sinh": "Sinh", "sqrt": "Sqrt",
-    "sub": "Sub", "tan": "Tan", "tanh": "Tanh", "xor": "Xor",
-}  # fmt: skip
-"""Operators of primitives that are one operator."""
-REDUCTIONS = {
-    "reduce_max": "ReduceMax",
-    "reduce_min": "ReduceMin",
-    "reduce_prod": "ReduceProd",
-    "reduce_sum": "ReduceSum",
-    "reduce_or": "ReduceMax",
-    "reduce_and": "ReduceMin",
-}
+REDUCTIONS = {"reduce_max": "ReduceMax", "reduce_min": "ReduceMin", "reduce_sum": "ReduceSum"}
 
 
 class Graph:
@@ -106,13 +91,10 @@ def add(graph: Graph, operation: Operation) -> None:
         for axis, size in zip(operation.params["broadcast_dimensions"], inputs[0].sizes, strict=True):
             sizes[axis] = size
         graph.narrow[outputs[0]] = graph.reshape(graph.name(inputs[0]), sizes)
-    elif name in ELEMENTWISE or name in COMPOSED:
+    elif name in PRIMITIVES or name == "convert_element_type":
         has_shape = any(one.shape == outputs[0].shape and one not in graph.narrow for one in inputs)
         names = [graph.loose(one) if has_shape else graph.name(one) for one in inputs]
-        if name in ELEMENTWISE:
-            graph.names[outputs[0]] = graph.node(ELEMENTWISE[name], names)
-        else:
-            graph.names[outputs[0]] = COMPOSED[name](graph, operation, names)
+        graph.names[outputs[0]] = elementwise(graph, operation, names)
     elif name == "split":
         lengths = graph.constant(np.array(operation.params["sizes"], np.int64))
         names = [f"v{len(graph.nodes)}_{i}" for i in range(len(outputs))]
@@ -120,11 +102,8 @@ def add(graph: Graph, operation: Operation) -> None:
         graph.nodes.append(node)
         graph.names |= zip(outputs, names, strict=True)
     elif name in REDUCTIONS:
-        is_logical = name in ("reduce_or", "reduce_and")
-        taken = graph.cast(graph.name(inputs[0]), np.int32) if is_logical else graph.name(inputs[0])
         axes = graph.constant(np.array(operation.params["axes"], np.int64))
-        found = graph.node(REDUCTIONS[name], [taken, axes], keepdims=0)
-        graph.names[outputs[0]] = graph.cast(found, bool) if is_logical else found
+        graph.names[outputs[0]] = graph.node(REDUCTIONS[name], [graph.name(inputs[0]), axes], keepdims=0)
     elif name in STRUCTURAL:
         graph.names[outputs[0]] = STRUCTURAL[name](graph, operation, [graph.name(one) for one in inputs])
     else:
@@ -135,49 +114,18 @@ Make = Callable[[Graph, Operation, list[str]], str]
 """Adds the nodes of an operation whose inputs have these names, and returns the name of its output."""
 
 
-def scalar(operation: Operation, value: float) -> np.ndarray:
-    """Returns a number in the dtype of the first input."""
-    return np.asarray(value, operation.inputs[0].dtype)
-
-
-def power(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """A power with a whole exponent."""
-    if operation.params["y"] == 2:
-        return graph.node("Mul", [names[0], names[0]])
-    return graph.node("Pow", [names[0], graph.constant(scalar(operation, operation.params["y"]))])
-
-
-def select(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """A choice between two arrays."""
-    if len(names) != 3 or operation.inputs[0].dtype != bool:
-        raise unsupported(operation, "ONNX", " for more than two choices")
-    return graph.node("Where", [names[0], names[2], names[1]])
-
-
-def not_equal(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """Inequality."""
-    return graph.node("Not", [graph.node("Equal", names)])
-
-
-def rounded(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """Rounding; of halves to even numbers."""
-    if int(operation.params["rounding_method"]) != 1:
-        raise unsupported(operation, "ONNX", " for halves away from zero")
-    return graph.node("Round", names)
-
-
-COMPOSED: dict[str, Make] = {
-    "convert_element_type": lambda g, op, n: g.cast(n[0], op.params["new_dtype"]),
-    "expm1": lambda g, op, n: g.node("Sub", [g.node("Exp", n), g.constant(scalar(op, 1.0))]),
-    "integer_pow": power,
-    "log1p": lambda g, op, n: g.node("Log", [g.node("Add", [n[0], g.constant(scalar(op, 1.0))])]),
-    "ne": not_equal,
-    "rem": lambda g, op, n: g.node("Mod", n, fmod=1),
-    "round": rounded,
-    "rsqrt": lambda g, op, n: g.node("Reciprocal", [g.node("Sqrt", n)]),
-    "select_n": select,
-}
-"""Primitives of each element by itself that are several operators, or have parameters."""
+def elementwise(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """An operation on each element by itself."""
+    name, params = operation.name, operation.params
+    if name == "convert_element_type":
+        return graph.cast(names[0], params["new_dtype"])
+    kind = PRIMITIVES[name].get("onnx")
+    if name == "select_n":
+        names[1:] = reversed(names[1:])
+    is_other = name == "select_n" and (len(names) != 3 or operation.inputs[0].dtype != bool)
+    if kind is None or is_other or (name == "round" and int(params["rounding_method"]) != 1):
+        raise unsupported(operation, "ONNX")
+    return graph.node(kind, names, **({"fmod": 1} if name == "rem" else {}))
 
 
 def product(graph: Graph, operation: Operation, names: list[str]) -> str:
@@ -201,22 +149,6 @@ def product(graph: Graph, operation: Operation, names: list[str]) -> str:
     return graph.reshape(graph.node("MatMul", made), operation.outputs[0].sizes)
 
 
-def convolution(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """A convolution."""
-    params, (left, right, out) = operation.params, operation.params["dimension_numbers"]
-    if params["batch_group_count"] != 1 or any(size != 1 for size in params["lhs_dilation"]):
-        raise unsupported(operation, "ONNX", " if it is transposed")
-    found = graph.node(
-        "Conv",
-        [graph.node("Transpose", [name], perm=axes) for name, axes in zip(names, (left, right), strict=True)],
-        strides=params["window_strides"],
-        pads=[pair[end] for end in (0, 1) for pair in params["padding"]],
-        dilations=params["rhs_dilation"],
-        group=params["feature_group_count"],
-    )
-    return graph.node("Transpose", [found], perm=np.argsort(out).tolist())
-
-
 def sliced(graph: Graph, operation: Operation, names: list[str]) -> str:
     """A part of an array."""
     params, shape = operation.params, operation.inputs[0].sizes
@@ -226,30 +158,10 @@ def sliced(graph: Graph, operation: Operation, names: list[str]) -> str:
     return graph.node("Slice", [names[0], *(graph.constant(np.array([*part], np.int64)) for part in parts)])
 
 
-def reversed_(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """An array backwards."""
-    axes = np.array(operation.params["dimensions"], np.int64)
-    parts = (np.full_like(axes, -1), np.full_like(axes, -TO_THE_END), axes, np.full_like(axes, -1))
-    return graph.node("Slice", [names[0], *map(graph.constant, parts)])
-
-
-def padded(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """An array with a border."""
-    config = operation.params["padding_config"]
-    if any(interior for _, _, interior in config):
-        raise unsupported(operation, "ONNX", " between elements")
-    pads = np.array([[low for low, _, _ in config], [high for _, high, _ in config]], np.int64).ravel()
-    return graph.node("Pad", [names[0], graph.constant(pads), names[1]])
-
-
-def position(kind: str) -> Make:
-    """The index of the largest or smallest element."""
-
-    def make(graph: Graph, operation: Operation, names: list[str]) -> str:
-        found = graph.node(kind, names, axis=operation.params["axes"][0], keepdims=0)
-        return graph.cast(found, operation.params["index_dtype"])
-
-    return make
+def argmax(graph: Graph, operation: Operation, names: list[str]) -> str:
+    """The index of the first of the largest elements."""
+    found = graph.node("ArgMax", names, axis=operation.params["axes"][0], keepdims=0)
+    return graph.cast(found, operation.params["index_dtype"])
 
 
 def reshaped(graph: Graph, operation: Operation, names: list[str]) -> str:
@@ -258,15 +170,11 @@ def reshaped(graph: Graph, operation: Operation, names: list[str]) -> str:
 
 
 STRUCTURAL: dict[str, Make] = {
-    "argmax": position("ArgMax"),
-    "argmin": position("ArgMin"),
+    "argmax": argmax,
     "concatenate": lambda g, op, n: g.node("Concat", n, axis=op.params["dimension"]),
-    "conv_general_dilated": convolution,
     "dot_general": product,
     "expand_dims": reshaped,
-    "pad": padded,
     "reshape": reshaped,
-    "rev": reversed_,
     "slice": sliced,
     "squeeze": reshaped,
     "transpose": lambda g, op, n: g.node("Transpose", n, perm=op.params["permutation"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,13 +21,68 @@ IDENTITIES = ("copy", "copy_p", "optimization_barrier", "reduce_precision", "sto
 DRAWS = {"_normal": "normal", "_uniform": "uniform", "_randint": "uniform"}
 """JAX's functions that draw, by name, and the distribution of the input that replaces them."""
 
+
+def power(params: Any, x: Any) -> Any:
+    """A power with a whole exponent, as products."""
+    y, one = params["y"], x.dtype.type(1)
+    result = math.prod([x] * (abs(y) - 1), start=x) if y else jnp.ones_like(x)
+    return one / result if y < 0 else result
+
+
+def padded(params: Any, x: Any, value: Any) -> Any:
+    """An array with a border, as a concatenation."""
+    for axis, (low, high, _) in enumerate(params["padding_config"]):
+        border = lambda n, axis=axis: jnp.broadcast_to(value, [*x.shape[:axis], n, *x.shape[axis + 1 :]])  # noqa: B023, E731
+        parts = (border(low) if low else None, x, border(high) if high else None)
+        x = jnp.concatenate([one for one in parts if one is not None], axis)
+    return x
+
+
+def convolution(params: Any, x: Any, kernel: Any) -> Any:
+    """A convolution, as the product of a matrix of patches."""
+    left, right, out = params["dimension_numbers"]
+    x = x.transpose(left[0], *left[2:], left[1])
+    x = jnp.pad(x, [(0, 0), *params["padding"], (0, 0)])
+    kernel = kernel.transpose(*right[2:], right[1], right[0])
+    steps, gaps = params["window_strides"], params["rhs_dilation"]
+    patches = []
+    for tap in np.ndindex(*kernel.shape[:-2]):
+        part = x
+        for axis, (i, n, step, gap) in enumerate(zip(tap, kernel.shape, steps, gaps, strict=False), 1):
+            part = jax.lax.slice_in_dim(part, i * gap, x.shape[axis] - (n - 1 - i) * gap, step, axis)
+        patches.append(part)
+    found = jnp.concatenate(patches, -1) @ kernel.reshape(-1, kernel.shape[-1])
+    return found.transpose(np.argsort([out[0], *out[2:], out[1]]))
+
+
 REWRITTEN: dict[str, Callable[..., Any]] = {
-    "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
-    "exp2": lambda x: jnp.power(x.dtype.type(2), x),
-    "square": lambda x: x * x,
-    "stack": lambda *parts, axis: jnp.concatenate([jnp.expand_dims(one, axis) for one in parts], axis),
+    "argmin": lambda params, x: jax.lax.argmax(-x, params["axes"][0], params["index_dtype"]),
+    "clamp": lambda _, low, x, high: jnp.minimum(jnp.maximum(x, low), high),
+    "conv_general_dilated": convolution,
+    "exp2": lambda _, x: jnp.power(x.dtype.type(2), x),
+    "expm1": lambda _, x: jnp.exp(x) - x.dtype.type(1),
+    "integer_pow": power,
+    "log1p": lambda _, x: jnp.log(x + x.dtype.type(1)),
+    "ne": lambda _, x, y: jnp.logical_not(x == y),
+    "pad": padded,
+    "reduce_and": lambda params, x: jnp.min(x.astype(jnp.int32), params["axes"]) > np.int32(0),
+    "reduce_or": lambda params, x: jnp.max(x.astype(jnp.int32), params["axes"]) > np.int32(0),
+    "rsqrt": lambda _, x: x.dtype.type(1) / jnp.sqrt(x),
+    "square": lambda _, x: x * x,
+    "stack": lambda params, *parts: jnp.concatenate(
+        [jnp.expand_dims(one, params["axis"]) for one in parts], params["axis"]
+    ),
 }
 """Primitives that are written with others, so that no format needs them."""
+
+
+def is_rewritten(name: str, params: Any) -> bool:
+    """Returns whether a primitive is written with others; transposed or grouped convolutions and gaps are not."""
+    if name == "conv_general_dilated":
+        return params["feature_group_count"] * params["batch_group_count"] * max(params["lhs_dilation"]) == 1
+    if name == "pad":
+        return all(low >= 0 and high >= 0 and not gap for low, high, gap in params["padding_config"])
+    return name in REWRITTEN
 
 
 class Value:
@@ -154,11 +210,10 @@ class _Tracing:
             return inputs
         if params.get("name") in DRAWS and "jaxpr" in params:
             return self.draw(DRAWS[params["name"]], equation.outvars[0].aval, inputs[1:])
-        if name in REWRITTEN:
-            examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in inputs]
-            kept = {key: params[key] for key in params if name == "stack"}
-            return self.inline(jax.make_jaxpr(partial(REWRITTEN[name], **kept))(*examples).jaxpr, inputs)
         inner = next((params[key] for key in INLINED if key in params), None)
+        if is_rewritten(name, params):
+            examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in inputs]
+            inner = jax.make_jaxpr(partial(REWRITTEN[name], params))(*examples)
         before, where = self.where, _line(equation.source_info) or self.where
         if inner is not None and name not in ("scan", "while", "cond"):
             constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in getattr(inner, "consts", ())]

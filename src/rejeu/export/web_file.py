@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,10 +15,9 @@ from rejeu import spaces
 from rejeu.envs import functional
 from rejeu.envs.functional import FunctionalEnv
 from rejeu.export.contract import Policy
-from rejeu.export.loops import Language, Printer, contiguous, indented
+from rejeu.export.loops import TEMPLATES, Language, Printer, indented, memory
 from rejeu.export.program import Program, trace
 
-FOLDER = Path(__file__).parent
 ENVIRONMENTS = {
     name: f"jax/{name.removeprefix('rejeu/')}"
     for name in ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "rejeu/Ball-v0")
@@ -35,15 +33,7 @@ TYPES = {
     "uint32": "Uint32Array",
     "bool": "Uint8Array",
 }
-JAVASCRIPT = Language(
-    name="JavaScript",
-    types=TYPES,
-    variable=lambda dtype: "let",
-    functions={"mod": "fmod", "rint": "rint"},
-    prefix="Math.",
-    suffix="",
-    missing=("erf",),
-)
+JAVASCRIPT = Language("JavaScript", TYPES)
 KEY = ShapeDtypeStruct((2,), np.uint32)
 
 
@@ -94,13 +84,13 @@ def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
     constant = json.dumps(about).replace("<", "\\u003c")
     functions = (("policy", policy.program), ("resetWorld", reset), ("stepWorld", stepped))
     parts = [function(name, program) for name, program in functions]
-    shared = (FOLDER / "web.js").read_text(encoding="utf-8")
+    shared = (TEMPLATES / "web.js").read_text(encoding="utf-8")
     return "\n".join(['"use strict";', f"const ABOUT = {constant};", *parts, shared])
 
 
 def write(script: str) -> bytes:
     """Returns the page with a script."""
-    return (FOLDER / "web.html").read_text(encoding="utf-8").replace("/* script */", script).encode()
+    return (TEMPLATES / "web.html").read_text(encoding="utf-8").replace("/* script */", script).encode()
 
 
 def draws_of(program: Program) -> list[tuple[str, int]]:
@@ -111,11 +101,11 @@ def draws_of(program: Program) -> list[tuple[str, int]]:
 def function(name: str, program: Program) -> str:
     """Returns a function from arrays to arrays."""
     printer, arguments = Printer(JAVASCRIPT), [f"a{i}" for i in range(len(program.arguments))]
-    results = []
-    for i, (value, one) in enumerate(zip(program.outputs, printer.run(program, arguments), strict=True)):
-        out = contiguous(f"out{i}", one.shape, value.dtype)
-        results.append(out.base)
-        printer.lines.append(f"const {out.base} = {array(out.dtype, max(math.prod(out.shape), 1))};")
+    results: list[str] = []
+    for value, one in zip(program.outputs, printer.run(program, arguments), strict=True):
+        out = memory(f"out{len(results)}", one.shape, value.dtype)
+        results.append(out.name)
+        printer.lines.append(f"const {out.name} = {array(out.dtype, max(math.prod(out.shape), 1))};")
         printer.copy(one, out)
     lines = [
         f"const {name} = (() => {{",
