@@ -671,11 +671,12 @@ DERIVED = ("RecurrentPPO", "MaskablePPO")
 
 
 @pytest.mark.parametrize(
-    ("relation", "case"),
+    "pair",
     only([pair for pair in RELATIONS if pair[1].name not in DERIVED], RELATIONS),
     ids=[f"{relation.__name__}-{case.name}" for relation, case in RELATIONS],
 )
-def test_a_setting_does_what_its_definition_says(relation: Relation, case: Case) -> None:
+def test_a_setting_does_what_its_definition_says(pair: tuple[Relation, Case]) -> None:
+    relation, case = pair
     relation(case)
 
 
@@ -705,12 +706,13 @@ def outcome(case: Case, **settings: Any) -> tuple[dict[str, np.ndarray], dict[st
 
 
 @pytest.mark.parametrize(
-    ("case", "field"),
+    "pair",
     only([pair for pair in SCHEDULES if pair[0].name not in DERIVED or pair[1] == "learning_rate"], SCHEDULES),
     ids=[f"{case.name}-{field}" for case, field in SCHEDULES],
 )
-def test_a_schedule_is_its_value_at_the_progress_of_the_clock(case: Case, field: str) -> None:
+def test_a_schedule_is_its_value_at_the_progress_of_the_clock(pair: tuple[Case, str]) -> None:
     """In everything that an update leaves and reports; and that differs from its value elsewhere."""
+    case, field = pair
     rest = {"n_epochs": 3} if "clip" in field else {}
     if field != "learning_rate":
         rest["learning_rate"] = 0.5
@@ -745,6 +747,7 @@ ELSEWHERE = {
     "n_steps": "tests/buffers/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept",
     "priorities": f"{PRIORITIZED}::test_steps_are_drawn_in_proportion_to_their_priorities",
     "frame_stack": "tests/networks/test_images.py::test_sampled_stacks_are_those_that_the_agent_saw",
+    "action_masks": "tests/algorithms/test_action_masks.py::test_what_is_forbidden_is_never_done_and_nothing_becomes_infinite",
     "overlap": "tests/agents/test_determinism.py::test_actions_follow_the_newest_update_unless_they_overlap_with_it",
     "renorm_warmup_steps": "tests/networks/test_batch_renorm.py::test_training_equals_numpy_over_warm_up_and_after",
     "n_episodes": "tests/agents/test_whole_episodes.py::test_every_environment_plays_its_episodes_and_waits_for_the_others",
