@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from types import SimpleNamespace
+from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms.rollout_config import RolloutConfig
+from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.callbacks import Checkpoint
+from rejeu.core import TD_ERROR, Algorithm
 from rejeu.loops.training_call import TrainingCall
 from rejeu.schedules import Exponential, Linear, at, parse, to_json
 from tests.environments import Counter
@@ -201,3 +209,101 @@ def test_any_function_of_the_progress_is_a_schedule(tmp_path):
         rejeu.load(path)
     assert rejeu.load(path, learning_rate=half_cosine).config == agent.config
     assert rejeu.load(path, learning_rate=1e-3).config.learning_rate == 1e-3
+
+
+# Which progress the loops tell.
+
+ROOM = 64
+
+
+class Heard(eqx.Module):
+    """A state that writes down the progress that updates were told, and that their actions had been told."""
+
+    updates: jax.Array
+    acted: jax.Array
+    weighed: jax.Array
+    """Whether the importance weights of a batch differ."""
+    n: jax.Array
+
+
+def listener(config, observation_space, action_space):
+    """An algorithm whose actions are the progress that it is told when it acts, and which learns nothing but that."""
+
+    def init(key):
+        return Heard(jnp.full(ROOM, -1.0), jnp.full(ROOM, -1.0), jnp.full(ROOM, -1.0), jnp.int32(0))
+
+    def act(actor, obs, key=None, clock=None):
+        n = jax.tree.leaves(obs)[0].shape[0]
+        return jnp.full((n, 1), 0.0 if clock is None else clock.progress, jnp.float32)
+
+    def update(state, batch, clock):
+        weight = getattr(batch, "weight", None)
+        differ = jnp.float32(0.0 if weight is None else weight.min() < 1)
+        state = Heard(
+            state.updates.at[state.n].set(clock.progress),
+            state.acted.at[state.n].set(batch.action.reshape(-1)[-1]),
+            state.weighed.at[state.n].set(differ),
+            state.n + 1,
+        )
+        metrics = {"progress": jnp.float32(clock.progress)}
+        return state, metrics | ({TD_ERROR: jnp.abs(batch.reward) + 0.01} if hasattr(batch, "weight") else {})
+
+    return Algorithm(init, lambda state: state.n, act, act, update)
+
+
+def listening(kind, on_device, **settings):
+    """An agent of that algorithm in an environment on the device, which trains there or on the host."""
+    base = {"off": OffPolicyConfig, "on": RolloutConfig}[kind]
+    agent_of = {"off": rejeu.OffPolicyAgent, "on": rejeu.OnPolicyAgent}[kind]
+    fields = {"__annotations__": {"name": ClassVar[str]}, "name": "Listener", "__module__": __name__}
+    config = dataclasses.dataclass(frozen=True, kw_only=True)(type("Config", (base,), fields))
+    cls = type("Listener", (agent_of,), {"algorithm": SimpleNamespace(Config=config, make=listener)})
+    agent = cls("MlpPolicy", rejeu.make_vector("jax/Pendulum-v1", 1), seed=0, **settings)
+    agent.on_device = on_device
+    return agent
+
+
+CALLS = [(8, True, 0, 8), (12, False, 8, 20), (8, True, 0, 8), (4, False, 8, 12)]
+"""Steps to take, whether counters are reset, and by the rule of Stable-Baselines3 the steps before and in total."""
+
+
+@pytest.mark.parametrize("on_device", [False, True], ids=["host", "device"])
+def test_off_policy_loops_tell_actions_updates_and_weights_how_far_the_run_is(on_device):
+    """In the first ``learn`` and in later ones, with counters reset or not. Beta is 0 in the first half of a run."""
+    half = PriorityConfig(beta=lambda progress: jnp.where(jnp.asarray(progress) > 0.5, 1.0, 0.0))
+    settings = {"learning_starts": 0, "batch_size": 16, "buffer_size": 100, "priorities": half}
+    agent = listening("off", on_device, **settings)
+    updates, acted = [], []
+    for n_steps, reset, before, total in CALLS:
+        agent.learn(n_steps, reset_num_timesteps=reset)
+        taken = before + np.arange(n_steps)
+        acted += [*(taken / total)]
+        updates += [*((taken + 1) / total)]
+    assert agent.stops is not None if on_device else agent.stops is None
+    heard = agent.state
+    n = int(heard.n)
+    n_missing = len(updates) - n  # nothing can be drawn in the first turn
+    assert n_missing <= 1
+    np.testing.assert_allclose(heard.updates[:n], updates[n_missing:], rtol=1e-6)
+    actions = agent.replay_buffer.arrays()["action"].ravel()[: len(acted)]
+    first = np.cumsum([0, *(call[0] for call in CALLS[:-1])])  # chosen at the end of the call before
+    later = np.setdiff1d(np.arange(len(acted)), first[1:])
+    np.testing.assert_allclose(actions[later], np.array(acted)[later], rtol=1e-6)
+    expected = np.array(updates[n_missing:]) > 0.5
+    assert not np.array(heard.weighed[:n])[~expected].any()
+    assert np.array(heard.weighed[:n])[expected][3:].all()
+
+
+@pytest.mark.parametrize("on_device", [False, True], ids=["host", "device"])
+def test_on_policy_loops_tell_actions_and_updates_how_far_the_run_is(on_device):
+    agent = listening("on", on_device, n_steps=4)
+    updates, acted = [], []
+    for n_steps, reset, before, total in CALLS:
+        agent.learn(n_steps, reset_num_timesteps=reset)
+        ends = before + np.arange(4, n_steps + 1, 4)
+        updates += [*(ends / total)]
+        acted += [*((ends - 1) / total)]
+    assert agent.stops is not None if on_device else agent.stops is None
+    n = int(agent.state.n)
+    np.testing.assert_allclose(agent.state.updates[:n], updates, rtol=1e-6)
+    np.testing.assert_allclose(agent.state.acted[:n], acted, rtol=1e-6)
