@@ -4,8 +4,8 @@
 
 In *maze*, moves into walls are invalid: they take a step and lead nowhere. The observation holds the cell and the walls around
 it, so masks tell the agent nothing that it does not see. In *doors*, a sign at the start says which of two doors at the end is
-the right one, and on the way there only two of eight actions are valid in each step, others at each step, which the observation
-shows. Without memory the right door can only be guessed.
+the right one. On the way there only two of eight actions are valid, others at each step, which the observation shows. Without
+memory the right door can only be guessed.
 
 Hyperparameters are the same with and without masks, and were not tuned. Results go to
 ``benchmarks/results/invalid_actions.json``: by task and agent, the mean return of 200 episodes of the deterministic policy

@@ -203,6 +203,13 @@ class Normalizer(NamedTuple):
         return normalized, after
 
 
+def normalizer_of(leaves: tuple[Leaf, ...], config: NormalizationConfig, gamma: float = 1.0) -> Normalizer:
+    """Returns what normalizes observations of these leaves, and rewards."""
+    indices = groups(leaves)
+    shapes = {g: leaf.shape for g, leaf in zip(indices, leaves, strict=True) if g is not None}
+    return Normalizer(indices, shapes, config, gamma)
+
+
 def normalized(
     algorithm: Algorithm,
     explorer: Explorer,
@@ -219,9 +226,7 @@ def normalized(
         config: what is normalized.
         gamma: the discount factor of n-step returns, each of whose rewards is clipped separately.
     """
-    indices = groups(leaves)
-    shapes = {g: leaf.shape for g, leaf in zip(indices, leaves, strict=True) if g is not None}
-    normalizer = Normalizer(indices, shapes, config, gamma)
+    normalizer = normalizer_of(leaves, config, gamma)
 
     def update(state: State, batch: Any, clock: Clock) -> tuple[State, Metrics]:
         if isinstance(batch, Rollout):

@@ -20,6 +20,7 @@ import numpy as np
 
 from rejeu import devices, hardware, spaces, validation, xla
 from rejeu.algorithms import config as configs, contract
+from rejeu.algorithms.rnd import with_rnd
 from rejeu.callbacks.base import Stateful
 from rejeu.core import Algorithm, Masked
 from rejeu.envs.make import Backend, VectorEnv
@@ -245,6 +246,8 @@ class BaseAgent(ABC):
         """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
         made = self.algorithm.make(config, self.observation_space, self.action_space)
         algorithm = contract.checked(made, self.action_space)
+        if config.rnd is not None:
+            algorithm = with_rnd(algorithm, self.obs_leaves, config.rnd)
         if config.normalize is None:
             return algorithm
         explorer = exploration.make(algorithm, self.make_noise())

@@ -44,6 +44,32 @@ NAMED: Mapping[str, Mapping[str, Any]] = {"encoder": ENCODERS, "goal_selection_s
 """Settings that a registered name may stand for, and what is registered."""
 
 
+@dataclass(frozen=True)
+class RndConfig:
+    """Settings of random network distillation; see :mod:`rejeu.algorithms.rnd`."""
+
+    coefficient: float = 1.0
+    """Weight of the bonus, whose standard deviation is 1, in the unit of rewards. A larger value explores more."""
+    learning_rate: float = 1e-4
+    """Step size of the predictor. A larger value makes the bonus of an observation vanish faster."""
+    n_features: int = 64
+    """Outputs that are predicted."""
+    batch_size: int = 256
+    """Observations per gradient step of the predictor, if a batch or a rollout has more."""
+
+    def __post_init__(self) -> None:
+        coerce(self, "coefficient", number, above=0)
+        coerce(self, "learning_rate", number, least=0)
+        coerce(self, ("n_features", "batch_size"), whole, least=1)
+
+    @classmethod
+    def parse(cls, key: str, value: Any) -> RndConfig | None:
+        """Returns the settings that a weight, a dict or None stands for; None for the weight 0."""
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            value = {"coefficient": value} if value else None
+        return None if value is None else nested(key, value, cls)
+
+
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfig:
     """The hyperparameters of every algorithm. Abstract."""
@@ -64,6 +90,9 @@ class AlgorithmConfig:
     action_masks: bool = False
     """Take masks of the allowed actions from the environment (``info["action_mask"]`` or ``action_masks()``) and choose
     among these only. For Discrete actions; PPO, A2C, TRPO and RecurrentPPO take MultiDiscrete and MultiBinary too."""
+    rnd: RndConfig | None = None
+    """Adds a bonus for new observations to the rewards that are learned from (random network distillation, arXiv
+    1810.12894): its weight such as 0.5, or a dict with ``coefficient``, ``learning_rate``, ``n_features``, ``batch_size``."""
     optimizer: Any = "adam"
     """``"adam"``, ``"adamw"``, ``"nadam"``, ``"radam"``, ``"amsgrad"``, ``"lion"``, ``"rmsprop"``, ``"sgd"``, a dict of
     such a name and settings (``{"name": "adamw", "weight_decay": 0.01}``), an Optax optimizer such as ``optax.lamb``, or
@@ -97,6 +126,7 @@ class AlgorithmConfig:
         assign(self, normalize=normalization.parse(self.normalize))
         coerce(self, "nonfinite", choice, among=("stop", "skip"))
         coerce(self, "policy_kwargs", nested, kind=self.policy_kwargs_class)
+        coerce(self, "rnd", RndConfig.parse)
         coerce(self, "action_masks", flag)
         if self.action_masks and not self.can_mask:
             raise ValueError(

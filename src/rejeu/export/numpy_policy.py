@@ -46,7 +46,7 @@ class NumpyPolicy:
         self.action_space = spaces.rebuild(header["action_space"], largest)
         self._leaves = spaces.leaves(self.observation_space)
         is_normalized = config.get("normalize") is not None
-        self._arrays = {key.removeprefix("learner."): array for key, array in arrays.items()}
+        self._arrays = {key.rpartition("learner.")[2]: array for key, array in arrays.items()}
         scaled = self._normalizations(config["normalize"]) if is_normalized else [None] * len(self._leaves)
         self._encoders = [encoder(leaf, scale) for leaf, scale in zip(self._leaves, scaled, strict=True)]
         self._shape = config["policy_kwargs"]
@@ -256,7 +256,7 @@ def load_policy(path: str | Path) -> NumpyPolicy:
     with checkpoint.opened(model, "agent") as file:
         name = file.header.get("algorithm")
         prefix = ACTORS.get(name) if isinstance(name, str) else None
-        prefixes = [f"{before}{prefix}." for before in ("", "learner.")]
+        prefixes = [f"{before}{prefix}." for before in ("", "learner.", "learner.learner.")]
         if prefix is None or any(key.startswith(f"{one}encoder.") for one in prefixes for key in file.specs):
             raise CheckpointError(
                 f"{file.path}: the policy of {str(name)[:40]} has images, memory or modules of your own, which NumPy cannot "
