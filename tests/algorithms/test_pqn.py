@@ -367,10 +367,12 @@ def test_values_for_another_number_of_environments_are_warned_of(n_envs, setting
         agent.learn(n_envs)
 
 
+# With a constant learning rate of 5e-4, one of these seeds ended at 103 with one environment and two with four.
 @pytest.mark.slow
-def test_the_defaults_learn_with_one_environment():
-    agent = rejeu.PQN("MlpPolicy", "jax/CartPole-v1", seed=0).learn(60_000)
-    assert agent.evaluate(20, seed=1).mean_return > 400
+@pytest.mark.parametrize("n_envs", [1, 4, 8])
+def test_the_defaults_learn_with_few_environments_on_every_seed(n_envs):
+    agents = rejeu.train_seeds(rejeu.PQN, "MlpPolicy", "jax/CartPole-v1", 100_000, seeds=range(100, 106), n_envs=n_envs)
+    assert min(agent.evaluate(20, seed=1).mean_return for agent in agents) > 475
 
 
 # In one program.

@@ -38,7 +38,7 @@ from rejeu.algorithms.search import SearchSpace
 from rejeu.core import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
 from rejeu.networks import Network, PolicyConfig, Widths
 from rejeu.prng import nth
-from rejeu.schedules import Schedule, at
+from rejeu.schedules import Linear, Schedule, at
 from rejeu.spaces import check_discrete_action
 from rejeu.validation import assign, coerce, number, whole
 
@@ -79,7 +79,9 @@ class NormalizedConfig(PolicyConfig):
 class Config(RolloutConfig):
     """Hyperparameters of PQN; the defaults are for 1 to 8 environments, :data:`FOR_MANY` for about 128."""
 
-    learning_rate: float | Schedule = 5e-4
+    learning_rate: float | Schedule = Linear(1e-3, 0.0)
+    """Step size of the optimizer. It falls to 0: with a constant one the last weights may be bad ones, since no target network
+    slows down the changes of the policy."""
     n_steps: int = 128
     """Steps of each environment between two updates. A larger number bootstraps later and updates less often."""
     batch_size: int = 32
