@@ -19,6 +19,7 @@ import shlex
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -38,7 +39,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     env = make_vector(preset.env_id, preset.n_envs, backend, seed, **arguments.env)
     nested = "Dict" in type(env.observation_space).__name__
     agent = rejeu.AGENTS[preset.algorithm](
-        "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **preset.hyperparameters
+        "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **settings_of(preset, arguments)
     )
     callback = None
     if arguments.best:
@@ -75,6 +76,10 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     }
 
 
+def settings_of(preset: presets.Preset, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {**preset.hyperparameters, **arguments.set}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env_id")
@@ -85,6 +90,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--backend")
     parser.add_argument("--env", type=json.loads, default={}, help="arguments of the environment, as JSON")
+    parser.add_argument("--set", type=json.loads, default={}, help="hyperparameters other than the preset's, as JSON")
     parser.add_argument("--best", action="store_true", help="evaluate the best weights by evaluations on the way")
     parser.add_argument("--name", help="of the result file")
     arguments = parser.parse_args()
@@ -103,7 +109,7 @@ def main() -> None:
             **{name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool")},
         },
         "hyperparameters": configs.to_json(
-            validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, preset.hyperparameters)
+            validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, settings_of(preset, arguments))
         ),
         "n_envs": preset.n_envs,
         "runs": runs,
