@@ -106,6 +106,10 @@ def test_a_leaderboard_in_french(folder, tmp_path):
     assert "| place | modèle | algorithme | pas | graine | retour moyen |" in text
     assert "| 1 à 2 | anna | DQN | 0 | 0 |" in text
     assert "il a été entraîné sur MountainCar-v0, et non sur CartPole-v1" in text
+    broken = "le fichier est endommagé, ou ce n'est pas un modèle que rejeu peut évaluer"
+    assert [line.split(": ")[1] for line in text.splitlines() if line.startswith(("- cut", "- empty", "- flip"))] == (
+        [broken] * 3
+    )
     pytest.importorskip("jinja2")
     run(folder, tmp_path / "board.html", "--language", "fr")
     assert '<html lang="fr">' in (tmp_path / "board.html").read_text(encoding="utf-8")
@@ -154,6 +158,18 @@ def test_large_files_and_symbolic_links_are_not_opened(tmp_path, monkeypatch, ca
     assert [model["name"] for model in board["models"]] == ["small"]
     assert [one["name"] for one in board["not_evaluated"]] == ["large"]
     assert "MiB at most" in board["not_evaluated"][0]["reason"]
+    run(tmp_path, tmp_path / "board.md", "--language", "fr")
+    assert "- large: le fichier a 0 Mio, au lieu de 0 Mio au plus" in (tmp_path / "board.md").read_text("utf-8")
+
+
+def test_a_model_whose_spaces_are_not_those_of_its_environment_is_not_ranked(tmp_path):
+    agent = rejeu.DQN("MlpPolicy", "Acrobot-v1", policy_kwargs={"net_arch": [8]}, seed=0)
+    agent.run.env.env_id = "CartPole-v1"
+    agent.save(tmp_path / "other")
+    for language, reason in (("en", "(6,)"), ("fr", "ses observations ou ses actions ne sont pas celles de CartPole")):
+        run(tmp_path, tmp_path / "board.json", "--language", language)
+        (problem,) = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))["not_evaluated"]
+        assert reason in problem["reason"]
 
 
 def test_json_is_all_of_standard_output(folder, tmp_path, capsys):

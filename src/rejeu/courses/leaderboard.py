@@ -124,16 +124,17 @@ def usual_env_id(paths: Sequence[Path]) -> str:
     return ids.most_common(1)[0][0]
 
 
-def header(path: Path) -> dict[str, Any]:
+def header(path: Path, language: Language = "en") -> dict[str, Any]:
     """Returns the header of a model file.
 
     Raises:
-        ValueError: if the file is too large or damaged.
+        Unranked: if the file is too large.
+        ValueError: if it is damaged.
         OSError: if it cannot be read.
     """
     size = path.stat().st_size
     if size > MAX_BYTES:
-        raise ValueError(f"the file has {size / 2**20:,.0f} MiB, expected {MAX_BYTES >> 20} MiB at most")
+        raise Unranked(texts()[language]["large"].format(size=size / 2**20, most=MAX_BYTES >> 20))
     return dict(checkpoint.read_header(path, "agent"))
 
 
@@ -173,7 +174,7 @@ def build(
         for path in paths[:MAX_MODELS]:
             name = shown(path.relative_to(folder).with_suffix("").as_posix())
             try:
-                model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, said)
+                model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, language)
             except Unranked as error:
                 reason = str(error)
             except PROBLEMS as error:
@@ -188,7 +189,7 @@ def build(
     return Leaderboard(env_id, episodes, ranked(done), tuple(problems), language)
 
 
-class Unranked(Exception):
+class Unranked(ValueError):
     """A model cannot be ranked; the message says why, in the language of the leaderboard."""
 
 
@@ -201,20 +202,24 @@ def evaluated(
     seed: int,
     seconds: float,
     success_threshold: float | None,
-    said: Mapping[str, Any],
+    language: Language,
 ) -> Model:
     """Returns a model with its evaluation.
 
     Raises:
-        Unranked: if it is of another environment, takes too long, or has returns that are not finite.
+        Unranked: if it is too large or of another environment, takes too long, or has returns that are not finite.
         ValueError: if it is damaged.
     """
-    trained_on = header(path).get("env_id")
+    said = texts()[language]
+    trained_on = header(path, language).get("env_id")
     if trained_on != env_id:
         raise Unranked(said["other_env"].format(said=shown(trained_on), env_id=env_id))
     end = time.perf_counter() + seconds
     agent = load(path)
-    agent.check_spaces(env, env_id)
+    try:
+        agent.check_spaces(env, env_id)
+    except ValueError as error:
+        raise Unranked(said["spaces"].format(env_id=env_id, reason=error)) from None
     choose = policy(agent, deterministic=True)
 
     def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
