@@ -52,6 +52,9 @@ class Preset:
     """Episodes of each evaluation."""
     backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async|jax)$")] = "auto"
     """Backend of the environments, as for ``make_vector``."""
+    success_threshold: float | None = None
+    """Least return of a successful episode where the environment does not report success; None: its reward threshold.
+    Evaluations are ranked by success first, so a threshold that good policies miss half of the time ranks by luck."""
     source: Annotated[str, Meta(max_length=1000)] = ""
     """Origin of the hyperparameters."""
 
