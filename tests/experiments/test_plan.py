@@ -125,6 +125,13 @@ def test_a_mistake_is_one_line_with_its_place(tmp_path, old, new, place, problem
     assert "\n" not in message
 
 
+def test_a_mistake_at_the_end_of_a_plan_is_found_before_any_agent_is_built(monkeypatch):
+    monkeypatch.setattr(rejeu.agents.Agent, "build", lambda *_: pytest.fail("an agent was built"))
+    settings = {f"s{i}": {"learning_rate": 1e-4 * (i + 1)} for i in range(300)} | {"last": {"gama": 0.9}}
+    with pytest.raises(PlanError, match=r"settings\.last: DQN has no setting 'gama'"):
+        read_plan({"environments": ["CartPole-v1"], "algorithms": ["DQN"], "settings": settings})
+
+
 def test_a_mistake_in_a_dict_is_named_by_its_path():
     with pytest.raises(PlanError, match=r"plan, settings\.a: PPO has no setting 'gama'; did you mean gamma"):
         read_plan({"environments": ["CartPole-v1"], "algorithms": ["PPO"], "settings": {"a": {"gama": 1}}})

@@ -144,7 +144,9 @@ def make_config(
         device=devices.named(arguments.device, "--device"),
         steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
         minutes=arguments.minutes,
-        success_threshold=base.success_threshold if arguments.success_threshold is None else arguments.success_threshold,
+        success_threshold=base.success_threshold
+        if arguments.success_threshold is None
+        else arguments.success_threshold,
         video_every=arguments.video_every,
         evaluate_every=arguments.evaluate_every or base.evaluate_every,
         evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,

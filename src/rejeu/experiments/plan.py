@@ -173,10 +173,15 @@ def parse(content: Mapping[str, Any], plan: str) -> Plan:
 def expanded(
     environments: list[Environment], settings: Mapping[str, Kwargs], seeds: list[int], plan: str
 ) -> Iterator[Job]:
-    """Yields the job of each combination, after its hyperparameters were checked."""
+    """Yields the job of each combination, after all values were checked, and then that each agent can be built.
+
+    Values take little time, so that a mistake at the end of a long plan is found at once.
+    """
+    checked = []
     for environment in environments:
         for algorithm, (name, setting) in itertools.product(environment.algorithms, settings.items()):
-            with at(plan, *(("settings", name) if setting else ("environments", environment.label))):
+            place = ("settings", name) if setting else ("environments", environment.label)
+            with at(plan, *place):
                 if "algorithms" in setting and algorithm not in read_algorithms(setting["algorithms"]):
                     continue
                 own = convert(setting.get(str(algorithm), {}), Kwargs)
@@ -185,11 +190,15 @@ def expanded(
                 chosen = algorithm or choose_algorithm(preset, environment.run.env, environment.action)
                 common = {key: value for key, value in setting.items() if key != "algorithms" and key not in AGENTS}
                 base = preset or presets.default(environment.run.env, chosen)
-                check_hyperparameters(environment, chosen, base.hyperparameters, {**common, **own})
-            run = replace(environment.run, algorithm=chosen, hyperparameters=dict(flat({**common, **own})))
-            for seed in seeds:
-                job = job_name(environment.label, chosen, name, seed)
-                yield Job(name=job, run=replace(run, seed=seed), setting=name, **environment.files)
+                config = read_hyperparameters(chosen, base.hyperparameters, {**common, **own})
+            checked.append((environment, place, name, config, {**common, **own}))
+    for environment, place, name, config, given in checked:
+        with at(plan, *place):
+            check_spaces(environment, config)
+        run = replace(environment.run, algorithm=config.name, hyperparameters=dict(flat(given)))
+        for seed in seeds:
+            job = job_name(environment.label, config.name, name, seed)
+            yield Job(name=job, run=replace(run, seed=seed), setting=name, **environment.files)
 
 
 def read_run(env_id: str, kwargs: Kwargs, given: Kwargs) -> tuple[RunConfig, dict[str, bool]]:
@@ -287,17 +296,24 @@ def find_spaces(run: RunConfig) -> tuple[gym.Space, gym.Space]:
         env.close()
 
 
-def check_hyperparameters(
-    environment: Environment, algorithm: str, base: Mapping[str, Any], given: Mapping[str, Any]
-) -> None:
-    """Builds the algorithm with ``base`` and the given values for the environment's spaces, as ``rejeu train`` would.
+def read_hyperparameters(algorithm: str, base: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+    """Returns the configuration of an algorithm from ``base`` and the given values, as ``rejeu train`` would.
 
     Raises:
-        ValueError, TypeError: for an unknown or invalid hyperparameter, or if the algorithm does not take such spaces.
+        ValueError, TypeError: for an unknown or invalid hyperparameter.
     """
-    kind = AGENTS[algorithm]
-    check_names(given, field_names(kind.algorithm.Config), algorithm)
-    config = build(kind.algorithm.Config, merged(dict(flat(given)), base))
+    config = AGENTS[algorithm].algorithm.Config
+    check_names(given, field_names(config), algorithm)
+    return build(config, merged(dict(flat(given)), base))
+
+
+def check_spaces(environment: Environment, config: Any) -> None:
+    """Builds the algorithm for the spaces of an environment.
+
+    Raises:
+        ValueError, TypeError: if it does not take such spaces.
+    """
+    kind = AGENTS[config.name]
     nested = isinstance(environment.observation, gym.spaces.Dict | gym.spaces.Tuple)
     agent = kind.__new__(kind)
     agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, seed=0)
