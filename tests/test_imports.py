@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 import rejeu
 
 
@@ -24,6 +26,29 @@ print(json.dumps({"loaded": sorted(sys.modules), "ids": [i for i in gymnasium.re
     assert found["ids"] == ["rejeu/Ball-v0", "rejeu/CartPoleNoVelocity-v0"]
     loaded = set(found["loaded"])
     assert not loaded & {"jax", "equinox", "optax", "scipy", "rich", "envpool", "rejeu.agents"}
+
+
+@pytest.mark.exhaustive
+def test_training_in_gymnasium_imports_neither_envpool_nor_scipy_stats(tmp_path):
+    arguments = [
+        "train",
+        "CartPole-v1",
+        "--steps",
+        "16",
+        "--backend",
+        "gymnasium",
+        "--algo",
+        "dqn",
+        "--evaluate-episodes",
+        "1",
+    ]
+    program = f"""
+import sys
+from rejeu.cli import main
+main({[*arguments, "--out", str(tmp_path / "run")]!r})
+print({{"envpool", "scipy.stats"}} & {{*sys.modules}} or "none")
+"""
+    assert fresh(program).splitlines()[-1] == "none"
 
 
 def test_every_public_name_can_be_imported():

@@ -37,6 +37,11 @@ def test_the_site_builds_without_warnings(site):
 
 
 @pytest.mark.exhaustive
+def test_the_search_finds_her_although_english_stops_at_the_word(site):
+    assert re.search(r'"?\bher"?:', (site / "searchindex.js").read_text(encoding="utf-8"))
+
+
+@pytest.mark.exhaustive
 def test_pages_load_nothing_from_the_network(site):
     for page in site.rglob("*.html"):
         for script, link in LOADED.findall(page.read_text(encoding="utf-8")):

@@ -386,7 +386,7 @@ def load_zip(path: str | Path, env: Any = None, vecnormalize: str | Path | None 
 
     Args:
         path: of the file; ``.zip`` is added if it has no suffix.
-        env: environments to continue training in, as for :meth:`rejeu.Agent.load`; None for an agent that only predicts.
+        env: environments to continue training in, as for ``load`` of its class; None for an agent that only predicts.
         vecnormalize: the file of the ``VecNormalize`` that the policy was trained behind. The agent normalizes by its
             statistics and takes raw observations.
         changes: constructor arguments and hyperparameters that replace those of the file.
