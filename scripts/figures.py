@@ -204,6 +204,7 @@ def supported(algorithm: str) -> str:
         "images": spaces.Box(0, 255, (36, 36, 3), np.uint8),
         "Dict and Tuple": spaces.Dict({"a": spaces.Tuple([box, spaces.Discrete(2)]), "b": box}),
     }
+    actions["Dict and Tuple"] = spaces.Dict({"a": spaces.Tuple([box, spaces.Discrete(2)]), "b": box})
     possible = [name for name, space in actions.items() if can_make(agent, config, box, space)]
     readable = [name for name, space in observations.items() if can_make(agent, config, space, actions[possible[0]])]
     is_off_policy = "replay_buffer_class" in fields

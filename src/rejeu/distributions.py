@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
@@ -175,6 +176,60 @@ class Bernoulli(NamedTuple):
         zero = jax.nn.log_sigmoid(-self.logits) - jax.nn.log_sigmoid(-other.logits)
         share = jax.nn.sigmoid(self.logits)
         return jnp.sum(share * one + (1.0 - share) * zero, axis=-1)
+
+
+class Joint(NamedTuple):
+    """Independent parts of one action; a value is the values of the parts one after the other, ``float32 (..., width)``."""
+
+    parts: tuple[Any, ...]
+    """Distributions of the same leading shape."""
+
+    def sample(self, key: Array) -> Array:
+        """Returns one sample, ``float32 (..., width)``."""
+        keys = jax.random.split(key, len(self.parts))
+        return self.joined([part.sample(keys[i]) for i, part in enumerate(self.parts)])
+
+    def log_prob(self, value: Array) -> Array:
+        """Returns the log-probability of ``value``, ``(...)``, the sum over the parts, in nats."""
+        ends = np.cumsum([width(part) for part in self.parts])[:-1].tolist()
+        pairs = zip(self.parts, jnp.split(value, ends, axis=-1), strict=True)
+        return sum_of([part.log_prob(x[..., 0] if isinstance(part, Categorical) else x) for part, x in pairs])
+
+    def entropy(self) -> Array:
+        """Returns the entropy, ``(...)``, the sum over the parts, in nats."""
+        return sum_of([part.entropy() for part in self.parts])
+
+    def mode(self) -> Array:
+        """Returns the most likely value, ``float32 (..., width)``."""
+        return self.joined([part.mode() for part in self.parts])
+
+    def kl_divergence(self, other: Joint) -> Array:
+        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
+        return sum_of([own.kl_divergence(theirs) for own, theirs in zip(self.parts, other.parts, strict=True)])
+
+    def joined(self, values: list[Array]) -> Array:
+        """Returns values of the parts as one, ``float32 (..., width)``."""
+        pairs = zip(self.parts, values, strict=True)
+        columns = [x[..., None] if isinstance(part, Categorical) else x for part, x in pairs]
+        return jnp.concatenate([column.astype(jnp.float32) for column in columns], axis=-1)
+
+
+def width(distribution: Any) -> int:
+    """Returns the numbers of a value of a distribution."""
+    if isinstance(distribution, Joint):
+        return sum(map(width, distribution.parts))
+    if isinstance(distribution, Categorical):
+        return 1
+    if isinstance(distribution, MultiCategorical):
+        return len(distribution.parts)
+    return int(distribution[0].shape[-1])
+
+
+def is_squashed(distribution: Any) -> bool:
+    """Returns whether a distribution has no entropy in closed form, because it or a part of it is a :class:`TanhNormal`."""
+    if isinstance(distribution, Joint):
+        return any(map(is_squashed, distribution.parts))
+    return isinstance(distribution, TanhNormal)
 
 
 def forbid(values: Array, mask: Array | None) -> Array:

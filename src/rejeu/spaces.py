@@ -246,6 +246,8 @@ def check_discrete_action(space: spaces.Space, algorithm: str) -> int:
 def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
     """Returns ``space`` if a stochastic policy can act in it: a Box with an axis, Discrete, MultiDiscrete, MultiBinary.
 
+    Or any nesting of Dict and Tuple of these.
+
     Raises:
         ValueError: otherwise, naming what to do instead.
     """
@@ -257,10 +259,13 @@ def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
             raise ValueError(
                 f"every action bound must satisfy low < high, got low={space.low.tolist()}, high={space.high.tolist()}"
             )
+    elif isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
+        for part in members(space):
+            check_action(part, algorithm)
     elif not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         raise ValueError(
-            f"{algorithm} needs a Box, Discrete, MultiDiscrete or MultiBinary action space, got {space}; wrap the "
-            "environment in a gymnasium.ActionWrapper"
+            f"{algorithm} needs a Box, Discrete, MultiDiscrete or MultiBinary action space, or a Dict or Tuple of these, "
+            f"got {space}; wrap the environment in a gymnasium.ActionWrapper"
         )
     return space
 
@@ -278,12 +283,50 @@ def action_dimension(space: spaces.Box) -> int:
     return int(np.prod(space.shape, dtype=int))
 
 
+def members(space: spaces.Dict | spaces.Tuple) -> list[spaces.Space]:
+    """Returns the spaces of a Dict or Tuple, in the order of the numbers of an algorithm's action."""
+    return [space.spaces[key] for key in _keys(space)]
+
+
+def _keys(space: spaces.Dict | spaces.Tuple) -> list[Any]:
+    return sorted(space.spaces) if isinstance(space, spaces.Dict) else [*range(len(space.spaces))]
+
+
+def action_width(space: spaces.Space) -> int:
+    """Returns the length of an algorithm's action: one number for each component, choice or bit."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return sum(map(action_width, members(space)))
+    return int(np.prod(space.shape or (), dtype=int))
+
+
+def nested_action(space: spaces.Dict | spaces.Tuple, action: Any, scale: Callable[[spaces.Space, Any], Any]) -> Any:
+    """Returns actions ``(batch, action_width)`` of a Dict or Tuple as one, each part by ``scale(part's space, numbers)``.
+
+    The arrays are of NumPy or of JAX.
+    """
+    found, begin = list[Any](), 0
+    for part in members(space):
+        numbers = action[:, begin : begin + action_width(part)]
+        begin += action_width(part)
+        found.append(scale(part, numbers[:, 0] if isinstance(part, spaces.Discrete) else numbers))
+    return dict(zip(_keys(space), found, strict=True)) if isinstance(space, spaces.Dict) else tuple(found)
+
+
+def rows(action: Any) -> Any:
+    """Returns a batch of actions as a sequence of single ones: an array as it is, of a Dict or Tuple a list."""
+    if isinstance(action, dict):
+        parts = zip(*map(rows, action.values()), strict=True)
+        return [dict(zip(action, part, strict=True)) for part in parts]
+    return [*zip(*map(rows, action), strict=True)] if isinstance(action, tuple) else action
+
+
 def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     """Returns actions in the range of the environment from those of an algorithm.
 
     Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; actions are clipped, and components
     without finite bounds are not scaled. Of a Box of integers, each number from low to high gets an equal part of [-1, 1].
-    Discrete and MultiDiscrete: from 0 to n - 1 to the numbers of the space. MultiBinary: the bits.
+    Discrete and MultiDiscrete: from 0 to n - 1 to the numbers of the space. MultiBinary: the bits. Dict and Tuple: from the
+    numbers of all parts, ``float32 (batch, action_width)``, to a dict or tuple of the parts' arrays.
     """
     return action_scaler(space)(action)
 
@@ -315,6 +358,8 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
     if isinstance(space, spaces.MultiBinary):
         shape, dtype = (-1, *space.shape), space.dtype
         return lambda action: action.reshape(shape).astype(dtype)
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return lambda action: nested_action(space, action, scale_action)
     raise TypeError(f"cannot scale actions of {space}")
 
 
@@ -353,6 +398,9 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator, mask: n
         return rng.integers(space.nvec.ravel(), size=(n, space.nvec.size), dtype=np.int32)
     if isinstance(space, spaces.MultiBinary):
         return rng.integers(2, size=(n, int(np.prod(space.shape))), dtype=np.int32)
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = [random_action(part, n, rng).reshape(n, -1) for part in members(space)]
+        return np.concatenate(parts, axis=-1).astype(np.float32)
     raise TypeError(f"cannot draw random actions of {space}")
 
 

@@ -130,7 +130,8 @@ class Agent(BaseAgent):
         with devices.chosen(self.device):
             action, memory = policy.act(self, batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
-        return (scaled[0] if single else scaled), state if memory is None else memory
+        scaled = jax.tree.map(lambda part: part[0], scaled) if single else scaled
+        return scaled, state if memory is None else memory
 
     def evaluate(
         self,

@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import gymnasium as gym
 import jax
 import numpy as np
 
@@ -95,6 +96,8 @@ def export(
     path = Path(path)
     target = target_of(path, to)
     path = path if path.suffix else path.with_suffix(SUFFIXES[target])
+    if isinstance(agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
+        raise ValueError("policies with Dict or Tuple actions cannot be exported; load the model with rejeu.load")
     if target == "web" and noise:
         raise ValueError("noise=True: a page contains the deterministic policy; leave it out")
     if target in ("c", "web"):

@@ -252,9 +252,8 @@ def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.n
     """
     rest = ~active
     kept = jax.tree.map(lambda leaf: leaf[rest], before)
-    action = np.array(action)
-    action[rest] = action[np.argmax(active)]
-    step = step_all(action)
+    of_active = lambda part: np.where(active.reshape(-1, *[1] * (part.ndim - 1)), part, part[np.argmax(active)])  # noqa: E731
+    step = step_all(jax.tree.map(of_active, action))
     reward = np.where(active, step.reward, np.float32(0.0))
     terminated, truncated = step.terminated & active, step.truncated & active
     return step._replace(obs=replaced(step.obs, rest, kept), reward=reward, terminated=terminated, truncated=truncated)

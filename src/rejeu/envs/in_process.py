@@ -15,7 +15,7 @@ from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.validation import convert_step
 from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import leaves, structure
+from rejeu.spaces import leaves, rows, structure
 
 
 class InProcess(VectorEnv):
@@ -98,6 +98,7 @@ class InProcess(VectorEnv):
         truncated = np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
+        action = rows(action)
         for i in range(self.n_envs) if which is None else which:
             answer = self.envs[i].step(action[i])
             try:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, MultiBinary, MultiDiscrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from rejeu import spaces
 from rejeu.errors import CheckpointError
@@ -229,6 +229,8 @@ def chooser(space: Any, is_squashed: bool) -> Function:
     if isinstance(space, MultiDiscrete):
         ends = np.cumsum(space.nvec.ravel())[:-1]
         return lambda x: np.stack([part.argmax(axis=-1) for part in np.split(x, ends, axis=-1)], axis=-1)
+    if not isinstance(space, Discrete):
+        raise ValueError("Dict or Tuple actions")
     return lambda x: x.argmax(axis=-1)
 
 

@@ -184,7 +184,14 @@ TWINS = {
 }
 """Environments in JAX that are equal to another environment, whose presets they have."""
 
-ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", "MultiDiscrete": "PPO", "MultiBinary": "PPO"}
+ALGORITHM_FOR = {
+    "Box": "SAC",
+    "Discrete": "DQN",
+    "MultiDiscrete": "PPO",
+    "MultiBinary": "PPO",
+    "Dict": "PPO",
+    "Tuple": "PPO",
+}
 """The default algorithm of an environment without a preset, by the class of its action space."""
 
 

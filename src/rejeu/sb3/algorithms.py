@@ -453,7 +453,7 @@ class Original(Agent):
             )
             sampled = [self.action_space.sample(mask) for mask in each]
             action = np.asarray(sampled, action.dtype).reshape(np.shape(action))
-        return np.asarray(action), memory
+        return action if isinstance(action, dict | tuple) else np.asarray(action), memory
 
     def learn(
         self,

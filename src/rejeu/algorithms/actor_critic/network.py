@@ -15,9 +15,9 @@ from jax import Array
 from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig, OnPolicyConfig, check_value_rate
 from rejeu.algorithms.config import network_inputs
 from rejeu.core import Clock, Explorer, PyTree, unmasked
-from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, forbid
+from rejeu.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal, forbid
 from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
-from rejeu.spaces import Leaf, check_action
+from rejeu.spaces import Leaf, check_action, members
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
@@ -32,16 +32,43 @@ SDE_EPSILON = 1e-6
 class ActionKind(NamedTuple):
     """What a policy must give for an action space; static and hashable."""
 
-    kind: Literal["box", "categorical", "binary"]
+    kind: Literal["box", "categorical", "binary", "joint"]
     sizes: tuple[int, ...]
-    """Box: the number of components. Discrete and MultiDiscrete: possibilities of each choice. MultiBinary: the bits."""
+    """Box: the number of components. Discrete and MultiDiscrete: possibilities of each choice. MultiBinary: the bits.
+    Dict and Tuple: the outputs of each part."""
     single: bool
     """Whether an action is one choice without an axis (Discrete)."""
+    parts: tuple[ActionKind, ...] = ()
+    """Those of a Dict or Tuple."""
 
     @property
     def n_outputs(self) -> int:
         """Numbers that the policy's head gives, leaving out a standard deviation."""
         return sum(self.sizes)
+
+    @property
+    def n_stds(self) -> int:
+        """Standard deviations of an action: one for each component of a Box."""
+        return self.n_outputs if self.kind == "box" else sum(part.n_stds for part in self.parts)
+
+    def distribution(self, outputs: Array, log_std: Any, box: type[Normal] | type[TanhNormal]) -> Distribution:
+        """Returns the distribution of a head's ``outputs`` ``(batch, n_outputs)``.
+
+        ``log_std`` is broadcastable to ``(batch, n_stds)``, and ``box`` the distribution of Box actions.
+        """
+        if self.kind == "box":
+            return box(outputs, log_std)
+        if self.kind == "binary":
+            return Bernoulli(outputs)
+        if self.single:
+            return Categorical(outputs)
+        columns = jnp.split(outputs, np.cumsum(self.sizes)[:-1].tolist(), axis=-1)
+        if self.kind == "categorical":
+            return MultiCategorical(tuple(map(Categorical, columns)))
+        ends = np.cumsum([part.n_stds for part in self.parts])[:-1].tolist()
+        stds = [None] * len(columns) if log_std is None else jnp.split(log_std, ends, axis=-1)
+        triples = zip(self.parts, columns, stds, strict=True)
+        return Joint(tuple(part.distribution(column, std, box) for part, column, std in triples))
 
 
 def action_kind(space: spaces.Space) -> ActionKind:
@@ -52,6 +79,9 @@ def action_kind(space: spaces.Space) -> ActionKind:
         return ActionKind("categorical", (int(space.n),), True)
     if isinstance(space, spaces.MultiDiscrete):
         return ActionKind("categorical", tuple(int(n) for n in space.nvec.ravel()), False)
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = tuple(map(action_kind, members(space)))
+        return ActionKind("joint", tuple(part.n_outputs for part in parts), False, parts)
     assert isinstance(space, spaces.MultiBinary)
     return ActionKind("binary", (int(np.prod(space.shape, dtype=int)),), False)
 
@@ -70,7 +100,7 @@ def checked(
     return obs_leaves, action_kind(action_space), network_shape
 
 
-Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli
+Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli | Joint
 
 
 class ActorCritic(eqx.Module):
@@ -100,10 +130,10 @@ class ActorCritic(eqx.Module):
         """Draws the weights."""
         keys = jax.random.split(key, 6)
         widths, value_widths = shape.actor_widths(HIDDEN_LAYERS), shape.critic_widths(HIDDEN_LAYERS)
-        std = shape.state_dependent_std and action.kind == "box"
+        std = shape.state_dependent_std and action.n_stds > 0
         encoder = make_encoder(keys[0], leaves, shape)
         torso, n_hidden = make_torso(keys[1], encoder.n_features, None, widths, shape)
-        head = make_head(keys[2], n_hidden, action.n_outputs * (2 if std else 1), shape)
+        head = make_head(keys[2], n_hidden, action.n_outputs + std * action.n_stds, shape)
         value_encoder = None if shape.share_features_extractor else make_encoder(keys[3], leaves, shape)
         value_torso, n_value = (
             (None, n_hidden)
@@ -122,8 +152,8 @@ class ActorCritic(eqx.Module):
             head = eqx.tree_at(lambda linear: linear.bias, head, bias)
         self.encoder, self.torso, self.head = encoder, torso, head
         self.value_encoder, self.value_torso, self.value_head = value_encoder, value_torso, value_head
-        has_log_std = action.kind == "box" and not std
-        std_shape = (n_hidden, action.n_outputs) if use_sde else (action.n_outputs,)
+        has_log_std = action.n_stds > 0 and not std
+        std_shape = (n_hidden, action.n_stds) if use_sde else (action.n_stds,)
         self.log_std = jnp.full(std_shape, shape.log_std_init, jnp.float32) if has_log_std else None
         self.action, self.shape = action, shape
 
@@ -156,25 +186,17 @@ class ActorCritic(eqx.Module):
 
     def distribution(self, hidden: Array, mask: Array | None) -> Distribution:
         """Returns the distribution that the last hidden layer ``(batch, width)`` asks for."""
-        outputs = self.head(hidden)
-        if self.action.kind == "box":
-            if self.log_std is None:
-                outputs, log_std = jnp.split(outputs, 2, axis=-1)
-                log_std = jnp.clip(log_std, *LOG_STD_RANGE)
-            else:
-                log_std = (
-                    self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden, self.use_expln)
-                )
-                if not self.shape.learn_std:
-                    log_std = jax.lax.stop_gradient(log_std)
-            return (TanhNormal if self.shape.squash_output else Normal)(outputs, log_std)
-        outputs = forbid(outputs, mask)
-        if self.action.kind == "binary":
-            return Bernoulli(outputs)
-        if self.action.single:
-            return Categorical(outputs)
-        ends = np.cumsum(self.action.sizes)[:-1].tolist()
-        return MultiCategorical(tuple(Categorical(part) for part in jnp.split(outputs, ends, axis=-1)))
+        outputs, log_std = forbid(self.head(hidden), mask), None
+        if self.log_std is not None:
+            log_std = (
+                self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden, self.use_expln)
+            )
+            if not self.shape.learn_std:
+                log_std = jax.lax.stop_gradient(log_std)
+        elif self.action.n_stds:
+            outputs, log_std = jnp.split(outputs, [self.action.n_outputs], axis=-1)
+            log_std = jnp.clip(log_std, *LOG_STD_RANGE)
+        return self.action.distribution(outputs, log_std, TanhNormal if self.shape.squash_output else Normal)
 
 
 def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:

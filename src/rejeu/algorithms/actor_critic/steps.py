@@ -15,7 +15,7 @@ from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution, is_value
 from rejeu.core import PyTree, Rollout, clip, descend
-from rejeu.distributions import TanhNormal
+from rejeu.distributions import is_squashed
 from rejeu.schedules import at
 
 D = TypeVar("D")
@@ -68,7 +68,7 @@ def with_advantages(rollout: Rollout, gae_lambda: float, log_prob: Array, value:
 
 def entropy_of(distribution: Distribution, log_prob: Array) -> Array:
     """Returns the entropy, ``(batch,)``; of a squashed normal, which has none in closed form, its estimate -log pi."""
-    return -log_prob if isinstance(distribution, TanhNormal) else distribution.entropy()
+    return -log_prob if is_squashed(distribution) else distribution.entropy()  # type: ignore[union-attr]
 
 
 def clip_and_descend(

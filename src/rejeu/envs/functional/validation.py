@@ -37,7 +37,8 @@ def check(env: FunctionalEnv) -> None:
     if limit is not None:
         whole("max_episode_steps", limit.item() if isinstance(limit, np.generic) else limit, least=1)
     key = jax.eval_shape(lambda: jax.random.key(0))
-    action = jax.ShapeDtypeStruct(env.action_space.shape or (), narrow(env.action_space.dtype))
+    examples = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves(env.action_space)]
+    action = jax.tree.unflatten(structure(env.action_space), examples)
     said = f"{name}.reset"
     state, obs = _unpack(_traced(said, env.reset, key), said, ("state", "obs"))
     _check_obs(said, env.observation_space, obs)

@@ -174,7 +174,7 @@ class JaxVector(VectorEnv):
         self.n_envs = n_envs
         self.env_id = type(env).__name__ if env_id is None else env_id
         self.observation_space = env.observation_space
-        self.action_space = env.action_space
+        self.action_space, self._action_leaves = env.action_space, leaves(env.action_space)
         self.max_episode_steps = env.max_episode_steps
         self.reward_threshold = reward_threshold
         self.state: VectorState | None = None
@@ -195,7 +195,7 @@ class JaxVector(VectorEnv):
         return self._step_some(action, None)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray | None) -> Step:
-        action = np.asarray(action, self._action_dtype)
+        action = cast(self.action_space, self._action_leaves, action)
         self.state, results = _step(self._static, self._arrays, self._running(), action, active)
         obs, reward, terminated, truncated, success = jax.tree.map(np.asarray, results)
         obs = self._obs = cast(self.observation_space, self._leaves, obs)
@@ -242,11 +242,6 @@ class JaxVector(VectorEnv):
 
     def close(self) -> None:
         """Does nothing: there is nothing to close."""
-
-    @property
-    def _action_dtype(self) -> Any:
-        """The dtype in which actions are passed to the environments, with at most 32 bits."""
-        return jax.dtypes.canonicalize_dtype(self.action_space.dtype)
 
     def _running(self) -> VectorState:
         if self.state is None:

@@ -25,7 +25,7 @@ from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Starter, Work
 from rejeu.envs.workers.process import Failure, ToSharedMemory
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.io.records import Count, convert
-from rejeu.spaces import Leaf, leaves, structure
+from rejeu.spaces import Leaf, leaves, rows, structure
 
 INDEX = np.uint16
 """Data type of the indices of environments in a record."""
@@ -233,6 +233,7 @@ class InWorkers(VectorEnv):
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
         lost = {i: self._lost.pop(i) for i in which if i in self._lost}
+        action = rows(action)
         asked = {i: ("step", action[i]) for i in which if i not in lost}
         said = {**self._heard(self.workers.ask(asked), "step"), **lost}
         stepped = {}
@@ -278,7 +279,7 @@ class InWorkers(VectorEnv):
             action: in the environment's own range, ``(n_envs, ...)``; other rows are ignored.
         """
         idle = [i for i in range(self.n_envs) if i not in self._pending and i not in self._results]
-        lost = [i for i in idle if i in self._lost]
+        lost, action = [i for i in idle if i in self._lost], rows(action)
         self.workers.send({i: ("step_and_reset", action[i]) for i in idle if i not in self._lost})
         self._pending.update(idle)
         for i in lost:

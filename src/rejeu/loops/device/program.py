@@ -395,7 +395,7 @@ def all_finite(*arrays: Array) -> Array:
     return jnp.stack(floats).all() if floats else jnp.bool(True)
 
 
-def scale(space: gym.Space, action: Array) -> Array:
+def scale(space: gym.Space, action: Array) -> Any:
     """Returns actions in the range of the environment, as :func:`rejeu.spaces.scale_action` does on the host.
 
     Between bounds that are not symmetric about 0, the last bit may differ, because the host computes in 64 bits.
@@ -419,6 +419,8 @@ def scale(space: gym.Space, action: Array) -> Array:
     if isinstance(space, gym.spaces.MultiDiscrete):
         starts = np.broadcast_to(space.start, space.nvec.shape).astype(np.int32)
         return action.reshape(-1, *space.nvec.shape) + starts[None]
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        return spaces.nested_action(space, action, scale)
     assert isinstance(space, gym.spaces.MultiBinary)
     return action.reshape(-1, *space.shape).astype(jnp.int8)
 
