@@ -126,6 +126,10 @@ AGENTS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "a2c-adam": ("A2C", "mlp/box", {"policy_kwargs": SMALL, "use_rms_prop": False}),
     "a2c-cnn": ("A2C", "cnn/discrete", {"policy_kwargs": IMAGE}),
     "a2c-sde": ("A2C", "mlp/box", {"policy_kwargs": SMALL, "use_sde": True}),
+    "trpo-mlp": ("TRPO", "mlp/box", {**ROLLOUT, "policy_kwargs": SMALL}),
+    "trpo-cnn": ("TRPO", "cnn/discrete", {**ROLLOUT, "policy_kwargs": IMAGE}),
+    "trpo-dict": ("TRPO", "dict/discrete", {**ROLLOUT, "policy_kwargs": DICT}),
+    "trpo-sde": ("TRPO", "mlp/box", {**ROLLOUT, "policy_kwargs": SMALL, "use_sde": True}),
     "sac-mlp": ("SAC", "mlp/box", {**REPLAY, "policy_kwargs": SMALL}),
     "sac-cnn": ("SAC", "cnn/box", {**REPLAY, "policy_kwargs": IMAGE}),
     "sac-normalized": ("SAC", "mlp/box", {**REPLAY, "policy_kwargs": SMALL, "normalize": True, "ent_coef": "auto_0.1"}),
@@ -253,7 +257,7 @@ def recorded(model: Any, algorithm: str, kind: str, scaler: Any) -> dict[str, np
             result["masks"] = masks
         extra = {} if masks is None else {"action_masks": masks}
         result["actions"] = model.predict(seen, deterministic=True, **extra)[0]
-        if algorithm in ("PPO", "A2C", "MaskablePPO"):
+        if algorithm in ("PPO", "A2C", "TRPO", "MaskablePPO"):
             if model.use_sde:
                 policy.reset_noise(N)
             distribution = policy.get_distribution(tensor, **extra)

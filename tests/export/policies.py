@@ -41,7 +41,7 @@ ACTIONS: dict[str, gym.Space] = {
     "unbounded": spaces.Box(-np.inf, np.inf, (2,), np.float32),
 }
 CONTINUOUS, DISCRETE = ("SAC", "DDPG", "TD3", "TQC", "CrossQ"), ("DQN", "QRDQN", "PQN", "SAC", "DDPG")
-ON_POLICY = ("PPO", "A2C", "RecurrentPPO", "MaskablePPO")
+ON_POLICY = ("PPO", "A2C", "TRPO", "ARS", "RecurrentPPO", "MaskablePPO")
 KINDS = [
     *((name, "Box") for name in CONTINUOUS),
     *((name, "Discrete") for name in DISCRETE),

@@ -49,6 +49,9 @@ OTHERS = {
     "branches": ("SAC", "Box", {"policy_kwargs": {"state_layers": [8], "actor_layers": [8], "activation_fn": "gelu"}}),
     "silu": ("DQN", "Discrete", {"policy_kwargs": {"net_arch": [16], "activation_fn": "silu"}}),
     "CNN with layer norm": ("SAC", "Box", {"observation": "CNN", "policy_kwargs": {"cnn_layer_norm": True}}),
+    "linear": ("ARS", "Box", {"policy_kwargs": {"net_arch": []}, "zero_policy": False}),
+    "masks": ("DQN", "Discrete", {"action_masks": True}),
+    "masks of SAC": ("SAC", "Discrete", {"action_masks": True}),
     "large CNN": ("QRDQN", "Discrete", {"observation": "large CNN"}),
 }
 

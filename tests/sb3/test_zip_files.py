@@ -20,7 +20,7 @@ from rejeu.cli import main
 from rejeu.core import Clock, Transition
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
-from rejeu.sb3 import load_zip
+from rejeu.sb3 import algorithms, load_zip
 from rejeu.sb3.conversion import Policy, converted, parts_of
 from tests.hostile_zips import hostile_zips
 from tests.sb3_models import MadeUp, difference_from, loaded
@@ -70,6 +70,22 @@ def test_the_next_gradient_step_is_the_one_of_the_original(name):
     assert max(np.abs(ours[key] - before[key]).max() for key in expected) > 1e-5
     for key, value in expected.items():
         np.testing.assert_allclose(ours[key], value, atol=2e-6, err_msg=key)
+
+
+@pytest.mark.parametrize(("name", "file"), [("DQN", "dqn-mlp"), ("A2C", "a2c-sde"), ("TRPO", "trpo-mlp")])
+def test_the_class_of_the_drop_in_loads_a_file_of_the_original(name, file):
+    kind, path = getattr(algorithms, name), FOLDER / f"{file}.zip"
+    with path.open("rb") as file:
+        found = kind.load(file, gamma=0.5)
+    agent, expected = kind.load(path), load_zip(path)
+    obs = np.stack([agent.observation_space.sample() for _ in range(5)])
+    for one in (agent, found):
+        np.testing.assert_array_equal(
+            one.predict(obs, deterministic=True)[0], expected.predict(obs, deterministic=True)[0]
+        )
+    assert (type(agent), agent.gamma, found.gamma) == (kind, expected.config.gamma, 0.5)
+    with pytest.raises(CheckpointError, match=f"it is a model of {name}, not of PPO; load it with {name}.load"):
+        algorithms.PPO.load(path)
 
 
 @pytest.mark.parametrize("name", ["dqn-mlp", "sac-her", "ppo-normalized"])

@@ -28,9 +28,12 @@ ACTIVATIONS: dict[str, Function] = {
     "leakyrelu": lambda x: np.where(x >= 0, x, 0.01 * x),
     "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
 }
-ACTORS = {"PPO": "network", "A2C": "network", "MaskablePPO": "network", "DQN": "network", "PQN": "network"} | {
+SQUASHED = ("SAC", "TQC", "CrossQ", "TD3", "DDPG")
+ACTORS = {
+    **dict.fromkeys(("PPO", "A2C", "TRPO", "MaskablePPO", "DQN", "PQN"), "network"),
+    **dict.fromkeys(SQUASHED, "actor"),
     "QRDQN": "network.outputs",
-    **dict.fromkeys(("SAC", "TQC", "CrossQ", "TD3", "DDPG"), "actor"),
+    "ARS": "actor.network",
 }
 """Where the policy's network is in the state of each algorithm."""
 WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
@@ -64,7 +67,7 @@ class NumpyPolicy:
             hidden.append(lambda x: x.reshape(*x.shape[:-1], -1, config["n_quantiles"]).mean(axis=-1))
         self._steps = hidden
         self.takes_masks = config.get("action_masks", name == "MaskablePPO")
-        is_squashed = name in ("SAC", "TQC", "CrossQ", "TD3", "DDPG") or self._shape.get("squash_output", False)
+        is_squashed = name in SQUASHED or (len(hidden) > 1 if name == "ARS" else self._shape.get("squash_output", False))
         self._choose = chooser(self.action_space, is_squashed)
         self._scale = spaces.action_scaler(self.action_space)
         zero = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._leaves]
@@ -85,7 +88,7 @@ class NumpyPolicy:
             state: returned unchanged.
             episode_start: ignored; there is no memory.
             deterministic: must be True.
-            action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, for MaskablePPO; None allows all.
+            action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, if the agent takes them; None allows all.
 
         Raises:
             ValueError: if the shapes do not match, or ``deterministic`` is False.

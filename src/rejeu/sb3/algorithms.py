@@ -10,6 +10,7 @@ import inspect
 import os
 import tempfile
 import warnings
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +35,7 @@ from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import encoder_of, register_again
 from rejeu.sb3.policy import BasePolicy
+from rejeu.sb3.zip_files import load_zip
 
 __all__ = [
     "A2C",
@@ -536,7 +538,7 @@ class Original(Agent):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> Self:
-        """Returns the agent of a model file.
+        """Returns the agent of a model file, or of a zip file that Stable-Baselines3 itself saved; no code from it is run.
 
         Args:
             path: as given to :meth:`save`, or a file object.
@@ -552,11 +554,16 @@ class Original(Agent):
         known = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
         objects = {key: value for key, value in (custom_objects or {}).items() if key in known}
         has_gpu = utils.Device(str(device)).type == "cuda" and utils.get_device(device).type == "cuda"
+        place = str(device) if has_gpu or str(device) in ("auto", "cpu") else "auto"
+        changes = {**objects, "device": place, **kwargs}
         with readable(path, ".zip") as found:
-            shape = checkpoint.read_header(found, "agent").get("config", {}).get("policy_kwargs")
-            register_again(shape.get("encoder") if isinstance(shape, dict) else None)
-            place = str(device) if has_gpu or str(device) in ("auto", "cpu") else "auto"
-            agent = load_agent(cls, found, env, {**objects, "device": place, **kwargs})
+            agent: Any
+            if zipfile.is_zipfile(found):
+                agent = load_zip(found, env, kind=cls, **cls.converted(changes))
+            else:
+                shape = checkpoint.read_header(found, "agent").get("config", {}).get("policy_kwargs")
+                register_again(shape.get("encoder") if isinstance(shape, dict) else None)
+                agent = load_agent(cls, found, env, changes)
         agent.device = utils.Device(agent.device)
         return agent
 

@@ -34,7 +34,7 @@ MOST_FIELD = 4 * 2**20
 """Upper limit on the bytes of one of its values, and of a ``VecNormalize`` file."""
 EXPANSION = 16
 """Upper limit on the size of the unpacked content relative to that of the file: weights can hardly be compressed."""
-ON_POLICY = ("PPO", "A2C", "MaskablePPO", "RecurrentPPO")
+ON_POLICY = ("PPO", "A2C", "TRPO", "MaskablePPO", "RecurrentPPO")
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 """Hyperparameters that are numbers here and may be code in a file."""
 IGNORED: tuple[str, ...] = (
@@ -153,7 +153,7 @@ def algorithm_of(model: Model) -> str:
         return "RecurrentPPO"
     if "action_net" in roots and "value_net" in roots:
         if "clip_range" not in model.fields:
-            return "A2C"
+            return "TRPO" if "cg_max_steps" in model.fields else "A2C"
         policy = model.value("policy_class")
         return "MaskablePPO" if isinstance(policy, Name) and "maskable" in policy.module.lower() else "PPO"
     if "actor.latent_pi" in modules and "critic" in roots:
@@ -170,7 +170,7 @@ def unknown(roots: set[str]) -> str:
     """Raises ``Malformed`` for a policy of another algorithm."""
     raise Malformed(
         f"its policy has the parts {shown(', '.join(sorted(roots)))}, of no algorithm that rejeu has; it reads DQN, QRDQN, "
-        "PPO, A2C, SAC, TD3, DDPG, TQC, CrossQ, RecurrentPPO and MaskablePPO"
+        "PPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ, RecurrentPPO and MaskablePPO"
     )
 
 
@@ -238,6 +238,7 @@ def settings_of(kind: Any, model: Model, notes: list[str]) -> dict[str, Any]:
     """Returns the hyperparameters of a file that rejeu has too; what is left out goes to ``notes``."""
     names = {field.name for field in dataclasses.fields(kind)}
     found: dict[str, Any] = {}
+    names -= {"max_grad_norm"} if number_of(model.readable("max_grad_norm")) == 0 else set()  # of TRPO, without effect
     for name in sorted(names & model.fields.keys() - {*IGNORED}):
         value = number_of(model.readable(name))
         if name in SCHEDULES and not isinstance(value, int | float | None):
@@ -377,7 +378,13 @@ def statistics_of(
     return settings, arrays
 
 
-def load_zip(path: str | Path, env: Any = None, vecnormalize: str | Path | None = None, **changes: Any) -> Agent:
+def load_zip(
+    path: str | Path,
+    env: Any = None,
+    vecnormalize: str | Path | None = None,
+    kind: type[Agent] | None = None,
+    **changes: Any,
+) -> Agent:
     """Returns the agent of a zip file that Stable-Baselines3 or its Contrib package saved. No code from the file is run.
 
     The agent acts as the original does: actions, values and probabilities are equal up to rounding. It holds the
@@ -389,6 +396,7 @@ def load_zip(path: str | Path, env: Any = None, vecnormalize: str | Path | None 
         env: environments to continue training in, as for ``load`` of its class; None for an agent that only predicts.
         vecnormalize: the file of the ``VecNormalize`` that the policy was trained behind. The agent normalizes by its
             statistics and takes raw observations.
+        kind: class of the agent, whose algorithm must be that of the file; None for the one in :mod:`rejeu`.
         changes: constructor arguments and hyperparameters that replace those of the file.
 
     Raises:
@@ -400,11 +408,13 @@ def load_zip(path: str | Path, env: Any = None, vecnormalize: str | Path | None 
     with explained(path):
         model = read(path)
         algorithm = algorithm_of(model)
+        if kind is not None and kind.algorithm.Config.name != algorithm:
+            raise Malformed(f"it is a model of {algorithm}, not of {kind.algorithm.Config.name}; load it with {algorithm}.load")
     state = None
     if vecnormalize is not None:
         with explained(Path(vecnormalize)):
             state = read_normalization(Path(vecnormalize))
-    cls = BUILT_IN[algorithm]
+    cls = kind or BUILT_IN[algorithm]
     agent: Agent = cls.__new__(cls)
     own = {
         key: changes.pop(key) for key in [*changes] if key in ("seed", "device", "verbose", "log", "tensorboard_log")
