@@ -1,4 +1,4 @@
-"""Models on the hub, against a stand-in of its interface: folders on the disk, without network."""
+"""Models on the hub, against stand-ins of the package for it and of its server, without network."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import rejeu
 from rejeu import hub
 from rejeu.cli import main
 from rejeu.errors import CheckpointError
+from tests import hub_server
 
 SB3 = Path(__file__).parent / "data" / "sb3"
 
@@ -158,6 +159,48 @@ def test_a_folder_with_content_is_not_replaced(server):
     Path("full/file").touch()
     with pytest.raises(FileExistsError, match="--out"):
         hub.pull("me/full")
+
+
+@pytest.fixture
+def served_hub(tmp_path, monkeypatch):
+    """The real huggingface_hub, whose server is a stand-in on this machine; returns its repositories."""
+    constants = pytest.importorskip("huggingface_hub.constants")
+    monkeypatch.setenv("HF_TOKEN", hub_server.TOKEN)
+    monkeypatch.chdir(tmp_path)
+    with hub_server.served() as (address, repos):
+        monkeypatch.setattr(constants, "ENDPOINT", address)
+        template = constants.HUGGINGFACE_CO_URL_TEMPLATE
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", address + template[template.index("/{") :])
+        yield repos
+
+
+def test_the_package_of_the_hub_pushes_and_pulls_over_http(served_hub, run, capsys):
+    assert main(["push", str(run), "me/cart"]) == 0
+    assert "/me/cart" in capsys.readouterr().out
+    found = served_hub["me/cart"]
+    assert {"agent.safetensors", "config.json", "curve.png", "README.md"} <= {*found}
+    assert found["agent.safetensors"] == (run / "best.safetensors").read_bytes()
+    found |= {"train.py": b"print()", "inner/other.zip": b"PK"}
+    assert main(["pull", "me/cart", "--out", "back"]) == 0
+    pulled = {path.relative_to("back").as_posix() for path in Path("back").rglob("*")}
+    assert pulled == {*found} - {".gitattributes", "train.py", "inner/other.zip"}
+    assert Path("back/agent.safetensors").read_bytes() == found["agent.safetensors"]
+
+
+def test_refusals_over_http_are_one_line_and_leave_nothing(served_hub, run, tmp_path, monkeypatch):
+    with pytest.raises(OSError, match="the hub answered: ") as error:
+        hub.pull("me/none", tmp_path / "none")
+    assert "\n" not in str(error.value)
+    with pytest.raises(OSError, match=r"the hub answered: .*403"):
+        hub.push(run, "others/x", note=lambda text: None)
+    served_hub["me/bad"] = {"agent.safetensors": b"nothing"}
+    with pytest.raises(CheckpointError, match="not a complete safetensors file"):
+        hub.pull("me/bad", tmp_path / "bad")
+    monkeypatch.setenv("HF_TOKEN", "hf_wrong")
+    with pytest.raises(OSError, match=r"the hub answered: .*401"):
+        hub.push(run, "me/cart", note=lambda text: None)
+    assert not (tmp_path / "none").exists()
+    assert not (tmp_path / "bad").exists()
 
 
 def test_the_calls_are_those_of_the_real_interface():

@@ -67,7 +67,9 @@ class NumpyPolicy:
             hidden.append(lambda x: x.reshape(*x.shape[:-1], -1, config["n_quantiles"]).mean(axis=-1))
         self._steps = hidden
         self.takes_masks = config.get("action_masks", name == "MaskablePPO")
-        is_squashed = name in SQUASHED or (len(hidden) > 1 if name == "ARS" else self._shape.get("squash_output", False))
+        is_squashed = name in SQUASHED or (
+            len(hidden) > 1 if name == "ARS" else self._shape.get("squash_output", False)
+        )
         self._choose = chooser(self.action_space, is_squashed)
         self._scale = spaces.action_scaler(self.action_space)
         zero = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._leaves]

@@ -409,7 +409,9 @@ def load_zip(
         model = read(path)
         algorithm = algorithm_of(model)
         if kind is not None and kind.algorithm.Config.name != algorithm:
-            raise Malformed(f"it is a model of {algorithm}, not of {kind.algorithm.Config.name}; load it with {algorithm}.load")
+            raise Malformed(
+                f"it is a model of {algorithm}, not of {kind.algorithm.Config.name}; load it with {algorithm}.load"
+            )
     state = None
     if vecnormalize is not None:
         with explained(Path(vecnormalize)):
