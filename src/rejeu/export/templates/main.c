@@ -15,6 +15,7 @@ int main(void) {
 		double seconds = (double)(two.tv_sec - one.tv_sec) + 1e-9 * (double)(two.tv_nsec - one.tv_nsec);
 		fwrite(action, sizeof action, 1, stdout);
 		fwrite(&seconds, sizeof seconds, 1, stdout);
+		fflush(stdout);
 	}
 	return 0;
 }
