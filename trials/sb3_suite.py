@@ -46,7 +46,7 @@ KINDS = (
     ("name", r"^(ImportError|AttributeError|ModuleNotFoundError|NotImplementedError)|unexpected keyword argument"),
 )
 """Kinds with the expressions that identify them in a failure, in order."""
-CONFTEST = "import sys\nsys.path.append({packages!r})\n"
+CONFTEST = "import sys\nsys.path += {packages!r}\n"
 
 
 def kind_of(failure: str) -> str:
@@ -110,7 +110,7 @@ def total_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the tests")
-    parser.add_argument("--packages", default="", help="folder of packages that is searched last")
+    parser.add_argument("--packages", nargs="*", default=[], help="folders of packages that are searched last")
     parser.add_argument("--only", nargs="+", help="names of files")
     parser.add_argument("--limit", type=float, default=1200, help="seconds that a file may take")
     parser.add_argument("--original", action="store_true", help="run them against Stable-Baselines3")
@@ -137,8 +137,8 @@ def main() -> None:
             rows.append(run_file(folder, name, arguments.limit, arguments.log, tests.get(name, 1)))
             print({key: value for key, value in rows[-1].items() if key != "failures"}, flush=True)
     print(total_of(rows))
-    names = {str(arguments.folder): "FOLDER", arguments.packages: "SITE_PACKAGES", str(arguments.log): "LOG"}
-    names |= {str(arguments.output): "OUTPUT"}
+    names = {str(arguments.folder): "FOLDER", str(arguments.log): "LOG", str(arguments.output): "OUTPUT"}
+    names |= dict.fromkeys(arguments.packages, "SITE_PACKAGES")
     if arguments.original:
         counted = [{key: row[key] for key in ("file", "passed", "failed", "skipped")} for row in rows]
         content = {**earlier, "original": counted, "files": earlier.get("files", [])}
