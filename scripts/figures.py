@@ -37,6 +37,7 @@ from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
 from rejeu.algorithms.rollout_config import RolloutConfig  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
 from rejeu.presets import Result  # noqa: E402
+from scripts import sb3_parity  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
 PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"
@@ -382,6 +383,10 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "ball": ball,
     "parking": parking,
     "speed": speed,
+    "sb3-names": sb3_parity.text,
+    "sb3-examples": sb3_parity.examples,
+    "sb3-suite": sb3_parity.suite,
+    "sb3-scripts": sb3_parity.same_scripts,
 }
 
 

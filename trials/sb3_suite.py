@@ -2,11 +2,12 @@
 
     python trials/sb3_suite.py FOLDER --packages SITE_PACKAGES
 
-``FOLDER`` has the tests, for example those of the source distribution of stable-baselines3 2.9.2; they are no part of this
-repository. ``SITE_PACKAGES`` is searched last, for what rejeu does not need and the tests import (PyTorch). Each file runs in a
-process of its own. The counts, and each failed test with its kind, are written to ``trials/results/sb3_suite.json``; with
-``--log`` the output of pytest to that folder. ``--original`` runs them against Stable-Baselines3 itself, in an interpreter that
-has it, so that the result says how many tests a file has; of a file that cannot be imported all count as failed. The kinds:
+``FOLDER`` has the tests, such as those in the source distribution of stable-baselines3 2.9.2; they are no part of this
+repository. ``SITE_PACKAGES`` is searched last, for what rejeu does not need and the tests import, such as PyTorch. Each file
+runs in a process of its own. The counts, and each failed test with its kind, are written to
+``trials/results/sb3_suite.json``; with ``--log`` the output of pytest to that folder. ``--original`` runs the tests against
+Stable-Baselines3 itself, in an interpreter that has it, so that the result says how many tests a file has; of a file that
+cannot be imported all count as failed. The kinds:
 
 - ``tensor``: something of rejeu's was given to PyTorch, or a PyTorch module or optimizer to rejeu.
 - ``name``: a module, attribute or argument is missing.
@@ -20,6 +21,7 @@ has it, so that the result says how many tests a file has; of a file that cannot
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import re
@@ -42,7 +44,7 @@ KINDS = (
     ("time", r"Timeout"),
     ("message", r"Regex pattern did not match|Pattern:|DID NOT WARN.*\n(?:.*\n)*?.*Emitted warnings: \[\w*Warning\("),
     ("absent", r"DID NOT (RAISE|WARN)"),
-    ("tensor", r"torch|Tensor|\bth\.|nn\.Module|state_dict"),
+    ("tensor", r"torch|Tensor|\bth\.|nn\.Module|state_dict|FrozenInstanceError"),
     ("name", r"^(ImportError|AttributeError|ModuleNotFoundError|NotImplementedError)|unexpected keyword argument"),
 )
 """Kinds with the expressions that identify them in a failure, in order."""
@@ -87,10 +89,10 @@ def run_file(folder: Path, name: str, limit: float, log: Path | None, n_tests: i
     environment = os.environ | {"PYTHONPATH": str(SOURCES), "MPLBACKEND": "agg"}
     with (log / f"{name}.log" if log else folder / "log").open("w") as output:
         command = [sys.executable, "-m", "pytest", *options, "--timeout-method=signal", name]
-        try:
-            subprocess.run(command, cwd=folder, env=environment, stdout=output, stderr=output, timeout=limit, check=False)
-        except subprocess.TimeoutExpired:
-            pass
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            subprocess.run(
+                command, cwd=folder, env=environment, stdout=output, stderr=output, timeout=limit, check=False
+            )
     counts, failed = outcomes(report) if report.is_file() else (Counter({"failed": 1}), [["", "time"]])
     if failed and not counts["passed"] and len(failed) == 1:  # an import, or the file's time
         counts["failed"], failed = n_tests, [["every test", failed[0][1]]]

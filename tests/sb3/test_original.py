@@ -102,8 +102,8 @@ def test_sac_explores_by_state_dependent_noise(tmp_path):
     np.testing.assert_array_equal(
         sb3.SAC.load(tmp_path / "sde").predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]
     )
-    with pytest.raises(ValueError, match="leave action_noise out"):
-        sac(use_sde=True, action_noise=0.1)
+    with pytest.warns(UserWarning, match="explores by itself"):
+        assert sac(use_sde=True, action_noise=0.1).config.action_noise is None
 
 
 def test_expln_continues_the_exponential_smoothly():
@@ -306,7 +306,87 @@ def test_contrib_modules_and_masks():
     assert timed.step(np.zeros(1))[0][-1] == pytest.approx(1 - 1 / 200)
 
 
+def test_files_by_path_or_open(tmp_path):
+    from rejeu.sb3.common.save_util import load_from_pkl, open_path, save_to_pkl
+
+    with open_path(tmp_path / "plain", "w", suffix="pkl") as file:
+        save_to_pkl(file, {"a": [1, 2.5]})
+    assert load_from_pkl(tmp_path / "plain") == load_from_pkl(tmp_path / "plain.pkl") == {"a": [1, 2.5]}
+    with pytest.warns(UserWarning, match="does not exist"):
+        save_to_pkl(tmp_path / "new" / "file", "text")
+    assert (tmp_path / "new" / "file.pkl").is_file()
+    with pytest.raises(ValueError, match="closed"):
+        open_path(file, "w")
+    with pytest.raises(TypeError):
+        save_to_pkl(tmp_path / "agent", ppo)
+
+
+def test_state_dependent_noise_has_the_variance_of_its_matrix():
+    from rejeu.sb3.common.distributions import StateDependentNoiseDistribution, TanhBijector
+
+    latent, log_std = np.array([[0.5, -1.0]]).repeat(4000, axis=0), np.log(np.array([[0.4], [0.3]]))
+    distribution = StateDependentNoiseDistribution(1)
+    distribution.sample_weights(log_std, batch_size=4000)
+    made = distribution.proba_distribution(np.full((4000, 1), 2.0), log_std, latent)
+    std = np.sqrt((0.5 * 0.4) ** 2 + (1.0 * 0.3) ** 2)
+    assert np.exp(made.distribution.log_std[0, 0]) == pytest.approx(std, rel=1e-4)
+    assert made.get_actions().std() == pytest.approx(std, rel=0.06)
+    assert TanhBijector.inverse(TanhBijector.forward(np.array([0.7]))) == pytest.approx(0.7)
+    assert TanhBijector(0.0).log_prob_correction(0.7) == pytest.approx(np.log(1 - np.tanh(0.7) ** 2))
+
+
+def test_create_mlp_makes_layers():
+    from rejeu.sb3.common.torch_layers import create_mlp
+
+    layers = create_mlp(4, 2, [16, 8], squash_output=True, key=jax.random.key(0))
+    assert [getattr(layer, "weight", np.zeros(0)).shape for layer in layers] == [
+        (16, 4),
+        (0,),
+        (8, 16),
+        (0,),
+        (2, 8),
+        (0,),
+    ]
+    assert np.abs(eqx.nn.Sequential(layers)(np.full(4, 1e3, np.float32))).max() <= 1
+    assert create_mlp(4, -1, []) == []
+
+
+def test_stacks_of_observations_by_hand():
+    from rejeu.sb3.common.vec_env.stacked_observations import StackedObservations
+
+    space = spaces.Box(0, 255, (3, 4, 5), np.uint8)
+    assert StackedObservations.compute_stacking(2, space) == (True, 1, (6, 4, 5), 0)
+    stack = StackedObservations(2, 3, spaces.Box(-1, 1, (2,)))
+    stack.reset(np.ones((2, 2)))
+    obs, infos = stack.update(
+        np.full((2, 2), 2), np.array([False, True]), [{}, {"terminal_observation": np.full(2, 3)}]
+    )
+    assert obs.tolist() == [[0, 0, 1, 1, 2, 2], [0, 0, 0, 0, 2, 2]]
+    assert infos[1]["terminal_observation"].tolist() == [0, 0, 1, 1, 3, 3]
+    with pytest.raises(TypeError, match="one value"):
+        StackedObservations(2, 3, spaces.Box(-1, 1, (2,)), {"a": "first"})
+
+
+def test_a_vector_environment_need_not_call_its_base_and_extra_actions_warn():
+    from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan
+
+    class Bare(DummyVecEnv):
+        def __init__(self):
+            super().__init__([lambda: gym.make("Pendulum-v1")])
+            del self.reset_infos
+
+    assert VecCheckNan(Bare()).reset_infos == [{}]
+    env = VecCheckNan(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), raise_exception=True)
+    env.reset()
+    with pytest.raises(ValueError, match="nan"):
+        env.step(np.array([[np.nan]]))
+    with pytest.warns(UserWarning, match="takes the first"):
+        env.step(np.zeros((2, 1)))
+
+
 def test_utilities():
+    model = ppo(**SMALL)
+    assert len(utils.get_parameters_by_name(model.policy, ["bias"])) < len([*model.policy.parameters()])
     assert utils.get_latest_run_id("/nowhere", "PPO") == 0
     assert utils.is_vectorized_observation(np.zeros((2, 3)), spaces.Box(0, 1, (3,)))
     assert utils.explained_variance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 1.0

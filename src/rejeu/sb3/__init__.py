@@ -39,6 +39,15 @@ __all__ = [
 ]
 
 
+class HER:
+    """The name of an algorithm that became a replay buffer."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        raise ImportError(
+            "HER is a replay buffer: SAC(..., replay_buffer_class=HerReplayBuffer); see the documentation"
+        )
+
+
 def __getattr__(name: str) -> Any:
     """Imports an algorithm when it is first used, so that worker processes need not."""
     if name not in __all__:

@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import gymnasium as gym
@@ -202,6 +203,8 @@ class Original(Agent):
             result["priorities"] = {key: utils.of_progress(value) for key, value in result["priorities"].items()}
         if isinstance(noise := result.get("action_noise"), VectorizedActionNoise):
             result["action_noise"] = noise.base_noise
+        if result.get("use_sde") and result.get("action_noise") is not None:
+            unsupported("action_noise", result.pop("action_noise"), "is not used: use_sde=True explores by itself")
         if isinstance(frequency := result.get("train_freq"), tuple):
             result["train_freq"] = tuple(getattr(part, "value", part) for part in frequency)
         if "device" in result:
@@ -525,6 +528,13 @@ class Original(Agent):
         """Replaces the replay buffer by a saved one; see :meth:`rejeu.OffPolicyAgent.load_replay_buffer`."""
         self.__dict__.pop("replay_buffer_deleted", None)
         with readable(path, ".pkl") as found:
+            if self.run.replay is None and self.config.hindsight is None:  # loaded without environments
+                with checkpoint.opened(found, "replay") as file:
+                    n_envs = file.specs["head"].shape[0]
+                like: Any = SimpleNamespace(
+                    n_envs=n_envs, observation_space=self.observation_space, action_space=self.action_space
+                )
+                self.run.replay = self.make_buffer(like)
             super().load_replay_buffer(found)  # type: ignore[misc]
 
     @classmethod

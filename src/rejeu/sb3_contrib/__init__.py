@@ -24,6 +24,7 @@ from rejeu.sb3.common.envs import InvalidActionEnvDiscrete, InvalidActionEnvMult
 from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
 from rejeu.sb3.common.policies import ActorCriticPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
+from rejeu.sb3.policy import Actor, ContinuousCritic, DQNPolicy, QNetwork, SACPolicy
 
 __all__ = ["ARS", "QRDQN", "TQC", "TRPO", "CrossQ", "MaskablePPO", "MaskableRecurrentPPO", "RecurrentPPO"]
 
@@ -155,6 +156,10 @@ MODULES: dict[str, dict[str, Any]] = {
         one.__name__: one
         for one in (InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete)
     },
+    "common.envs.invalid_actions_env": {
+        one.__name__: one
+        for one in (InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete)
+    },
     "common.wrappers": {"ActionMasker": ActionMasker, "TimeFeatureWrapper": TimeFeatureWrapper},
     "common.wrappers.action_masker": {"ActionMasker": ActionMasker},
     "common.wrappers.time_feature": {"TimeFeatureWrapper": TimeFeatureWrapper},
@@ -182,8 +187,11 @@ MODULES: dict[str, dict[str, Any]] = {
 for kind, folder in ((QRDQN, "qrdqn"), (TQC, "tqc"), (CrossQ, "crossq"), (MaskablePPO, "ppo_mask"), (TRPO, "trpo")):
     named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
     MODULES |= {folder: {kind.__name__: kind, **named}, f"{folder}.{folder}": {kind.__name__: kind}}
-    MODULES[f"{folder}.policies"] = named
-linear = {"LinearPolicy": "LinearPolicy", "MlpPolicy": "MlpPolicy"}
+    parts = {f"{kind.__name__}Policy": SACPolicy, "Actor": Actor, "Critic": ContinuousCritic}
+    parts |= {"QRDQNPolicy": DQNPolicy, "QuantileNetwork": QNetwork, "CrossQCritic": ContinuousCritic}
+    MODULES[f"{folder}.policies"] = named | ({} if folder in ("ppo_mask", "trpo") else parts)
+linear = dict.fromkeys(("LinearPolicy", "ARSLinearPolicy"), "LinearPolicy") | {"MlpPolicy": "MlpPolicy"}
+linear["ARSPolicy"] = "MlpPolicy"
 MODULES |= {"ars": {"ARS": ARS, **linear}, "ars.ars": {"ARS": ARS}, "ars.policies": linear}
 lstm = {"CnnLstmPolicy": CnnPolicy, "MlpLstmPolicy": MlpPolicy, "MultiInputLstmPolicy": MultiInputPolicy}
 MODULES |= {"ppo_recurrent": {"RecurrentPPO": RecurrentPPO, **lstm}, "ppo_recurrent.policies": lstm}

@@ -262,6 +262,10 @@ class CallbackList(BaseCallback):
     def _children(self) -> list[BaseCallback]:
         return self.callbacks
 
+    def _init_callback(self) -> None:
+        for callback in self.callbacks:
+            callback.parent = self.parent
+
     def _on_rollout_start(self) -> None:
         for callback in self.callbacks:
             callback.on_rollout_start()

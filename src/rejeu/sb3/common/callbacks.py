@@ -165,7 +165,7 @@ class EvalCallback(EventCallback):
         self.evaluations_results: list[list[float]] = []
         self.evaluations_length: list[list[int]] = []
         self.evaluations_successes: list[list[bool]] = []
-        self._successes: list[bool] = []
+        self._is_success_buffer: list[bool] = []
 
     def _children(self) -> list[BaseCallback]:
         return super()._children() + ([] if self.callback_on_new_best is None else [self.callback_on_new_best])
@@ -188,7 +188,7 @@ class EvalCallback(EventCallback):
             return True
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
-        self._successes = []
+        self._is_success_buffer = []
         returns, lengths = evaluate_policy(
             self.model,
             self.eval_env,
@@ -216,7 +216,7 @@ class EvalCallback(EventCallback):
 
     def _record_success(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         if locals_["done"] and (success := locals_["info"].get("is_success")) is not None:
-            self._successes.append(bool(success))
+            self._is_success_buffer.append(bool(success))
 
     def _write(self, returns: list[float], lengths: list[int]) -> None:
         if self.log_path is None:
@@ -225,8 +225,8 @@ class EvalCallback(EventCallback):
         self.evaluations_results.append(returns)
         self.evaluations_length.append(lengths)
         parts: dict[str, Any] = {}
-        if self._successes:
-            self.evaluations_successes.append(self._successes)
+        if self._is_success_buffer:
+            self.evaluations_successes.append(self._is_success_buffer)
             if {len(row) for row in self.evaluations_successes} == {self.n_eval_episodes}:
                 parts["successes"] = np.array(self.evaluations_successes)
         parts["timesteps"] = np.array(self.evaluations_timesteps)
@@ -245,8 +245,8 @@ class EvalCallback(EventCallback):
             print(f"Episode length: {np.mean(lengths):.2f} +/- {np.std(lengths):.2f}")
         self.logger.record("eval/mean_reward", self.last_mean_reward)
         self.logger.record("eval/mean_ep_length", float(np.mean(lengths)))
-        if self._successes:
-            self.logger.record("eval/success_rate", float(np.mean(self._successes)))
+        if self._is_success_buffer:
+            self.logger.record("eval/success_rate", float(np.mean(self._is_success_buffer)))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 

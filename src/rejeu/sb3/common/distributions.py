@@ -8,13 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Self
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.algorithms.actor_critic.network import sde_std
 from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
 from rejeu.sb3.common.preprocessing import get_action_dim
+from rejeu.sb3.common.torch_layers import create_mlp
 from rejeu.sb3.common.utils import Tensor
 
 __all__ = [
@@ -24,6 +27,8 @@ __all__ = [
     "Distribution",
     "MultiCategoricalDistribution",
     "SquashedDiagGaussianDistribution",
+    "StateDependentNoiseDistribution",
+    "TanhBijector",
     "kl_divergence",
     "make_proba_distribution",
 ]
@@ -94,6 +99,11 @@ class DiagGaussianDistribution(Distribution):
         super().__init__()
         self.action_dim = action_dim
 
+    def proba_distribution_net(self, latent_dim: int, log_std_init: float = 0.0) -> tuple[eqx.Module, np.ndarray]:
+        """Returns a linear layer for the means, and logarithms of standard deviations."""
+        shape = (latent_dim, self.action_dim) if isinstance(self, StateDependentNoiseDistribution) else self.action_dim
+        return create_mlp(latent_dim, self.action_dim, [])[0], np.full(shape, np.float32(log_std_init))
+
     def proba_distribution(self, mean_actions: Any, log_std: Any) -> Self:
         """Sets the parameters, and returns itself."""
         mean, log_std = (jnp.asarray(np.asarray(part, np.float32)) for part in (mean_actions, log_std))
@@ -107,6 +117,74 @@ class SquashedDiagGaussianDistribution(DiagGaussianDistribution):
     kind = TanhNormal
 
 
+class StateDependentNoiseDistribution(DiagGaussianDistribution):
+    """Normal distributions of gSDE: the noise is linear in features of the observation (arXiv 2005.05719).
+
+    Args:
+        action_dim: number of components.
+        full_std: accepted; the matrix has a standard deviation for each feature and component.
+        use_expln: let large standard deviations grow linearly.
+        squash_output: squash the actions by tanh.
+        learn_features: accepted.
+        epsilon: added to variances.
+    """
+
+    def __init__(
+        self,
+        action_dim: int,
+        full_std: bool = True,
+        use_expln: bool = False,
+        squash_output: bool = False,
+        learn_features: bool = False,
+        epsilon: float = 1e-6,
+    ) -> None:
+        super().__init__(action_dim)
+        self.kind = TanhNormal if squash_output else Normal
+        self.use_expln, self.epsilon = use_expln, epsilon
+        self._matrices: Any = None
+
+    def sample_weights(self, log_std: Any, batch_size: int = 1) -> None:
+        """Draws the matrices of the noise, ``(batch_size, width, action_dim)``, which :meth:`sample` uses from then on."""
+        std = np.asarray(sde_std(jnp.asarray(np.asarray(log_std, np.float32)), self.use_expln))
+        self._matrices = std * np.random.normal(size=(batch_size, *std.shape)).astype(np.float32)  # noqa: NPY002
+
+    def proba_distribution(self, mean_actions: Any, log_std: Any, latent_sde: Any = None) -> Self:
+        """Sets the parameters, and returns itself: ``log_std (width, action_dim)``, ``latent_sde (batch, width)``."""
+        std = sde_std(jnp.asarray(np.asarray(log_std, np.float32)), self.use_expln)
+        self._latent = np.asarray(latent_sde, np.float32)
+        variance = jnp.square(self._latent) @ jnp.square(std) + self.epsilon
+        return super().proba_distribution(mean_actions, 0.5 * jnp.log(variance))
+
+    def sample(self) -> np.ndarray:
+        """Returns actions with the noise of the matrices that were drawn last; without any, independent ones."""
+        if self._matrices is None or len(self._matrices) not in (1, len(self._latent)):
+            return super().sample()
+        noisy = self.distribution.mean + jnp.einsum("...i,...ij->...j", self._latent, self._matrices)
+        return self._shown(jnp.tanh(noisy) if self.kind is TanhNormal else noisy)
+
+
+class TanhBijector:
+    """The hyperbolic tangent, its inverse and the logarithm of its derivative; ``epsilon`` keeps both finite."""
+
+    def __init__(self, epsilon: float = 1e-6) -> None:
+        self.epsilon = epsilon
+
+    @staticmethod
+    def forward(x: Any) -> np.ndarray:
+        """Returns tanh(x)."""
+        return Tensor.of(np.tanh(np.asarray(x)))
+
+    @staticmethod
+    def inverse(y: Any) -> np.ndarray:
+        """Returns artanh(y), of ``y`` within (-1, 1)."""
+        limit = 1.0 - np.finfo(np.float32).eps
+        return Tensor.of(np.arctanh(np.clip(np.asarray(y), -limit, limit)))
+
+    def log_prob_correction(self, x: Any) -> np.ndarray:
+        """Returns the logarithm of the derivative at ``x``."""
+        return Tensor.of(np.log(1.0 - np.square(np.tanh(np.asarray(x))) + self.epsilon))
+
+
 class CategoricalDistribution(Distribution):
     """One choice among ``action_dim``."""
 
@@ -116,6 +194,10 @@ class CategoricalDistribution(Distribution):
 
     def _made(self, logits: Any) -> Any:
         return Categorical(logits)
+
+    def proba_distribution_net(self, latent_dim: int) -> eqx.Module:
+        """Returns a linear layer for the logits."""
+        return create_mlp(latent_dim, self.action_dim, [])[0]
 
     def proba_distribution(self, action_logits: Any) -> Self:
         """Sets the parameters, and returns itself."""
@@ -146,14 +228,13 @@ def make_proba_distribution(action_space: spaces.Space, use_sde: bool = False, d
     """Returns a distribution for an action space.
 
     Raises:
-        NotImplementedError: for other spaces, and for gSDE, which is part of the policies here.
+        NotImplementedError: for other spaces.
     """
-    if use_sde or not isinstance(
-        action_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-    ):
-        raise NotImplementedError(f"no distribution for {action_space} with use_sde={use_sde}")
+    if not isinstance(action_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        raise NotImplementedError(f"no distribution for {action_space}")
     if isinstance(action_space, spaces.Box):
-        return DiagGaussianDistribution(get_action_dim(action_space))
+        kind = StateDependentNoiseDistribution if use_sde else DiagGaussianDistribution
+        return kind(get_action_dim(action_space), **(dist_kwargs or {}))
     if isinstance(action_space, spaces.Discrete):
         return CategoricalDistribution(int(action_space.n))
     if isinstance(action_space, spaces.MultiDiscrete):

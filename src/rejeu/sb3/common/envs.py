@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.sb3 import alias
+
 __all__ = [
     "BitFlippingEnv",
     "FakeImageEnv",
@@ -306,3 +308,6 @@ class SimpleMultiObsEnv(gym.Env):
     def render(self) -> None:
         """Prints the number of the cell."""
         print(self.state)
+
+
+alias(__name__, "bit_flipping_env", "identity_env", "multi_input_envs")

@@ -244,15 +244,19 @@ class TensorBoardOutputFormat(KVWriter):
 def _add(summary: Any, key: str, value: Any) -> None:
     """Adds a value to a summary of TensorBoard's."""
     if isinstance(value, HParam):
-        from tensorboard.plugins.hparams import api_pb2, summary as hparams
+        from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2  # their summary needs TensorFlow
 
-        metrics = [api_pb2.MetricInfo(name=api_pb2.MetricName(tag=name)) for name in value.metric_dict]
-        settings = {
-            name: one if isinstance(one, bool | int | float | str) else str(one)
-            for name, one in value.hparam_dict.items()
-        }
-        summary.MergeFrom(hparams.experiment_pb(hparam_infos=[], metric_infos=metrics))
-        summary.MergeFrom(hparams.session_start_pb(hparams=settings))
+        names = [api_pb2.MetricInfo(name=api_pb2.MetricName(tag=name)) for name in value.metric_dict]
+        start = plugin_data_pb2.SessionStartInfo(start_time_secs=time.time())
+        for name, one in value.hparam_dict.items():
+            kind = "bool" if isinstance(one, bool) else "number" if isinstance(one, int | float) else "string"
+            setattr(start.hparams[name], f"{kind}_value", str(one) if kind == "string" else one)
+        for tag, content in (
+            (metadata.EXPERIMENT_TAG, {"experiment": api_pb2.Experiment(metric_infos=names)}),
+            (metadata.SESSION_START_TAG, {"session_start_info": start}),
+        ):
+            about = metadata.create_summary_metadata(plugin_data_pb2.HParamsPluginData(**content))
+            summary.value.add(tag=tag, metadata=about)
     elif isinstance(value, Figure):
         image = io.BytesIO()
         value.figure.savefig(image, format="png")

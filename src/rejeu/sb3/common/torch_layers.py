@@ -21,8 +21,9 @@ and with a ``key`` for its random weights if it takes one::
 from __future__ import annotations
 
 import inspect
+import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -38,7 +39,7 @@ from rejeu.networks.layers import own_module
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, preprocess_obs
 from rejeu.spaces import Leaf
 
-__all__ = ["BaseFeaturesExtractor", "CombinedExtractor", "FlattenExtractor", "NatureCNN"]
+__all__ = ["BaseFeaturesExtractor", "CombinedExtractor", "FlattenExtractor", "NatureCNN", "create_mlp"]
 
 PREFIX = "sb3:"
 """How the names of encoders that are extractors begin."""
@@ -83,6 +84,29 @@ class NatureCNN(BaseFeaturesExtractor):
 
 class CombinedExtractor(BaseFeaturesExtractor):
     """The name of rejeu's own encoder of a Dict; ``cnn_output_dim`` is the width for each image."""
+
+
+def create_mlp(
+    input_dim: int,
+    output_dim: int,
+    net_arch: Sequence[int],
+    activation_fn: Callable[[Array], Array] = jax.nn.relu,
+    squash_output: bool = False,
+    with_bias: bool = True,
+    *,
+    key: Array | None = None,
+) -> list[eqx.Module]:
+    """Returns the layers of a network for ``equinox.nn.Sequential``; no output layer with ``output_dim`` of at most 0.
+
+    ``key`` gives the random weights; None takes one from NumPy's global generator.
+    """
+    widths = [input_dim, *net_arch, *[output_dim] * (output_dim > 0)]
+    key = jax.random.key(np.random.randint(2**31)) if key is None else key  # noqa: NPY002
+    layers: list[eqx.Module] = []
+    for i, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
+        layers.append(eqx.nn.Linear(n_in, n_out, use_bias=with_bias, key=jax.random.fold_in(key, i)))
+        layers += [eqx.nn.Lambda(activation_fn)] * (i < len(net_arch))
+    return layers + [eqx.nn.Lambda(jnp.tanh)] * bool(squash_output and layers)
 
 
 class Prepared(eqx.Module):

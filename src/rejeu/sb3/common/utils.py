@@ -34,6 +34,7 @@ __all__ = [
     "get_device",
     "get_latest_run_id",
     "get_linear_fn",
+    "get_parameters_by_name",
     "get_schedule_fn",
     "get_system_info",
     "is_vectorized_observation",
@@ -255,6 +256,11 @@ def is_vectorized_observation(observation: Any, observation_space: gym.Space) ->
     )
 
 
+is_vectorized_box_observation = is_vectorized_discrete_observation = is_vectorized_observation
+is_vectorized_dict_observation = is_vectorized_multibinary_observation = is_vectorized_observation
+is_vectorized_multidiscrete_observation = is_vectorized_observation
+
+
 def safe_mean(arr: Any) -> float:
     """Returns the mean, NaN of nothing."""
     return float("nan") if len(arr) == 0 else float(np.mean(arr))
@@ -269,6 +275,11 @@ def polyak_update(params: Iterable[np.ndarray], target_params: Iterable[np.ndarr
     """Moves arrays, in place, by the share ``tau`` of the way to others."""
     for value, target in zip(params, target_params, strict=True):
         target += np.asarray(tau * (value - target), target.dtype)
+
+
+def get_parameters_by_name(model: Any, included_names: Iterable[str]) -> list[Any]:
+    """Returns the parameters of a policy, or of a part of one, whose names contain one of these."""
+    return [value for name, value in model.state_dict().items() if any(part in name for part in included_names)]
 
 
 def obs_as_tensor(obs: Any, device: Any = "auto") -> Any:

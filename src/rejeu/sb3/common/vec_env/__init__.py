@@ -3,6 +3,7 @@
 from rejeu.sb3.common.vec_env import adapters
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped, unwrap_vec_wrapper
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
+from rejeu.sb3.common.vec_env.stacked_observations import StackedObservations
 from rejeu.sb3.common.vec_env.subproc_vec_env import SubprocVecEnv
 from rejeu.sb3.common.vec_env.vec_check_nan import VecCheckNan
 from rejeu.sb3.common.vec_env.vec_extract_dict_obs import VecExtractDictObs
@@ -14,6 +15,7 @@ from rejeu.sb3.common.vec_env.vec_video_recorder import VecVideoRecorder
 
 __all__ = [
     "DummyVecEnv",
+    "StackedObservations",
     "SubprocVecEnv",
     "VecCheckNan",
     "VecEnv",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from operator import methodcaller
@@ -151,17 +152,20 @@ class VecEnv(ABC):
         """Returns the images of all environments as one, ``uint8 (height, width, 3)``, or shows it and returns None.
 
         Args:
-            mode: ``"rgb_array"`` returns the image, ``"human"`` shows it in a window; None uses the mode that the
-                environments were made with.
+            mode: ``"rgb_array"`` returns the image, ``"human"`` shows it in a window; None, and with a warning any other,
+                uses the mode that the environments were made with.
 
         Raises:
-            ValueError: if the render mode of the environments does not allow it.
+            ValueError: if the environments were made with another render mode.
         """
+        if mode not in (None, "rgb_array", "human"):
+            warnings.warn(f"render(mode={mode!r}): the mode is {self.render_mode!r}", UserWarning, stacklevel=2)
+            mode = None
         mode = self.render_mode if mode is None else mode
         if mode == "human" and self.render_mode == "human":
             self.env_method("render")
             return None
-        if self.render_mode != "rgb_array" or mode not in ("rgb_array", "human"):
+        if self.render_mode != "rgb_array":
             raise ValueError(
                 f"render(mode={mode!r}): the environments were made with render_mode={self.render_mode!r}; "
                 "make them with render_mode='rgb_array'"
@@ -184,8 +188,15 @@ class VecEnv(ABC):
         self._options = [None] * self.num_envs
 
     def _check_count(self, actions: Any) -> None:
-        if len(actions) != self.num_envs:
+        if len(actions) < self.num_envs:
             raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
+        if len(actions) > self.num_envs:
+            warnings.warn(
+                f"step got {len(actions)} actions for {self.num_envs} environments and takes the first; give an array "
+                "with one row for each environment",
+                UserWarning,
+                stacklevel=4,
+            )
 
     def _get_indices(self, indices: Indices) -> list[int]:
         chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
@@ -264,7 +275,7 @@ class VecEnvWrapper(VecEnv):
             venv.action_space if action_space is None else action_space,
         )
         self.metadata, self.render_mode = venv.metadata, venv.render_mode
-        self.reset_infos = venv.reset_infos
+        self.reset_infos = getattr(venv, "reset_infos", self.reset_infos)  # its own __init__ may not call VecEnv's
 
     def step_async(self, actions: Any) -> None:
         self.venv.step_async(actions)

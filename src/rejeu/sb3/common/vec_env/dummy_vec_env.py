@@ -73,7 +73,7 @@ class DummyVecEnv(SingleEnvs):
         return self._stepped(
             # Copies: an environment may write its next observation into the same array.
             self._located(i, step_and_reset, env, copy, copy, action)
-            for i, (env, copy, action) in enumerate(zip(self.envs, self._copies, self._actions, strict=True))
+            for i, (env, copy, action) in enumerate(zip(self.envs, self._copies, self._actions, strict=False))
         )
 
     def _located(self, i: int, function: Callable[..., Any], *arguments: Any) -> Any:

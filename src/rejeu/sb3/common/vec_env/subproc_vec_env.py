@@ -86,7 +86,9 @@ class SubprocVecEnv(SingleEnvs):
     def step_async(self, actions: Any) -> None:
         self._check_count(actions)
         self._n_steps += 1
-        self.workers.send({i: ("step_and_reset", action) for i, action in enumerate(actions)})
+        self.workers.send(
+            {i: ("step_and_reset", action) for i, action in zip(range(self.num_envs), actions, strict=False)}
+        )
         self.waiting = True
 
     def step_wait(self) -> StepResult:

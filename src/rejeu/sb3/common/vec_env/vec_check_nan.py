@@ -13,12 +13,16 @@ from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrap
 __all__ = ["VecCheckNan"]
 
 
+class NotFiniteError(BadEnvironmentError, ValueError):
+    """Actions, observations or rewards contain NaN or infinity."""
+
+
 class VecCheckNan(VecEnvWrapper):
     """Checks every action, observation and reward for NaN and infinity.
 
     Args:
         venv: the vector environment.
-        raise_exception: raise :class:`BadEnvironmentError`; False warns.
+        raise_exception: raise :class:`BadEnvironmentError`, which is a ``ValueError`` too; False warns.
         warn_once: warn only the first time.
         check_inf: check for infinity too.
     """
@@ -66,6 +70,6 @@ class VecCheckNan(VecEnvWrapper):
                 )
                 message = f"{name}{f' under {key!r}' * bool(key)} contain {array[where]} at {where}{after}"
                 if self.raise_exception:
-                    raise BadEnvironmentError(message)
+                    raise NotFiniteError(message)
                 self._warned = True
                 warnings.warn(message, UserWarning, stacklevel=3)

@@ -1,0 +1,214 @@
+"""The tables of docs/coming-from-sb3.md: names, examples, tests and results beside Stable-Baselines3's.
+
+    python scripts/sb3_parity.py record    # where stable-baselines3 and sb3-contrib are installed
+    python scripts/sb3_parity.py           # prints the comparison of names
+
+``record`` writes the public classes and functions of each module, with their arguments and methods, to
+``tests/data/sb3/signatures.json``. Names that begin with an underscore are left out.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import pkgutil
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "tests" / "data" / "sb3" / "signatures.json"
+PACKAGES = {"stable_baselines3": "rejeu.sb3", "sb3_contrib": "rejeu.sb3_contrib"}
+"""The original's packages, and where their names are here."""
+
+
+def arguments_of(function: Any) -> list[str]:
+    """Returns the names of the arguments of a function or of a class, without those for any number of arguments."""
+    try:
+        given = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return []
+    return [one.name for one in given if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) and one.name != "self"]
+
+
+def recorded() -> dict[str, Any]:
+    """Returns the public classes and functions of the installed packages, by module."""
+    found: dict[str, Any] = {}
+    for package in PACKAGES:
+        module = importlib.import_module(package)
+        names = [package, *(info.name for info in pkgutil.walk_packages(module.__path__, f"{package}."))]
+        for name in names:
+            try:
+                importlib.import_module(name)
+            except ImportError:  # of something optional
+                continue
+            own = {
+                key: described(one, package)
+                for key, one in vars(importlib.import_module(name)).items()
+                if callable(one) and not key.startswith("_") and getattr(one, "__module__", None) == name
+            }
+            if own:
+                found[name] = own
+    return found
+
+
+def described(one: Any, package: str) -> dict[str, list[str]]:
+    """Returns the arguments and, of a class, the methods that the package defines."""
+    if not inspect.isclass(one):
+        return {"arguments": arguments_of(one)}
+    bases = [base for base in one.__mro__ if base.__module__.startswith(package)]
+    methods = {key for base in bases for key, method in vars(base).items() if inspect.isroutine(method)}
+    return {"arguments": arguments_of(one), "methods": sorted(key for key in methods if not key.startswith("_"))}
+
+
+def accepted(one: Any) -> set[str]:
+    """Returns the arguments that a class or function of rejeu takes by name."""
+    from rejeu import validation
+    from rejeu.agents.base import AGENT_ARGUMENTS
+    from rejeu.sb3 import algorithms
+
+    names = set(arguments_of(one))
+    if inspect.isclass(one) and issubclass(one, algorithms.Original):
+        names |= {*validation.field_names(one.algorithm.Config), *AGENT_ARGUMENTS}
+        names |= {*algorithms.WITHOUT_EFFECT, *algorithms.NEUTRAL}
+    return names
+
+
+def takes_any(one: Any) -> bool:
+    """Returns whether a function passes arguments of any name on."""
+    try:
+        kinds = [given.kind for given in inspect.signature(one).parameters.values()]
+    except (TypeError, ValueError):
+        return True
+    return inspect.Parameter.VAR_KEYWORD in kinds
+
+
+def compared() -> tuple[dict[str, tuple[int, int, list[str]]], dict[str, set[str]], dict[str, set[str]]]:
+    """Returns what is here, of how much, and what is missing, by module; and classes and functions by what they lack."""
+    from rejeu.sb3 import algorithms
+
+    modules: dict[str, tuple[int, int, list[str]]] = {}
+    arguments: dict[str, set[str]] = {}
+    methods: dict[str, set[str]] = {}
+    for path, names in json.loads(DATA.read_text(encoding="utf-8")).items():
+        package = path.partition(".")[0]
+        here = PACKAGES[package] + path[len(package) :]
+        try:
+            module: Any = importlib.import_module(here)
+        except ModuleNotFoundError:
+            module = None
+        missing = [name for name in names if not hasattr(module, name)]
+        modules[here] = len(names) - len(missing), len(names), missing
+        for name in names.keys() - {*missing}:
+            one, original = getattr(module, name), names[name]
+            is_agent = inspect.isclass(one) and issubclass(one, algorithms.Original)
+            for key in original["arguments"] if is_agent or not takes_any(one) else ():
+                if key not in accepted(one):
+                    arguments.setdefault(key, set()).add(name)
+            for key in original.get("methods", ()):
+                if inspect.isclass(one) and not hasattr(one, key):
+                    methods.setdefault(key, set()).add(name)
+    return modules, arguments, methods
+
+
+def names_of(lacking: dict[str, set[str]]) -> str:
+    """Returns what is lacking, each with up to three of the classes and functions that lack it."""
+    shown = []
+    for key in sorted(lacking):
+        owners = sorted(lacking[key])
+        more = f" and {len(owners) - 3} more" if len(owners) > 3 else ""
+        shown.append(f"`{key}` ({', '.join(owners[:3])}{more})")
+    return ", ".join(shown)
+
+
+def text() -> str:
+    """Returns the comparison for the documentation."""
+    modules, arguments, methods = compared()
+    n, of = (sum(row[i] for row in modules.values()) for i in (0, 1))
+    complete = ", ".join(f"`{path}`" for path, (_, _, missing) in modules.items() if not missing)
+    lines = [f"{n} of {of} public classes and functions are where the original has them. Complete: {complete}.", ""]
+    lines += ["| module | names | missing |", "|---|---|---|"]
+    for path, (there, total, missing) in modules.items():
+        if missing:
+            lines.append(f"| `{path}` | {there} of {total} | {', '.join(f'`{name}`' for name in missing)} |")
+    lines += [
+        "",
+        f"Arguments that are not taken: {names_of(arguments)}.",
+        "",
+        f"Methods that are missing: {names_of(methods)}.",
+    ]
+    return "\n".join(lines)
+
+
+def examples() -> str:
+    """Returns how many examples of each page of the original's documentation run, for the documentation."""
+    from tests.sb3.examples import EXAMPLES
+
+    counts: dict[str, list[int]] = {}
+    for one in EXAMPLES:
+        row = counts.setdefault(one.page, [0, 0, 0])
+        row[2 if one.needs == "ale_py" else 1 if one.fails else 0] += 1
+    n = sum(row[0] for row in counts.values())
+    lines = [f"{n} of {len(EXAMPLES)} examples run.", "", "| page | run | fail | not tried |", "|---|---|---|---|"]
+    lines += [
+        f"| {page} | {' | '.join(str(count) if count else '' for count in row)} |" for page, row in counts.items()
+    ]
+    reasons = [f"- {one.run.__name__.replace('_', ' ')}: {one.fails}" for one in EXAMPLES if one.fails]
+    return "\n".join([*lines, "", *reasons, "- not tried: ale-py is not installed where the tests run"])
+
+
+def suite() -> str:
+    """Returns how the original's own tests end here, for the documentation."""
+    content = json.loads((ROOT / "trials" / "results" / "sb3_suite.json").read_text(encoding="utf-8"))
+    if not content["files"]:
+        raise FileNotFoundError("the tests were not run")
+    kinds = [*dict.fromkeys(kind for row in content["files"] for kind in row["kinds"])]
+    kinds.sort(key=lambda kind: -sum(row["kinds"].get(kind, 0) for row in content["files"]))
+    original = {row["file"]: row for row in content["original"]}
+    lines = [f"| file | original passes | passes here | {' | '.join(kinds)} |", "|---|---|---|" + "---|" * len(kinds)]
+    total: dict[str, Any] = {"file": "all", "passed": 0, "kinds": {}}
+    for row in [*content["files"], total]:
+        there = original.get(row["file"], {}).get("passed", sum(one["passed"] for one in original.values()))
+        numbers = [str(row["kinds"].get(kind, "")) for kind in kinds]
+        lines.append(f"| {row['file'].removesuffix('.py')} | {there} | {row['passed']} | {' | '.join(numbers)} |")
+        total["passed"] += row["passed"]
+        total["kinds"] = {kind: total["kinds"].get(kind, 0) + row["kinds"].get(kind, 0) for kind in kinds}
+    return "\n".join([f"{content['commit']}, {content['date']}, `{content['command']}`", "", *lines])
+
+
+def same_scripts() -> str:
+    """Returns what one script reaches with either library, for the documentation."""
+    from scipy import stats
+
+    folder = ROOT / "benchmarks" / "results" / "sb3_scripts"
+    runs = {
+        name: json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["runs"]
+        for name in ("original", "rejeu")
+    }
+    lines = [
+        "| | task | steps | seeds | Stable-Baselines3 | rejeu | intervals overlap |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for algorithm in dict.fromkeys(run["algorithm"] for run in runs["rejeu"]):
+        shown, limits = [], []
+        for rows in runs.values():
+            own = [run for run in rows if run["algorithm"] == algorithm]
+            values = [run["mean_return"] for run in own]
+            mean, half = statistics.mean(values), 0.0
+            half = float(stats.t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / len(values) ** 0.5
+            limits.append((mean - half, mean + half))
+            shown.append(f"{mean:.1f} [{mean - half:.1f}, {mean + half:.1f}]")
+        overlap = max(low for low, _ in limits) <= min(high for _, high in limits)
+        first = f"| {algorithm} | {own[0]['env_id']} | {own[0]['steps']:,} | {len(own)} |"
+        lines.append(f"{first} {' | '.join(shown)} | {'yes' if overlap else 'no'} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["record"]:
+        one_line = ",\n".join(f"{json.dumps(path)}: {json.dumps(names)}" for path, names in recorded().items())
+        DATA.write_text(f"{{\n{one_line}\n}}\n", encoding="utf-8")
+    else:
+        print(text())
