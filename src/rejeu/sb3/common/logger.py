@@ -253,7 +253,7 @@ def _add(summary: Any, key: str, value: Any) -> None:
             setattr(start.hparams[name], f"{kind}_value", str(one) if kind == "string" else one)
         for tag, content in (
             (metadata.EXPERIMENT_TAG, {"experiment": api_pb2.Experiment(metric_infos=names)}),
-            (metadata.SESSION_START_TAG, {"session_start_info": start}),
+            (metadata.SESSION_START_INFO_TAG, {"session_start_info": start}),
         ):
             about = metadata.create_summary_metadata(plugin_data_pb2.HParamsPluginData(**content))
             summary.value.add(tag=tag, metadata=about)
