@@ -54,7 +54,7 @@ def cases() -> Iterator[tuple[str, str, str, dict[str, Any]]]:
 def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, Any]]:
     """Returns the check of each format, with the size of its file."""
     one = exporting.policy_for(agent, False, 1)
-    recording, _ = exporting.record(agent, one, None)
+    recording, *_ = exporting.record(agent, one, None)
     runs: dict[str, tuple[Run, int]] = {}
     card = exporting.card_of(agent, one, "c", "", None)
     for target in ("onnx", "c", "stablehlo"):

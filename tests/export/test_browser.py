@@ -48,7 +48,7 @@ def test_a_page_acts_as_predict_and_is_played_by_keys(env_id, width, browser, tm
     monkeypatch.setattr(check, "OBSERVATIONS", 100)
     agent = agent_for(env_id)
     path, one = agent.export(tmp_path / "page.html").path, exporting.policy_for(agent, False, 1)
-    recording, _ = exporting.record(agent, one, None)
+    recording, *_ = exporting.record(agent, one, None)
     page, messages, requests = browser.new_page(viewport={"width": width, "height": 800}), [], []
     page.on("console", lambda message: messages.append(message.text))
     page.on("pageerror", lambda error: messages.append(str(error)))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
+from gymnasium.wrappers import FrameStackObservation
 
 import rejeu
 from rejeu import spaces
@@ -122,6 +124,71 @@ def test_memory_and_masks_are_inputs_that_matter(tmp_path):
     assert action.tolist() == [1, 2, 3]
 
 
+class Counting(gym.Env):
+    """Images, or vectors, that hold the number of the step; episodes of 7 steps."""
+
+    def __init__(self, shape=(3, 40)):
+        self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+        self.action_space = gym.spaces.Box(-2, 2, (2,), np.float32)
+
+    def observation(self):
+        return np.full(self.observation_space.shape, 20 * self.n + 5, np.uint8) + self.np_random.integers(
+            0, 5, self.observation_space.shape, np.uint8
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n = 0
+        return self.observation(), {}
+
+    def step(self, action):
+        self.n += 1
+        return self.observation(), 0.0, self.n == 7, False, {}
+
+
+@pytest.mark.parametrize("padding", ["reset", "zero"])
+@pytest.mark.parametrize("target", ["onnx", "c", "stablehlo"])
+def test_frames_are_stacked_inside_of_a_file(padding, target, tmp_path, monkeypatch):
+    make = lambda: FrameStackObservation(Counting(), 4, padding_type=padding)  # noqa: E731
+    agent = rejeu.PPO("MlpPolicy", make(), seed=0, policy_kwargs={"net_arch": [16]})
+    monkeypatch.setattr(exporting, "environment", lambda *_: (agent.make_envs(make(), 1, seed=0), None))
+    path = tmp_path / f"policy{exporting.SUFFIXES[target]}"
+    found = agent.export(path, frame_stack=4)
+    assert found.check.difference <= 1e-5
+    card = json.loads(found.card.read_text())
+    assert card["frame_stack"] == {"n": 4, "padding": padding}
+    assert [(one["name"], one.get("shape")) for one in card["inputs"]] == [
+        ("observation", [3, 40]), ("state_0", [4, 3, 40]), ("episode_start", []),
+    ]  # fmt: skip
+
+
+def test_the_frames_of_replay_and_of_channels_are_stacked_too(tmp_path):
+    images = rejeu.DQN(
+        "MlpPolicy", DiscreteActions(FrameStackObservation(Counting(), 4)), seed=0, frame_stack=4, buffer_size=500
+    )
+    assert images.export(tmp_path / "policy.onnx").check.difference <= 1e-5
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    frames, stack, start = np.zeros((5, 3, 40), np.uint8), np.zeros((5, 4, 3, 40), np.uint8), np.zeros(5, bool)
+    assert session.run(None, {"observation": frames, "state_0": stack, "episode_start": start})[1].shape == stack.shape
+    vectors = agent_of("SAC", "Box")
+    found = vectors.export(tmp_path / "vectors.c", frame_stack=2)
+    assert found.check.difference <= 1e-5
+    assert "_OBSERVATION_SIZE 2" in (tmp_path / "vectors.h").read_text()
+    with pytest.raises(ValueError, match=r"frame_stack=3 does not fit observations of the shape \[4\]"):
+        vectors.export(tmp_path / "other.c", frame_stack=3)
+
+
+class DiscreteActions(gym.ActionWrapper):
+    """Actions of no effect."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gym.spaces.Discrete(3)
+
+    def action(self, action):
+        return np.zeros(2, np.float32)
+
+
 def test_noise_is_an_input(tmp_path):
     agent = agent_of("SAC", "Box")
     session = onnxruntime.InferenceSession(agent.export(tmp_path / "policy.onnx", noise=True).path)
@@ -196,7 +263,7 @@ def test_a_file_that_differs_is_not_kept(tmp_path, monkeypatch):
 def test_choices_that_differ_must_be_equally_good():
     agent = agent_of("PPO", "Discrete")
     one = exporting.policy_for(agent, False, 1)
-    recording, _ = exporting.record(agent, one, None)
+    recording, *_ = exporting.record(agent, one, None)
     run = lambda inputs: (recording.actions % 3 + 1, np.ones(100))  # noqa: E731
     assert check.compare(one, recording, run).difference == 1.0
     equal = jax.tree.map(np.zeros_like, agent.state)

@@ -204,7 +204,13 @@ class Agent(BaseAgent):
         return write
 
     def export(
-        self, path: str | Path, to: Target | None = None, *, noise: bool = False, batch: int | None = None
+        self,
+        path: str | Path,
+        to: Target | None = None,
+        *,
+        noise: bool = False,
+        batch: int | None = None,
+        frame_stack: int | None = None,
     ) -> Exported:
         """Writes the policy to a file that acts as :meth:`predict` does, outside of rejeu.
 
@@ -220,6 +226,8 @@ class Agent(BaseAgent):
                 MountainCar, MountainCarContinuous, Ball or parking.
             noise: sample from the policy, with the random numbers as further inputs; else take its mode.
             batch: observations at once; None for any number. C and pages take one.
+            frame_stack: frames of which each observation is a stack, as of ``FrameStackObservation`` or ``VecFrameStack``. The
+                file takes single frames then, and the stack is a part of its state. None for the agent's ``frame_stack``.
 
         Raises:
             ValueError: if a part of the policy cannot be expressed in the format, or the file acts otherwise than
@@ -228,7 +236,7 @@ class Agent(BaseAgent):
             OSError: if the file cannot be written.
         """
         with devices.chosen(self.device):
-            return exporting.export(self, path, to, noise, batch)
+            return exporting.export(self, path, to, noise, batch, frame_stack=frame_stack)
 
     @classmethod
     def load(cls, path: str | Path, env: Any = None, **changes: Any) -> Self:

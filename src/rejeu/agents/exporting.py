@@ -16,13 +16,14 @@ import numpy as np
 
 from rejeu import spaces
 from rejeu.agents.base import BaseAgent
+from rejeu.buffers.ring import stacked_leaves
 from rejeu.core import Masked
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
 from rejeu.export import c_file, check, stablehlo_file, web_file
 from rejeu.export.check import Check, Recording, Run
-from rejeu.export.contract import CARD, Policy, policy_of
+from rejeu.export.contract import CARD, FrameStack, Policy, frame_stack_of, policy_of
 from rejeu.io import atomic
 from rejeu.loops import nonfinite
 
@@ -81,6 +82,7 @@ def export(
     batch: int | None,
     make_env: Callable[[], Any] | None = None,
     source: str = "",
+    frame_stack: int | None = None,
 ) -> Exported:
     """Writes the policy of an agent; the arguments are those of :meth:`rejeu.SAC.export`.
 
@@ -92,6 +94,7 @@ def export(
         batch: observations at once.
         make_env: makes an environment in which observations are recorded; None for that of the agent.
         source: the run or model it is from, for the card.
+        frame_stack: frames of an observation; None for those of the agent's setting of that name.
     """
     path = Path(path)
     target = target_of(path, to)
@@ -106,10 +109,14 @@ def export(
         batch = 1
     elif batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 1):
         raise ValueError(f"batch={batch!r} must be a number of observations, or None for any number")
-    made = policy_for(agent, noise, batch)
-    one = made if batch == 1 else policy_for(agent, noise, 1)
-    recording, duration = record(agent, one, make_env)
+    stack = stack_of(agent, frame_stack)
+    one = policy_for(agent, noise, 1, stack)
+    recording, duration, stack = record(agent, one, make_env, stack)
+    one = one if stack is None else policy_for(agent, noise, 1, stack)
+    made = one if batch == 1 else policy_for(agent, noise, batch, stack)
     card = card_of(agent, made, target, source, duration)
+    if stack is not None:
+        card["frame_stack"] = {"n": stack.n, "padding": "zero" if stack.zeros else "reset"}
     contents, run = written(made, one, card, target, path.stem, made_from(agent) or (None, {}))
     found = None if run is None else check.compare(one, recording, run)
     if found is not None and not found.difference <= check.LARGEST_DIFFERENCE:
@@ -166,12 +173,22 @@ def written(
     return (content,), check.onnx_run(one, content if single else onnx_file.write(one, card))
 
 
-def policy_for(agent: BaseAgent, noise: bool, batch: int | None) -> Policy:
+def stack_of(agent: BaseAgent, n: int | None) -> FrameStack | None:
+    """Returns of which frames the observations of an agent are made; None if they are no stacks."""
+    own = getattr(agent.config, "frame_stack", None)
+    if n is None and own is not None:
+        flags = stacked_leaves(agent.obs_leaves, own)
+        pairs = zip(agent.obs_leaves, flags, strict=True)
+        return FrameStack(own, tuple(-len(leaf.shape) if flag else None for leaf, flag in pairs))
+    return None if n is None else frame_stack_of(agent.obs_leaves, n)
+
+
+def policy_for(agent: BaseAgent, noise: bool, batch: int | None, stack: FrameStack | None = None) -> Policy:
     """Returns the policy of an agent as a program."""
     algorithm = agent.learner.algorithm
     mask = mask_leaf(agent.action_space, "the environment") if agent.takes_masks else None
     actor = jax.tree.map(np.asarray, algorithm.actor(agent.state))
-    return policy_of(algorithm, actor, agent.observation_space, agent.action_space, mask, batch, noise)
+    return policy_of(algorithm, actor, agent.observation_space, agent.action_space, mask, batch, noise, stack)
 
 
 def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
@@ -201,8 +218,12 @@ def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: 
     }
 
 
-def record(agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None) -> tuple[Recording, float | None]:
-    """Returns observations with the actions of ``predict``, and the duration of a step in seconds if it is known.
+def record(
+    agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None, stack: FrameStack | None = None
+) -> tuple[Recording, float | None, FrameStack | None]:
+    """Returns observations with the actions of ``predict``, the duration of a step in seconds if it is known, and the stack.
+
+    Of stacks of frames the newest frames are kept; how an episode begins is read from its first observation.
 
     They are recorded in a new environment like those it was trained on, in which the agent acts; where none can be made,
     they are samples of the observation space.
@@ -217,6 +238,8 @@ def record(agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None) ->
     obs = vector.reset(0) if vector is not None else _sample(agent, one, rng)
     try:
         while len(rows) < check.OBSERVATIONS and time.perf_counter() < end:
+            if vector is None and stack is not None:
+                obs = _restacked(agent, stack, obs, rows[-1] if rows else None, bool(ended[0]))
             arrays = [np.array(array[0]) for array in jax.tree.leaves(obs)]
             action, memory = agent.predict(obs, memory, ended, deterministic=True)  # type: ignore[attr-defined]
             rows.append(arrays)
@@ -231,13 +254,18 @@ def record(agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None) ->
     finally:
         if vector is not None:
             vector.close()
-    columns = zip(ports, zip(*rows, strict=True), strict=True)
-    inputs = {port.name: np.stack(column).astype(port.dtype) for port, column in columns}
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    if stack is not None:
+        n_leaves = len(stack.axes)
+        if vector is not None:
+            stack = stack._replace(zeros=stack.begins_with_zeros([one[starts] for one in columns[:n_leaves]]))
+        columns[:n_leaves] = [np.asarray(stack.newest(i, one)) for i, one in enumerate(columns[:n_leaves])]
+    inputs = {port.name: column.astype(port.dtype) for port, column in zip(ports, columns, strict=True)}
     inputs |= {port.name: np.array(starts) for port in one.of("episode_start")}
     for port in one.of("noise"):  # with these numbers a sample is the mode
         number = 0.0 if port.drawn == "normal" else 0.5
         inputs[port.name] = np.full((len(rows), *port.shape), number, port.dtype)
-    return Recording(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration
+    return Recording(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration, stack
 
 
 def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:
@@ -266,6 +294,18 @@ def seconds_per_step(env: Any) -> float | None:
         return 1.0 / float(config["policy_frequency"])
     found = next((value for name in ("dt", "tau") if isinstance(value := getattr(inner, name, None), float)), None)
     return None if found is None else float(found)
+
+
+def _restacked(agent: BaseAgent, stack: FrameStack, obs: Any, before: list[np.ndarray] | None, starts: bool) -> Any:
+    """Returns an observation whose newest frames are those of a sample, and the others those before."""
+    masked = obs if isinstance(obs, Masked) else None
+    leaves, structure = jax.tree.flatten(obs if masked is None else masked.obs)
+    for i, axis in enumerate(stack.axes):
+        if axis is not None:
+            last = leaves[i][0] if before is None else before[i]
+            leaves[i] = np.asarray(stack.pushed(i, last, stack.newest(i, leaves[i][0]), starts))[None]
+    found = jax.tree.unflatten(structure, leaves)
+    return found if masked is None else masked._replace(obs=found)
 
 
 def _sample(agent: BaseAgent, one: Policy, rng: np.random.Generator) -> Any:

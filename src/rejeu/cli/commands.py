@@ -231,6 +231,9 @@ class Export(RunOptions):
     """Sample from the policy, with the random numbers as inputs, instead of taking its mode."""
     batch: Count = None
     """Observations at once; by default any number. C and web pages take one."""
+    frame_stack: Count = None
+    """Frames of which each observation is a stack: the file then takes single frames. By default those of the agent's
+    setting frame_stack."""
     which: Which = "best"
     json: Json = False
 

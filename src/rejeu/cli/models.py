@@ -68,7 +68,8 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
         if arguments.env is not None:
             raise
         echo(f"the observations are sampled from the observation space, because there is no environment: {error}")
-    found = export(load(model), out, to, arguments.noise, arguments.batch, make_env, str(arguments.run))
+    agent, settings = load(model), (arguments.noise, arguments.batch)
+    found = export(agent, out, to, *settings, make_env, str(arguments.run), arguments.frame_stack)
     echo(found)
     return 0, found.to_dict()
 

@@ -42,6 +42,62 @@ class Port(NamedTuple):
         return {key: value for key, value in self._asdict().items() if value not in (None, "")}
 
 
+class FrameStack(NamedTuple):
+    """Observations that are stacks of frames, the newest last."""
+
+    n: int
+    """Frames of a stack."""
+    axes: tuple[int | None, ...]
+    """Of each leaf: the axis of its frames, from the end; None for a leaf that is no stack."""
+    zeros: bool = False
+    """Whether a stack is filled up with zeros at the start of an episode, else with its first frame."""
+
+    def newest(self, i: int, array: Any) -> Any:
+        """Returns the newest frame of leaf ``i``, with any further axes before."""
+        axis = self.axes[i]
+        if axis is None:
+            return array
+        width = array.shape[axis] // self.n
+        frame = jnp.split(array, [array.shape[axis] - width], axis)[1]
+        return frame.squeeze(axis) if width == 1 and axis != -1 else frame
+
+    def pushed(self, i: int, stack: Any, frame: Any, start: Any) -> Any:
+        """Returns the stack of leaf ``i`` after another frame, or the first one of an episode."""
+        axis = self.axes[i]
+        assert axis is not None
+        frame = frame if frame.ndim == stack.ndim else jnp.expand_dims(frame, axis)
+        older = jnp.split(stack, [frame.shape[axis]], axis)[1]
+        first = jnp.zeros_like(older) if self.zeros else jnp.concatenate([frame] * (self.n - 1), axis)
+        return jnp.concatenate([jnp.where(start, first, older), frame], axis)
+
+    def begins_with_zeros(self, arrays: list[Any]) -> bool:
+        """Returns whether these first observations of episodes, by leaf, hold zeros besides the newest frame."""
+        frames = [i for i, axis in enumerate(self.axes) if axis is not None]
+        empty = self._replace(zeros=True)
+        return all(
+            np.array_equal(empty.pushed(i, one, self.newest(i, one), True), one) for i in frames for one in arrays[i]
+        )
+
+
+def frame_stack_of(leaves: tuple[Leaf, ...], n: int) -> FrameStack:
+    """Returns how observations of whole stacks are made of frames: along a first axis of length ``n``, else along channels.
+
+    Raises:
+        ValueError: if ``n`` is no number of frames, or a leaf cannot be such a stack.
+    """
+    axes: list[int | None] = []
+    for leaf in leaves:
+        shape = leaf.shape or (1,)
+        is_first = shape[0] == n or (leaf.kind == "image" and shape[0] == min(shape))
+        axis = -len(shape) if is_first else -1
+        if isinstance(n, bool) or n < 2 or shape[axis] % n:
+            raise ValueError(
+                f"frame_stack={n!r} does not fit {leaf.path or 'observations'} of the shape {list(leaf.shape)}"
+            )
+        axes.append(axis)
+    return FrameStack(n, tuple(axes))
+
+
 class Policy(NamedTuple):
     """A policy as a program. Every array has a leading batch axis."""
 
@@ -66,6 +122,7 @@ def policy_of(
     mask: Leaf | None,
     batch: int | None = None,
     noise: bool = False,
+    stack: FrameStack | None = None,
 ) -> Policy:
     """Returns the policy of an algorithm from raw observations to actions of the environment.
 
@@ -77,6 +134,7 @@ def policy_of(
         mask: of the allowed actions, None for policies without.
         batch: number of observations at once, None for a free number.
         noise: sample from the policy, with the random numbers as inputs; else its mode.
+        stack: of which frames observations are made; the inputs are single frames then, and the stacks a part of the state.
 
     Raises:
         ValueError: if a free batch size or the drawing cannot be expressed, or ``noise`` is for a deterministic policy.
@@ -88,12 +146,24 @@ def policy_of(
     assert explorer is not None
     carry = explorer.init(actor, 1) if has_memory else ()
     memory, carry_structure = jax.tree.flatten(carry)
+    n_carry, stacked = len(memory), [i for i, axis in enumerate(stack.axes) if axis is not None] if stack else []
+    memory += [np.zeros((1, *leaves[i].shape), leaves[i].dtype) for i in stacked]
+    has_state = bool(memory)
+    parts = [*spaces.parts(observation_space, observation_space)]
+    if stack:
+        for i in stacked:
+            low, high = (np.asarray(stack.newest(i, one)) for one in (parts[i].low, parts[i].high))
+            parts[i] = gym.spaces.Box(low, high, dtype=parts[i].dtype)
     scale = action_scaler(action_space)
 
     def act(obs: list[Array], mask: Array | None, memory: list[Array], start: Any, key: Any) -> list[Array]:
+        stacks = [
+            stack.pushed(i, one, obs[i], start) for i, one in zip(stacked, memory[n_carry:], strict=True) if stack
+        ]
+        obs = [stacks[stacked.index(i)] if i in stacked else one for i, one in enumerate(obs)]
         arrays: PyTree = jax.tree.unflatten(structure, [one[None] for one in obs])
         arrays = arrays if mask is None else Masked(arrays, mask[None])
-        before = jax.tree.unflatten(carry_structure, [one[None] for one in memory])
+        before = jax.tree.unflatten(carry_structure, [one[None] for one in memory[:n_carry]])
         after: PyTree = ()
         if noise:
             ended = jnp.ones(1, bool) if start is None else start[None]
@@ -102,27 +172,29 @@ def policy_of(
             action, after = algorithm.recall(before, actor, arrays, start[None])  # type: ignore[misc]
         else:
             action = algorithm.exploit(actor, arrays)
-        return [scale(action)[0], *(one[0] for one in jax.tree.leaves(after) if has_memory)]
+        return [scale(action)[0], *(one[0] for one in jax.tree.leaves(after) if has_memory), *stacks]
 
     example = lambda shape, dtype: ShapeDtypeStruct((size, *shape), dtype)  # noqa: E731
     arguments = (
-        [example(leaf.shape, leaf.dtype) for leaf in leaves],
+        [
+            example(part.shape if i in stacked else leaf.shape, leaf.dtype)
+            for i, (leaf, part) in enumerate(zip(leaves, parts, strict=True))
+        ],
         None if mask is None else example(mask.shape, bool),
         [example(one.shape[1:], one.dtype) for one in memory],
-        example((), bool) if has_memory else None,
+        example((), bool) if has_state else None,
         example((2,), np.uint32) if noise else None,
     )
     program = trace(jax.vmap(act), *arguments, draws=noise)
     if noise and not program.draws:
         raise ValueError("noise=True is for policies that are sampled from; this one always returns the same action")
-    parts = spaces.parts(observation_space, observation_space)
     inputs = [
-        Port(leaf.path or "observation", "observation", leaf.shape, leaf.dtype, *bounds(part))
-        for leaf, part in zip(leaves, parts, strict=True)
+        Port(leaf.path or "observation", "observation", tuple(example.shape[1:]), leaf.dtype, *bounds(part))
+        for leaf, part, example in zip(leaves, parts, arguments[0], strict=True)
     ]
     state = [Port(f"state_{i}", "state", one.shape[1:], str(one.dtype)) for i, one in enumerate(memory)]
     inputs += [] if mask is None else [Port("action_mask", "action_mask", mask.shape, "bool")]
-    inputs += [*state, Port("episode_start", "episode_start", (), "bool")] if has_memory else []
+    inputs += [*state, Port("episode_start", "episode_start", (), "bool")] if has_state else []
     for i, (kind, value) in enumerate(program.draws):
         inputs.append(Port(f"noise_{i}", "noise", value.shape[1:], str(value.dtype), drawn=kind))
     is_integer = isinstance(action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
