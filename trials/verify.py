@@ -1,0 +1,473 @@
+"""One update of every algorithm that rejeu shares with Stable-Baselines3 and its Contrib package, against the original.
+
+The two parts run in the environments of the two libraries::
+
+    python trials/verify.py record FOLDER             # with stable-baselines3 and sb3-contrib
+    python trials/verify.py compare FOLDER            # with rejeu
+
+``record`` makes a small model of each algorithm, moves its targets away from its networks, and lets it learn three times: from
+three batches, or from three rollouts in a made-up environment. It writes the zip files before, after the first and after the
+third update, and an npz file of the batches or rollouts, the losses and the noise that was drawn. The library is unchanged
+except for the source of this noise and of the order of minibatches, and that CrossQ takes the biased variance of a batch.
+
+``compare`` reads the first zip file, takes the same updates from the same numbers, and reads the other zip files as well.
+Since optimizers are read too, the gradient of the first update is compared by Adam's first moment. It prints the largest
+differences and writes them to ``trials/results/verify.json``, from which the page "How we check" has its table.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results" / "verify.json"
+OBS, ACTIONS, CHOICES, BATCH, STEPS, ENVS, UPDATES = 3, 2, 4, 16, 16, 2, 3
+ALPHA = {"ent_coef": "auto_0.3"}
+OFF: dict[str, dict[str, Any]] = {
+    "DQN": {"target_update_interval": 1000, "max_grad_norm": 0.1},
+    "QRDQN": {"target_update_interval": 1000, "max_grad_norm": 0.1},
+    "SAC": {"tau": 0.1, **ALPHA},
+    "TD3": {"tau": 0.1, "policy_delay": 2},
+    "DDPG": {"tau": 0.1},
+    "TQC": {"tau": 0.1, "top_quantiles_to_drop_per_net": 2, **ALPHA},
+    "CrossQ": {"policy_delay": 1, **ALPHA},
+}
+WHOLE = {"n_steps": STEPS, "normalize_advantage": False, "gae_lambda": 0.9}
+JOINT = {**WHOLE, "batch_size": STEPS * ENVS, "ent_coef": 0.02}
+ON: dict[str, dict[str, Any]] = {
+    "PPO": {**JOINT, "n_epochs": 3, "clip_range": 0.1},
+    "PPO, Discrete": {**JOINT, "n_epochs": 3, "clip_range_vf": 0.1},
+    "A2C": {**WHOLE, "ent_coef": 0.02, "use_rms_prop": False},
+    "RecurrentPPO": {**JOINT, "n_epochs": 2},
+    "MaskablePPO": {**JOINT, "n_epochs": 3},
+    "TRPO": {**WHOLE, "batch_size": STEPS * ENVS, "n_critic_updates": 2},
+    "TRPO, Discrete": {**WHOLE, "batch_size": STEPS * ENVS, "n_critic_updates": 2},
+}
+BOX = ("SAC", "TD3", "DDPG", "TQC", "CrossQ", "PPO", "A2C", "RecurrentPPO", "TRPO")
+"""Those with Box actions; the others have Discrete ones."""
+LOSSES = (
+    "policy_loss",
+    "policy_gradient_loss",
+    "value_loss",
+    "entropy_loss",
+    "approx_kl",
+    "clip_fraction",
+    "loss",
+    "critic_loss",
+    "actor_loss",
+    "ent_coef",
+    "ent_coef_loss",
+    "policy_objective",
+    "kl_divergence_loss",
+)
+
+
+def spaces_of(name: str) -> tuple[Any, Any]:
+    """Returns the spaces of observations and actions."""
+    from gymnasium import spaces
+
+    action = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32) if name in BOX else spaces.Discrete(CHOICES)
+    return spaces.Box(-5.0, 5.0, (OBS,), np.float32), action
+
+
+# With Stable-Baselines3.
+
+
+def made_up(name: str) -> Any:
+    """Returns an environment of random numbers whose episodes end by terminal states, with masks of actions."""
+    import gymnasium as gym
+
+    class MadeUp(gym.Env):
+        observation_space, action_space = spaces_of(name)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            super().reset(seed=seed)
+            return self.seen(), {}
+
+        def seen(self) -> np.ndarray:
+            return self.np_random.normal(size=OBS).astype(np.float32)
+
+        def step(self, action: Any) -> Any:
+            over = bool(self.np_random.random() < 0.2)
+            return self.seen(), float(self.np_random.normal()), over, False, {}
+
+        def action_masks(self) -> np.ndarray:
+            return np.arange(CHOICES) != self.np_random.integers(CHOICES)
+
+    return MadeUp
+
+
+def record(folder: Path) -> None:
+    """Writes the files of every algorithm to ``folder``."""
+    import sb3_contrib
+    import stable_baselines3 as sb3
+    import torch
+    from stable_baselines3.common.logger import Logger
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, settings in (OFF | ON).items():
+        torch.manual_seed(0)
+        kind = name.split(",")[0]
+        cls = getattr(sb3, kind, None) or getattr(sb3_contrib, kind)
+        envs = DummyVecEnv([made_up(name)] * (1 if name in OFF else ENVS))
+        shape: dict[str, Any] = {"net_arch": [5, 4]}
+        shape |= {"lstm_hidden_size": 6, "net_arch": [5]} if kind == "RecurrentPPO" else {}
+        shape |= {"n_quantiles": 7} if kind in ("QRDQN", "TQC") else {}
+        policy = "MlpLstmPolicy" if kind == "RecurrentPPO" else "MlpPolicy"
+        model = cls(policy, envs, learning_rate=1e-2, gamma=0.9, seed=0, device="cpu", policy_kwargs=shape, **settings)
+        model.set_logger(Logger(None, []))
+        perturb(model, torch)
+        model.save(folder / f"{name}.0.zip")
+        data: dict[str, Any] = {}
+        if kind == "CrossQ":
+            torch.Tensor.var = lambda self, dim=None: torch.var(self, dim, unbiased=False)
+        for k in range(UPDATES):
+            found = (off_policy if name in OFF else on_policy)(model, kind, k, torch)
+            logged = {key.removeprefix("train/"): value for key, value in model.logger.name_to_value.items()}
+            found |= {key: np.float64(value) for key, value in logged.items() if key in LOSSES}
+            data |= {f"{k}.{key}": value for key, value in found.items()}
+            if k in (0, UPDATES - 1):
+                model.save(folder / f"{name}.{k + 1}.zip")
+        np.savez_compressed(folder / f"{name}.npz", **data)
+        print("recorded", name)
+    parts(folder)
+    versions = {
+        "stable-baselines3": sb3.__version__,
+        "sb3-contrib": sb3_contrib.__version__,
+        "torch": torch.__version__,
+    }
+    (folder / "versions.json").write_text(json.dumps(versions))
+
+
+def perturb(model: Any, torch: Any) -> None:
+    """Moves targets away from their networks, and the policy's standard deviation away from 1."""
+    rng = np.random.default_rng(1)
+    names = ("q_net_target", "quantile_net_target", "actor_target", "critic_target")
+    with torch.no_grad():
+        for target in filter(None, (getattr(model, name, None) for name in names)):
+            for value in target.parameters():
+                value += 0.3 * torch.tensor(rng.normal(size=value.shape), dtype=torch.float32)
+        if hasattr(getattr(model, "actor", None), "log_std"):
+            model.actor.log_std.bias -= 1.5
+        if hasattr(model.policy, "log_std"):
+            model.policy.log_std -= 0.7
+
+
+def off_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
+    """Takes an update on a random batch, and returns the batch."""
+    rng = np.random.default_rng(k)
+    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    is_box = kind in BOX
+    data = {
+        "obs": 0.5 * f32(BATCH, OBS),
+        "action": np.tanh(f32(BATCH, ACTIONS)) if is_box else rng.integers(CHOICES, size=BATCH),
+        "reward": 2.0 * f32(BATCH),
+        "next_obs": 0.5 * f32(BATCH, OBS),
+        "terminated": np.arange(BATCH) % 3 == 0,
+        "actor_noise": f32(BATCH, ACTIONS),
+        "target_noise": f32(BATCH, ACTIONS),
+    }
+    order = ["target_noise", "actor_noise"] if kind == "CrossQ" else ["actor_noise", "target_noise"]
+    noises = iter([data[one] for one in order])
+    drawn = torch.distributions.normal._standard_normal, torch.Tensor.normal_
+    torch.distributions.normal._standard_normal = lambda shape, dtype, device: torch.tensor(next(noises))
+    torch.Tensor.normal_ = lambda self, mean=0.0, std=1.0: self.copy_(mean + std * torch.tensor(data["target_noise"]))
+    batch = SimpleNamespace(
+        observations=torch.tensor(data["obs"]),
+        actions=torch.tensor(data["action"]).reshape(BATCH, -1),
+        rewards=torch.tensor(data["reward"])[:, None],
+        next_observations=torch.tensor(data["next_obs"]),
+        dones=torch.tensor(data["terminated"], dtype=torch.float32)[:, None],
+        discounts=None,
+    )
+    model.replay_buffer = SimpleNamespace(sample=lambda size, env=None: batch)
+    model.train(1, BATCH)
+    torch.distributions.normal._standard_normal, torch.Tensor.normal_ = drawn
+    return data
+
+
+def on_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
+    """Collects a rollout, takes an update on it, and returns the rollout."""
+    from stable_baselines3.common.callbacks import ConvertCallback
+
+    if k == 0:
+        model._setup_learn(10**6)
+    callback = ConvertCallback(None)
+    callback.init_callback(model)
+    memory = getattr(model, "_last_lstm_states", None)
+    found = {}
+    if memory is not None:
+        cells = [("pi", memory.pi), ("vf", memory.vf)]
+        found = {f"memory.{who}.{i}": part[0].numpy().copy() for who, both in cells for i, part in enumerate(both)}
+    model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+    buffer = model.rollout_buffer
+    starts = np.concatenate([buffer.episode_starts, model._last_episode_starts[None]]).astype(bool)
+    obs = np.concatenate([buffer.observations, model._last_obs[None]])
+    found |= {
+        "obs": obs[:-1].copy(),
+        "next_obs": obs[1:].copy(),
+        "action": buffer.actions.copy(),
+        "reward": buffer.rewards.copy(),
+        "started": starts[0].copy(),
+        "ended": starts[1:].copy(),
+        "advantage": buffer.advantages.copy(),
+        "target": buffer.returns.copy(),
+    }
+    if kind == "MaskablePPO":
+        found["mask"] = buffer.action_masks.reshape(STEPS, ENVS, CHOICES).astype(bool)
+    with mock.patch(
+        "numpy.random.randint", return_value=0
+    ):  # RecurrentPPO's batches begin in the middle of an environment
+        model.train()
+    return found
+
+
+def parts(folder: Path) -> None:
+    """Records n-step returns, and observations and rewards that ``VecNormalize`` scaled."""
+    import gymnasium as gym
+    from stable_baselines3.common.buffers import NStepReplayBuffer
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    rng = np.random.default_rng(0)
+    space = gym.spaces.Box(-5.0, 5.0, (1,), np.float32)
+    buffer = NStepReplayBuffer(200, space, space, device="cpu", n_steps=3, gamma=0.9)
+    ends = rng.random(100) < 0.2
+    rewards = rng.normal(size=100).astype(np.float32)
+    for i in range(100):
+        row = lambda x: np.array([[x]], np.float32)  # noqa: E731
+        buffer.add(row(i), row(i + 0.5), row(0), rewards[i : i + 1], ends[i : i + 1], [{}])
+    sampled = buffer._get_samples(np.arange(97))
+    names = ("rewards", "dones", "discounts", "next_observations")
+    n_step = {name: getattr(sampled, name).numpy().ravel() for name in names}
+
+    envs = VecNormalize(DummyVecEnv([made_up("PPO")] * ENVS), gamma=0.9)
+    envs.seed(0)
+    found: dict[str, list[Any]] = {name: [] for name in ("raw", "scaled", "reward", "scaled_reward", "ended")}
+    found["scaled"].append(envs.reset())
+    found["raw"].append(envs.get_original_obs())
+    for _ in range(200):
+        scaled, reward, ended, _ = envs.step(np.zeros((ENVS, ACTIONS), np.float32))
+        for name, value in {
+            "raw": envs.get_original_obs(),
+            "scaled": scaled,
+            "reward": envs.get_original_reward(),
+            "scaled_reward": reward,
+            "ended": ended,
+        }.items():
+            found[name].append(value.copy())
+    normalized = {f"normalized.{name}": np.array(values) for name, values in found.items()}
+    n_step = {f"n_step.{name}": value for name, value in n_step.items()}
+    np.savez_compressed(folder / "parts.npz", ends=ends, rewards=rewards, **n_step, **normalized)
+
+
+# With rejeu.
+
+
+def compare(folder: Path) -> None:
+    """Takes the updates and writes the table."""
+    import subprocess
+
+    import jax
+
+    import rejeu
+
+    rows = []
+    for name in (*OFF, *ON):
+        rows.append(row := {"algorithm": name} | compared(folder, name))
+        shown = [f"{key} {value:.1e}" for key, value in row.items() if isinstance(value, float)]
+        print(f"{name:15} {'  '.join(shown)}  {row['note']}", flush=True)
+    for row in compared_parts(folder):
+        rows.append(row)
+        print(f"{row['algorithm']:15} numbers {row['numbers']:.1e}  {row['note']}", flush=True)
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=RESULTS.parent, capture_output=True, text=True, check=True
+    )
+    versions = json.loads((folder / "versions.json").read_text())
+    versions |= {"rejeu": rejeu.__version__, "jax": jax.__version__}
+    command = "python trials/verify.py record FOLDER; python trials/verify.py compare FOLDER"
+    content = {"command": command, "commit": commit.stdout.strip(), "versions": versions, "rows": rows}
+    RESULTS.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+NOTES = {
+    "TQC": "the losses of the critics are summed, and their mean there: gradients are compared after that factor",
+    "TRPO": "target_kl and cg_damping times the action dimensions, over which sb3-contrib takes the mean of the divergence",
+    "TRPO, Discrete": "conjugate gradients in single precision",
+    "CrossQ": "with the biased variance of a batch there, where sb3-contrib has the unbiased one",
+    "A2C": "with Adam: the default is TensorFlow's RMSprop here and PyTorch's there",
+}
+
+
+def compared(folder: Path, name: str) -> dict[str, Any]:
+    """Returns the largest differences of an algorithm's losses, gradients and weights, relative to numbers above 1."""
+    import jax
+
+    import rejeu.algorithms.actor_critic.steps as steps
+    from rejeu.io.checkpoint import tree_to_arrays
+    from rejeu.sb3.zip_files import load_zip
+
+    with np.load(folder / f"{name}.npz", allow_pickle=False) as file:
+        data = dict(file)
+    changes = {"target_kl": 0.01 * ACTIONS, "cg_damping": 0.1 * ACTIONS} if name == "TRPO" else {}
+    agent, first, last = (load_zip(folder / f"{name}.{k}.zip", **changes) for k in (0, 1, UPDATES))
+    kind = name.split(",")[0]
+    algorithm = agent.algorithm.make(agent.config, *spaces_of(name))
+    state, found = agent.state, {"losses": 0.0, "gradients": 0.0, "weights": 0.0, "weights after 3": 0.0}
+    normal = jax.random.normal
+    for k in range(UPDATES):
+        one = {key.removeprefix(f"{k}."): value for key, value in data.items() if key.startswith(f"{k}.")}
+        if name in OFF:
+            noises = iter(
+                [one[which] for which in (("target_noise",) if kind == "TD3" else ("target_noise", "actor_noise"))]
+            )
+            jax.random.normal = lambda key, shape=(), dtype=None, noises=noises: jax.numpy.array(next(noises))
+            batch = transition(one, kind)
+        else:
+            batch = rollout(one, kind, agent)
+            if kind != "RecurrentPPO":
+                ours = steps.samples(state.network, batch, agent.config.gae_lambda)
+                for field in ("advantage", "target"):
+                    given = np.asarray(getattr(ours, field)).reshape(STEPS, ENVS)
+                    found["advantages"] = max(found.get("advantages", 0.0), difference(given, one[field]))
+        try:
+            with jax.disable_jit():
+                state, metrics = algorithm.update(state, batch, clock(k))
+        finally:
+            jax.random.normal = normal
+        for loss in LOSSES:
+            if loss in metrics and loss in one and (kind, loss) not in UNLIKE:
+                factor = 2.0 if (kind, loss) == ("TQC", "critic_loss") else 1.0
+                found["losses"] = max(found["losses"], difference(float(metrics[loss]), factor * float(one[loss])))
+        if k in (0, UPDATES - 1):
+            given, theirs = tree_to_arrays(state), tree_to_arrays((first if k == 0 else last).state)
+            for key, value in theirs.items():
+                if value.dtype != np.float32 or key in ("actor_loss", "entropy"):
+                    continue
+                if "optimizer" in key:
+                    if k == 0 and ".mu." in f"{key}.":
+                        factor = 2.0 if kind == "TQC" and key.startswith("critics") else 1.0
+                        decay = 0.5 if kind == "CrossQ" and "alpha" not in key else 0.9
+                        apart = difference(given[key] / (1 - decay), factor * value / (1 - decay))
+                        found["gradients"] = max(found["gradients"], apart)
+                else:
+                    which = "weights" if k == 0 else "weights after 3"
+                    found[which] = max(found[which], difference(given[key], value))
+    return found | {"note": NOTES.get(name, "")}
+
+
+UNLIKE = {(kind, loss) for kind in ("PPO", "RecurrentPPO", "MaskablePPO") for loss in ("loss", "approx_kl")} | {
+    ("TRPO", "kl_divergence_loss")
+}
+"""Metrics that are something else there: those of the last minibatch or epoch, and the divergence in the other direction."""
+
+
+def clock(k: int) -> Any:
+    """Returns the clock of an update; the environment steps are such that DQN's target does not move."""
+    from rejeu.core import Clock
+
+    return Clock(np.uint32(1), np.uint32(0), np.float32(0.0))
+
+
+def difference(one: Any, two: Any) -> float:
+    """Returns the largest difference, relative to numbers above 1."""
+    one, two = np.float64(one), np.float64(two)
+    return float(np.max(np.abs(one - two) / np.maximum(1.0, np.abs(two)), initial=0.0))
+
+
+def transition(one: dict[str, Any], kind: str) -> Any:
+    """Returns a recorded batch."""
+    from rejeu.core import Transition
+
+    discount = np.where(one["terminated"], 0.0, 0.9).astype(np.float32)
+    action = one["action"].astype(np.float32 if kind in BOX else np.int32)
+    return Transition(one["obs"], action, one["reward"], one["next_obs"], discount)
+
+
+def rollout(one: dict[str, Any], kind: str, agent: Any) -> Any:
+    """Returns a recorded rollout."""
+    from rejeu.core import Masked, Rollout
+
+    memory: Any = ()
+    if kind == "RecurrentPPO":
+        memory = tuple(tuple(one[f"memory.{who}.{i}"] for i in (0, 1)) for who in ("pi", "vf"))
+    obs, next_obs = one["obs"], one["next_obs"]
+    if "mask" in one:
+        obs, next_obs = Masked(obs, one["mask"]), Masked(next_obs, np.ones_like(one["mask"]))
+    return Rollout(
+        obs=obs,
+        action=one["action"]
+        if kind in BOX and one["action"].shape[-1] == ACTIONS
+        else one["action"][..., 0].astype(np.int32),
+        reward=one["reward"],
+        next_obs=next_obs,
+        discount=np.where(one["ended"], 0.0, 0.9).astype(np.float32),
+        ended=one["ended"],
+        valid=np.ones((STEPS, ENVS), bool),
+        running_return=np.zeros((STEPS, ENVS), np.float32),
+        started=one["started"],
+        carry=memory,
+    )
+
+
+def compared_parts(folder: Path) -> list[dict[str, Any]]:
+    """Returns rows for n-step returns and for running statistics."""
+    import gymnasium as gym
+    import jax.numpy as jnp
+
+    from rejeu import spaces
+    from rejeu.buffers.ring import Ring
+    from rejeu.buffers.uniform import ReplayBuffer
+    from rejeu.normalization import NormalizationConfig, Normalizer, Statistics, merged, no_moments
+
+    with np.load(folder / "parts.npz", allow_pickle=False) as file:
+        data = dict(file)
+    space = gym.spaces.Box(-5.0, 5.0, (1,), np.float32)
+    ring = Ring(400, 1, spaces.leaves(space), spaces.structure(space), (1,), np.float32)
+    row = lambda x: np.array([[x]], np.float32)  # noqa: E731
+    ring.begin(row(0))
+    times = []
+    for i, (end, reward) in enumerate(zip(data["ends"], data["rewards"], strict=True)):
+        times.append(int(ring.head[0]))
+        ring.add(row(0), np.array([reward]), np.array([end]), row(i + 0.5))
+        if end:
+            ring.begin(row(i + 1))
+    buffer = ReplayBuffer(ring, 0.9, n_steps=3)
+    n = len(data["n_step.rewards"])
+    rows = ring.at(np.zeros(n, np.int64), np.array(times[:n]))
+    batch = buffer.batch((n,), rows, ring.read(rows.position), None)
+    discount = data["n_step.discounts"] * (1 - data["n_step.dones"])
+    goes_on = discount > 0
+    apart = [difference(batch.reward, data["n_step.rewards"]), difference(batch.discount, discount)]
+    apart.append(difference(batch.next_obs[goes_on, 0], data["n_step.next_observations"][goes_on]))
+    found = [{"algorithm": "n-step returns", "numbers": max(apart), "note": "NStepReplayBuffer"}]
+
+    recorded = {key.removeprefix("normalized."): value for key, value in data.items() if key.startswith("normalized.")}
+    normalizer = Normalizer([0], {0: (OBS,)}, NormalizationConfig(), 1.0)
+    obs_moments, returns, running, everyone = no_moments((OBS,)), no_moments(()), np.zeros(ENVS), jnp.ones(ENVS)
+    apart = []
+    for t, raw in enumerate(recorded["raw"]):
+        obs_moments = merged(obs_moments, jnp.asarray(raw), everyone)
+        statistics = Statistics((obs_moments,), returns)
+        if t >= 100:  # there statistics begin with a count of 1e-4
+            apart.append(difference(normalizer.obs(statistics, jnp.asarray(raw)), recorded["scaled"][t]))
+        if t:
+            reward = recorded["reward"][t - 1]
+            running = 0.9 * running + reward
+            returns = merged(returns, jnp.asarray(running, jnp.float32), everyone)
+            if t >= 100:
+                ours = normalizer.reward(Statistics((obs_moments,), returns), jnp.asarray(reward))
+                apart.append(difference(ours, recorded["scaled_reward"][t - 1]))
+            running[recorded["ended"][t - 1]] = 0.0
+    note = "VecNormalize, from the 100th step on: its statistics begin with a count of 1e-4"
+    return [*found, {"algorithm": "normalization", "numbers": max(apart), "note": note}]
+
+
+if __name__ == "__main__":
+    {"record": record, "compare": compare}[sys.argv[1]](Path(sys.argv[2]))
