@@ -49,6 +49,8 @@ def cases() -> Iterator[tuple[str, str, str, dict[str, Any]]]:
     for name, action in KINDS:
         for form, settings in FORMS.items():
             yield name, action, form, settings
+    for name in ("DQN", "QRDQN", "SAC", "A2C", "TRPO", "RecurrentPPO"):
+        yield name, "Discrete", "masks", {"action_masks": True}
 
 
 def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, Any]]:

@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.agents import exporting
+from rejeu.agents.exporting import SUFFIXES
 from rejeu.cli import main
 from rejeu.networks import Linear
 from tests.export.policies import agent_of, observations
+from tests.full_disk import FullDisk
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 WIDTH = 8
@@ -211,3 +214,24 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, capsys):
         assert out in error
     assert sorted(path.name for path in tmp_path.rglob("*"))[:2] == ["file", "model.safetensors"]
     assert (tmp_path / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize("target", ["c", "onnx", "stablehlo"])
+def test_a_full_disk_leaves_nothing_new(target, tmp_path, monkeypatch):
+    agent, disk = agent_of("PPO", "Box"), FullDisk(monkeypatch)
+    path = tmp_path / f"policy{SUFFIXES[target]}"
+    path.write_bytes(b"older")
+    run = exporting.written
+    monkeypatch.setattr(exporting, "written", lambda *args: (run(*args)[0], setattr(disk, "full", True)))
+    with pytest.raises(OSError, match="free some space") as error:
+        agent.export(path)
+    assert "\n" not in str(error.value)
+    assert disk.failures == 1
+    assert ([*tmp_path.iterdir()], path.read_bytes()) == ([path], b"older")
+
+
+def test_no_c_file_is_kept_without_its_header(tmp_path):
+    (tmp_path / "policy.h").mkdir()
+    with pytest.raises(OSError, match=r"policy.h.*give a path that is not a folder"):
+        agent_of("PPO", "Box").export(tmp_path / "policy.c")
+    assert [*tmp_path.iterdir()] == [tmp_path / "policy.h"]

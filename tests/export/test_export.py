@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 
 import gymnasium as gym
 import jax
@@ -16,7 +17,7 @@ from rejeu import spaces
 from rejeu.agents import exporting
 from rejeu.algorithms.sac.continuous import policy as sac_policy
 from rejeu.cli import main
-from rejeu.export import check, contract
+from rejeu.export import c_file, check, contract
 from rejeu.spaces import parts
 from tests.export.policies import KINDS, agent_of, observations
 from tests.tiers import crossed, exhaustive
@@ -247,6 +248,26 @@ def test_c_compiles_as_c_and_is_included_by_cpp(tmp_path):
     assert "#define MY_POLICY_SPEED_SIZE 3" in header
     assert "void my_policy_act(const int8_t bits[2], const uint8_t camera_left[432]" in header
     assert "void my_policy_reset(void);" in header
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang", "g++"])
+@pytest.mark.parametrize(
+    ("name", "observation"), [("RecurrentPPO", "small Dict"), pytest.param("CrossQ", "CNN", marks=exhaustive)]
+)
+def test_each_compiler_accepts_the_file_and_acts_as_predict(name, observation, compiler, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"there is no {compiler}")
+    agent = agent_of(name, "Box", observation, normalize=True)
+    one = exporting.policy_for(agent, False, 1)
+    source, header = c_file.write(one, exporting.card_of(agent, one, "c", "", None), "policy")
+    if compiler == "g++":
+        (tmp_path / "policy.h").write_bytes(header)
+        (tmp_path / "main.cc").write_text('#include "policy.h"\nint main() { policy_reset(); }')
+        subprocess.run([compiler, "-Wall", "-Wextra", "-Werror", "-c", "main.cc"], cwd=tmp_path, check=True)
+        return
+    recording, *_ = exporting.record(agent, one, None)
+    run = check.c_run(one, source, header, "policy", compiler)
+    assert check.compare(one, recording, run).difference <= 1e-5
 
 
 def test_a_file_that_differs_is_not_kept(tmp_path, monkeypatch):

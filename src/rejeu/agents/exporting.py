@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -128,9 +129,12 @@ def export(
     about = {**card, "sha256": hashlib.sha256(contents[0]).hexdigest(), "check": found and found._asdict()}
     card_path = path.with_name(f"{path.name}.json")
     files = [path, path.with_suffix(".h")][: len(contents)]
-    for file, content in [*zip(files, contents, strict=True), (card_path, json.dumps(about, indent=1).encode())]:
-        with atomic.replacing(file) as out:
+    contents = (*contents, json.dumps(about, indent=1).encode())
+    with ExitStack() as opened:  # all of them, or none
+        for file, content in zip((*files, card_path), contents, strict=True):
+            out = opened.enter_context(atomic.replacing(file))
             out.write(content)
+            out.flush()
     return Exported(path, card_path, target, len(contents[0]), found, note)
 
 
