@@ -5,7 +5,11 @@
 Training is the same as with ``rejeu train``, but without periodic evaluations. The final weights are evaluated on 100
 new episodes. With ``--best``, the agent is also evaluated during training, as often as the preset specifies. The best
 weights of these evaluations are then evaluated on new episodes. The results are written to
-``benchmarks/results/learning/ENV-ALGO.json``, with the command, the versions and the hyperparameters.
+``benchmarks/results/learning/ENV-ALGO.json``, with the command, the versions and the hyperparameters. ``--shown`` leaves of
+the observations only some components, which makes Pendulum partially observable, and ``--set`` changes hyperparameters of the
+preset::
+
+    python benchmarks/learning.py Pendulum-v1 SAC --shown 0 1 --set '{"policy_kwargs": {"lstm_hidden_size": 64}}' --name NAME
 """
 
 from __future__ import annotations
@@ -21,7 +25,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import TransformObservation
 from scipy import stats
 
 import rejeu
@@ -29,6 +35,7 @@ from rejeu import presets, validation
 from rejeu.algorithms import config as configs
 from rejeu.callbacks import Evaluate
 from rejeu.envs import make_vector
+from rejeu.envs.make import VectorEnv
 
 RESULTS = Path(__file__).parent / "results" / "learning"
 
@@ -36,14 +43,20 @@ RESULTS = Path(__file__).parent / "results" / "learning"
 def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) -> dict:
     backend = arguments.backend or preset.backend
     began = time.perf_counter()
-    env = make_vector(preset.env_id, preset.n_envs, backend, seed, **arguments.env)
+
+    def environments(n: int, seed: int) -> VectorEnv:
+        if arguments.shown is None:
+            return make_vector(preset.env_id, n, backend, seed, **arguments.env)
+        return make_vector(lambda: partly_shown(preset.env_id, arguments.shown), n, "gymnasium", seed)
+
+    env = environments(preset.n_envs, seed)
     nested = "Dict" in type(env.observation_space).__name__
     agent = rejeu.AGENTS[preset.algorithm](
         "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **settings_of(preset, arguments)
     )
     callback = None
     if arguments.best:
-        test_env = make_vector(preset.env_id, 10, backend, 2_000_000 + 100 * seed, **arguments.env)
+        test_env = environments(10, 2_000_000 + 100 * seed)
         callback = Evaluate(test_env, preset.evaluate_every, preset.evaluate_episodes)
     if arguments.minutes:
         agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60, callback=callback)
@@ -61,7 +74,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         )
     if arguments.best:
         agent.restore_best()
-    evaluation_env = make_vector(preset.env_id, 10, backend, 1_000_000 + 100 * seed, **arguments.env)
+    evaluation_env = environments(10, 1_000_000 + 100 * seed)
     evaluation = agent.evaluate(arguments.episodes, env=evaluation_env)
     return {
         "seed": seed,
@@ -76,8 +89,17 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     }
 
 
+def partly_shown(env_id: str, shown: list[int]) -> gym.Env:
+    """Returns an environment of whose observations only some components are shown."""
+    env = gym.make(env_id)
+    space = env.observation_space
+    return TransformObservation(env, lambda obs: obs[shown], gym.spaces.Box(space.low[shown], space.high[shown]))
+
+
 def settings_of(preset: presets.Preset, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {**preset.hyperparameters, **arguments.set}
+    """Returns the hyperparameters of a preset with others set; of those that are dicts, only the given parts change."""
+    before = preset.hyperparameters
+    return {**before, **{k: {**before.get(k, {}), **v} if isinstance(v, dict) else v for k, v in arguments.set.items()}}
 
 
 def main() -> None:
@@ -92,6 +114,9 @@ def main() -> None:
     parser.add_argument("--env", type=json.loads, default={}, help="arguments of the environment, as JSON")
     parser.add_argument("--set", type=json.loads, default={}, help="hyperparameters other than the preset's, as JSON")
     parser.add_argument("--best", action="store_true", help="evaluate the best weights by evaluations on the way")
+    parser.add_argument(
+        "--shown", type=int, nargs="+", help="components of the observation that are shown; default: all"
+    )
     parser.add_argument("--name", help="of the result file")
     arguments = parser.parse_args()
     preset = presets.find(arguments.env_id, arguments.algorithm)

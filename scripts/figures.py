@@ -216,7 +216,10 @@ def supported(algorithm: str) -> str:
         ("several environments", "yes"),
         ("HER, prioritized replay, n-step returns", "yes" if is_off_policy else "no (on-policy)"),
         ("action masks", ", ".join(maskable) if config.can_mask else "no"),
-        ("memory (LSTM, GRU)", "yes" if "cell" in validation.field_names(type(config.policy_kwargs)) else "no"),
+        (
+            "memory (LSTM, GRU)",
+            "yes" if getattr(config, "can_remember", "cell" in vars(config.policy_kwargs)) else "no",
+        ),
         ("normalization, schedules", "yes"),
         ("custom modules as encoder, torso or head", "yes" if takes_modules(agent.algorithm.Config) else "no"),
     ]

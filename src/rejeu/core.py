@@ -70,6 +70,46 @@ def some_allowed(obs: PyTree) -> PyTree:
     return Masked(obs.obs, obs.mask | ~obs.mask.any(axis=-1, keepdims=True))
 
 
+class Remembered(NamedTuple):
+    """What networks with memory remember of the observations up to the present one, in place of it."""
+
+    memory: Any
+    """``(batch, n_numbers)``, of all networks of an algorithm."""
+
+
+class Sequences(NamedTuple):
+    """The observations of a batch of :class:`Transition`, for networks with memory: in successive rows of replay.
+
+    In place of ``(batch, ...)`` the leaves are ``(n, rows, ...)``. Of each of the n sequences some rows are read, and the
+    observations of the batch are those, sequence after sequence.
+    """
+
+    obs: PyTree
+    """Observations in the order in which they were made, ``(n, rows, ...)``; also final ones, without a step."""
+    begins: Any
+    """Where an episode begins with a row, ``bool (n, rows)``."""
+    n_absent: Any
+    """How many of the first rows were no longer there and stand for nothing, ``int32 (n,)``."""
+    memory: Any
+    """What was remembered before the first row that is there, ``(n, n_numbers)``."""
+    reads: Any
+    """Which rows are read, ``int32 (n, n_reads)``."""
+
+
+def rows_read(obs: PyTree) -> PyTree:
+    """Returns the observations of a batch, ``(batch, ...)``: of :class:`Sequences` the rows that are read."""
+    if not isinstance(unmasked(obs)[0], Sequences):
+        return obs
+    rows, _, _, _, reads = unmasked(obs)[0]
+
+    def read(x: Array) -> Array:
+        return jnp.take_along_axis(x, reads.reshape(*reads.shape, *[1] * (x.ndim - 2)), axis=1).reshape(
+            -1, *x.shape[2:]
+        )
+
+    return jax.tree.map(read, rows)
+
+
 class Rollout(NamedTuple):
     """The steps that all environments took under one policy; leaves are ``(steps, n_envs, ...)`` where not said."""
 
@@ -297,6 +337,11 @@ def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:
 def copy(tree: PyTree) -> PyTree:
     """Returns ``tree`` in buffers of its own: a target network must not share what is donated with the online one."""
     return jax.tree.map(jnp.copy, tree)
+
+
+def renew(ended: Array, fresh: PyTree, carry: PyTree) -> PyTree:
+    """Returns ``carry`` with the environments where ``ended`` taken from ``fresh``."""
+    return jax.tree.map(lambda f, c: jnp.where(ended.reshape(-1, *[1] * (c.ndim - 1)), f, c), fresh, carry)
 
 
 def names(tree: PyTree) -> list[str]:

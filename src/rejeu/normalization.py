@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, Transition
+from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, Sequences, Transition
 from rejeu.spaces import Leaf, groups
 from rejeu.validation import coerce, flag, nested, number
 
@@ -139,8 +139,8 @@ class Normalizer(NamedTuple):
         """Returns normalized observations ``(..., *shape)``."""
         if not self.config.norm_obs:
             return obs
-        if isinstance(obs, Masked):
-            return Masked(self.obs(statistics, obs.obs), obs.mask)
+        if isinstance(obs, Masked | Sequences):
+            return obs._replace(obs=self.obs(statistics, obs.obs))
         arrays, tree = jax.tree.flatten(obs)
         pairs = zip(arrays, self.groups, strict=True)
         return jax.tree.unflatten(tree, [x if g is None else self.standardize(statistics.obs[g], x) for x, g in pairs])

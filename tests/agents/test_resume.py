@@ -80,6 +80,11 @@ CASES = {
         lambda: InProcess([GymnasiumEnv(Forbidden()), GymnasiumEnv(Forbidden())], 1),
         {**OFF, "action_masks": True},
     ),
+    "TD3, memory, noise": (
+        "TD3",
+        vector("Pendulum-v1", 2),
+        {**OFF, "action_noise": 0.1, "policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 4, "sequence_length": 4}},
+    ),
     "PPO": ("PPO", vector("CartPole-v1"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "PPO, normalised": ("PPO", vector("Pendulum-v1"), {**SMALL, "n_steps": 16, "batch_size": 16, "normalize": True}),
     "PPO, whole episodes": ("PPO", vector("rejeu/Ball-v0"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
@@ -109,6 +114,7 @@ DEFAULT_CASES = {
     ),
     *(
         "DQN, masks",
+        "TD3, memory, noise",
         "priorities, n steps",
         "episodes",
         "normalised",

@@ -250,7 +250,7 @@ class BaseAgent(ABC):
             algorithm = with_rnd(algorithm, self.obs_leaves, config.rnd)
         if config.normalize is None:
             return algorithm
-        explorer = exploration.make(algorithm, self.make_noise())
+        explorer = exploration.make(algorithm, None if algorithm.recall else self.make_noise())
         return normalized(algorithm, explorer, self.obs_leaves, config.normalize, config.gamma)
 
     def n_threads(self, n_envs: int) -> int:

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 
 from rejeu import spaces
@@ -123,6 +124,7 @@ class OffPolicyAgent(Agent):
             action.dtype,
             config.frame_stack,
             counters(config.hindsight),
+            sum(leaf.size for leaf in jax.tree.leaves(self.learner.initial_memory(1))),
         )
         priorities = None if config.priorities is None else Priorities(ring, config.priorities)
         each_reward = config.normalize is not None and config.normalize.norm_reward
@@ -132,6 +134,9 @@ class OffPolicyAgent(Agent):
             goals = self._goals(env)
             return kind(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
         settings: Any = config.replay_buffer_kwargs or ()
+        if config.has_memory:
+            shape = config.policy_kwargs
+            settings = {"sequence": (shape.sequence_length, shape.burn_in)}
         return kind(ring, config.gamma, config.n_steps, priorities, each_reward, **dict(settings))
 
     def drop_rollout(self) -> None:

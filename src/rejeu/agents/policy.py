@@ -134,6 +134,10 @@ def q_values(
     """
     if critics not in CRITICS:
         raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
+    if agent.learner.algorithm.action_values is None:
+        raise ValueError(
+            f"{agent.name}.q_values has no critics, or their values depend on a memory of observations before"
+        )
     observation = split(observation, None)[0] if agent.takes_masks else observation
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
@@ -176,12 +180,10 @@ def memory_of(agent: BaseAgent, memory: Any, n: int) -> Any:
     Raises:
         ValueError: if the shapes of ``memory`` are others.
     """
-    if agent.learner.algorithm.recall is None:
-        return ()
-    if memory is None:
-        return agent.learner.initial_carry(n)
+    if memory is None or agent.learner.algorithm.recall is None:
+        return agent.learner.initial_memory(n)
     if agent.carry_shapes is None:  # once: it takes longer than a prediction
-        agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_carry(1))
+        agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_memory(1))
     given = jax.tree.map(np.shape, memory)
     expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent.carry_shapes)
     if given != expected:

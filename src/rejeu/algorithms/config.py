@@ -23,7 +23,8 @@ from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.strategies import STRATEGIES
 from rejeu.errors import MissingObjectError
 from rejeu.exploration import noise as action_noises
-from rejeu.networks import ENCODERS, PolicyConfig, Widths, reads_image, settled
+from rejeu.exploration.parameter_space import ParameterNoise
+from rejeu.networks import ENCODERS, MemoryConfig, PolicyConfig, Widths, reads_image, settled
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf, leaves
@@ -178,7 +179,15 @@ class OffPolicyConfig(AlgorithmConfig):
     overlap: bool = True
     """Step the environments while the update is computed: an action then uses the weights of the update before the last, in
     a fixed order, so that runs are reproducible. False waits for the newest weights before every action and is slower."""
+    policy_kwargs: MemoryConfig = dataclasses.field(default_factory=MemoryConfig)
+    """Shape of the networks: ``net_arch``, ``activation_fn``, ``layer_norm``, ``architecture``, branches
+    (``state_layers``, ``action_layers``, ``common_layers``, ``critic_layers``, ``actor_layers``), a memory
+    (``lstm_hidden_size``, ``cell``, ``sequence_length``, ``burn_in``), or modules of your own as ``encoder``, ``torso`` and
+    ``head``."""
 
+    can_remember: ClassVar[bool] = False
+    """Whether the networks may have a memory."""
+    policy_kwargs_class: ClassVar[type[PolicyConfig]] = MemoryConfig
     search_space: ClassVar[SearchSpace] = search.OFF_POLICY
 
     def __post_init__(self) -> None:
@@ -194,6 +203,38 @@ class OffPolicyConfig(AlgorithmConfig):
         assign(self, action_noise=action_noises.parse(self.action_noise))
         coerce(self, "replay_buffer_class", buffer_name)
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
+        if self.has_memory:
+            self._check_memory()
+
+    def _check_memory(self) -> None:
+        """Raises ``ValueError`` if the networks cannot have a memory, or with these settings cannot learn with it."""
+        if not self.can_remember:
+            raise ValueError(
+                f"policy_kwargs: {self.name} has no networks with memory; leave lstm_hidden_size out, or use SAC, TQC, TD3, "
+                "DQN or RecurrentPPO"
+            )
+        refused = {
+            f"replay_buffer_class={self.replay_buffer_class!r}": self.replay_buffer_class != "ReplayBuffer",
+            "priorities": self.priorities is not None,
+            "action_noise=ParameterNoise()": isinstance(self.action_noise, ParameterNoise),
+        }
+        if given := [setting for setting, is_given in refused.items() if is_given]:
+            raise ValueError(
+                f"{given[0]} is not available for networks with memory, which learn from whole sequences; leave it out, or "
+                "lstm_hidden_size"
+            )
+        length = self.policy_kwargs.sequence_length
+        if self.batch_size % length:
+            below = max(self.batch_size // length, 1) * length
+            raise ValueError(
+                f"batch_size={self.batch_size} must be divisible by sequence_length={length}, the steps that are learned "
+                f"from together; try {below}"
+            )
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the networks have a memory."""
+        return self.policy_kwargs.lstm_hidden_size is not None
 
     @property
     def hindsight(self) -> HindsightConfig | None:

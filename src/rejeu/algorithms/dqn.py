@@ -37,6 +37,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
+from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import (
     AVERAGED,
@@ -57,7 +58,7 @@ from rejeu.core import (
 )
 from rejeu.distributions import forbid
 from rejeu.exploration.noise import NoiseProcess
-from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso
+from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso, with_memory
 from rejeu.schedules import Exponential, Linear, Schedule, at
 from rejeu.spaces import Leaf, check_discrete_action, nth_allowed
 from rejeu.validation import choice, coerce, flag, number, whole
@@ -126,6 +127,7 @@ class Config(QLearningConfig):
     dueling: bool = False
     """Split the last hidden layer into a stream for the state's value and one for the actions' advantages."""
 
+    can_remember: ClassVar[bool] = True
     name: ClassVar[str] = "DQN"
 
     def __post_init__(self) -> None:
@@ -161,8 +163,14 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     epsilon = config.epsilon
 
     def init(key: Array) -> State:
-        network = Dueling if config.dueling else Network
-        return initial_state(network(key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape), optimizer)
+        kind = Dueling if config.dueling else Network
+        network = with_memory(
+            key,
+            obs_leaves,
+            shape,
+            lambda leaves, shape: kind(key, leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape),
+        )
+        return initial_state(network, optimizer)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         moves = moves_due(state.step, clock.step, config.target_update_interval)
@@ -176,7 +184,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         metrics = metrics_of(loss, jnp.mean(td_error + target), epsilon, clock) | {TD_ERROR: jnp.abs(td_error)}
         return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
 
-    return epsilon_greedy_algorithm(init, update, epsilon)
+    return remembering(epsilon_greedy_algorithm(init, update, epsilon), shape, lambda state: (state.network,))
 
 
 def initial_state(network: Any, optimizer: Optimizer) -> State:

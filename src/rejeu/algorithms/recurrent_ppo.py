@@ -6,14 +6,12 @@ through all of it; a minibatch is a share of the environments with all their ste
 which the gradient remembers. Losses and advantages are PPO's (see :mod:`rejeu.algorithms.ppo`); the value of a successor
 is read with the memory that the step left.
 
-Cells: LSTM (Hochreiter and Schmidhuber 1997, with the forget gate of Gers et al. 2000) and GRU (Cho et al. 2014, arXiv
-1406.1078), in the form of PyTorch's documentation.
+The cells are those of :mod:`rejeu.networks.memory`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -36,9 +34,8 @@ from rejeu.algorithms.actor_critic.network import (
 from rejeu.algorithms.actor_critic.steps import Samples, flat, shuffled, with_advantages
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
-from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, unmasked
-from rejeu.exploration.explorer import renew
-from rejeu.networks import make_encoder
+from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, renew, unmasked
+from rejeu.networks import Cell, make_encoder
 from rejeu.prng import nth
 from rejeu.spaces import Leaf
 from rejeu.validation import choice, coerce, flag, nested, whole
@@ -123,57 +120,6 @@ def envs_per_batch(config: Config, n_steps: int, n_envs: int) -> int:
     return min(max(config.batch_size // n_steps, 1), n_envs)
 
 
-class Cell(eqx.Module):
-    """A recurrent cell: an LSTM or a GRU."""
-
-    inputs: Array
-    """``(n_inputs, n_gates * size)``."""
-    recurrent: Array
-    """``(size, n_gates * size)``."""
-    bias: Array
-    """``(n_gates * size,)``."""
-    recurrent_bias: Array
-    """``(n_gates * size,)``."""
-    kind: str = eqx.field(static=True)
-
-    def __init__(self, key: Array, n_inputs: int, size: int, kind: str) -> None:
-        """Draws everything uniformly within ``1 / sqrt(size)`` of 0, PyTorch's default."""
-        width = (4 if kind == "lstm" else 3) * size
-        bound = 1.0 / math.sqrt(size)
-        shapes = ((n_inputs, width), (size, width), (width,), (width,))
-        drawn = [
-            jax.random.uniform(k, shape, jnp.float32, -bound, bound)
-            for k, shape in zip(jax.random.split(key, 4), shapes, strict=True)
-        ]
-        self.inputs, self.recurrent, self.bias, self.recurrent_bias = drawn
-        self.kind = kind
-
-    @property
-    def size(self) -> int:
-        """Numbers that come out."""
-        return self.recurrent.shape[0]
-
-    def empty(self, n: int) -> tuple[Array, ...]:
-        """Returns the memory at the start of ``n`` episodes, ``(n, size)`` each."""
-        return tuple(jnp.zeros((n, self.size), jnp.float32) for _ in range(2 if self.kind == "lstm" else 1))
-
-    def project(self, x: Array) -> Array:
-        """Returns what the inputs ``(..., n_inputs)`` bring to the gates; of many steps at once."""
-        return x @ self.inputs + self.bias.reshape(*[1] * (x.ndim - 1), -1)
-
-    def step(self, memory: tuple[Array, ...], projected: Array) -> tuple[Array, ...]:
-        """Returns the memory after one step, ``(n, size)`` each; the first of it is what comes out."""
-        recurrent = memory[0] @ self.recurrent + self.recurrent_bias[None]
-        if self.kind == "lstm":
-            i, f, g, o = jnp.split(projected + recurrent, 4, axis=-1)
-            cell = jax.nn.sigmoid(f) * memory[1] + jax.nn.sigmoid(i) * jnp.tanh(g)
-            return jax.nn.sigmoid(o) * jnp.tanh(cell), cell
-        reset, update, new = jnp.split(projected, 3, axis=-1)
-        r, z, n = jnp.split(recurrent, 3, axis=-1)
-        keep = jax.nn.sigmoid(update + z)
-        return ((1.0 - keep) * jnp.tanh(new + jax.nn.sigmoid(reset + r) * n) + keep * memory[0],)
-
-
 Memory = tuple[tuple[Array, ...], ...]
 """Of the policy's cell, and of the value's where it has its own."""
 
@@ -232,19 +178,8 @@ class RecurrentActorCritic(eqx.Module):
         """
         n_steps, n = started.shape
         features = [read.reshape(n_steps, n, -1) for read in self.features(flat(obs))]
-        after = []
-        for cell, first, read in zip(self.cells, memory, features, strict=True):
-            fresh = cell.empty(started.shape[1])
-
-            def step(
-                memory: tuple[Array, ...], inputs: tuple[Array, Array], cell: Cell = cell, fresh: Any = fresh
-            ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-                projected, began = inputs
-                memory = cell.step(renew(began, fresh, memory), projected)
-                return memory, memory
-
-            after.append(jax.lax.scan(step, first, (cell.project(read), started))[1])
-        return tuple(after)
+        each = zip(self.cells, memory, features, strict=True)
+        return tuple(cell.unroll(before, read, started) for cell, before, read in each)
 
     def features(self, obs: PyTree) -> tuple[Array, ...]:
         """Returns what each cell is given of observations ``(n, ...)``, ``(n, n_features)`` each."""

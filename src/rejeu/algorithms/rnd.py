@@ -26,7 +26,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.steps import flat, masked_mean, minibatches
 from rejeu.algorithms.config import RndConfig
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout, minimize
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout, minimize, rows_read
 from rejeu.networks import Network, PolicyConfig
 from rejeu.normalization import NormalizationConfig, Statistics, merged, normalizer_of
 from rejeu.prng import nth
@@ -76,7 +76,7 @@ def with_rnd(algorithm: Algorithm, obs_leaves: tuple[Leaf, ...], config: RndConf
         return State(algorithm.init(key), predictor, target, optimizer, normalizer.init(), keys[2], jnp.int32(0))
 
     def update(state: State, batch: Any, clock: Clock) -> tuple[State, Metrics]:
-        next_obs, valid = batch.next_obs, jnp.ones_like(batch.reward, bool)
+        next_obs, valid = rows_read(batch.next_obs), jnp.ones_like(batch.reward, bool)
         if isinstance(batch, Rollout):
             next_obs, valid = flat(next_obs), batch.valid.reshape(-1)
         weight = valid.astype(jnp.float32)

@@ -34,6 +34,7 @@ from rejeu.algorithms.ddpg.continuous import (
     metrics_of,
     policy,
 )
+from rejeu.algorithms.memory import remembering
 from rejeu.core import (
     AVERAGED,
     Algorithm,
@@ -50,7 +51,7 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.networks import Network, QNetwork, action_values, values_by_critics
+from rejeu.networks import Network, QNetwork, action_values, first, values_by_critics, with_memory
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import action_dimension, check_box_action
@@ -70,6 +71,7 @@ class Config(DeterministicPolicyConfig):
     n_critics: int = 2
     """Number of critics; the target is the minimum of their values."""
 
+    can_remember: ClassVar[bool] = True
     name: ClassVar[str] = "TD3"
 
     def __post_init__(self) -> None:
@@ -110,8 +112,21 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
         widths = shape.critic_widths(HIDDEN_LAYERS)
-        actor = Network(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        critics = ensemble(lambda k: QNetwork(k, obs_leaves, action_dim, widths, shape), critics_key, config.n_critics)
+        actor = with_memory(
+            actor_key,
+            obs_leaves,
+            shape,
+            lambda leaves, shape: Network(actor_key, leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape),
+        )
+        critics = with_memory(
+            critics_key,
+            obs_leaves,
+            shape,
+            lambda leaves, shape: ensemble(
+                lambda k: QNetwork(k, leaves, action_dim, widths, shape), critics_key, config.n_critics
+            ),
+            slot=1,
+        )
         return State(
             actor=actor,
             critics=critics,
@@ -135,8 +150,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         n_updates = state.n_updates + 1
 
         def delayed(state: State) -> State:
-            first_critic = jax.tree.map(lambda leaf: leaf[0], critics)
-            policy_loss, gradients = value_and_grad(actor_loss)(state.actor, first_critic, batch.obs)
+            policy_loss, gradients = value_and_grad(actor_loss)(state.actor, first(critics), batch.obs)
             actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
             return dataclasses.replace(
                 state,
@@ -152,7 +166,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         metrics = metrics_of(loss, state.actor_loss, values, jnp.mean(jnp.abs(values - target[None]), axis=0))
         return state, metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values_by_critics)
+    algorithm = Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values_by_critics)
+    return remembering(algorithm, shape, lambda state: (state.actor, state.critics))
 
 
 def smoothed_action(target_actor: Network, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:

@@ -16,7 +16,7 @@ losses are summed, which gives each the gradient of its own; Stable-Baselines3 C
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
+from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
@@ -35,15 +36,16 @@ from rejeu.algorithms.sac.continuous import (
     explorer_of,
     initial_state,
     metrics_of,
+    networks,
     policy,
     temperature_and_targets,
 )
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
-from rejeu.networks import Network, QNetwork
+from rejeu.networks import Network, QNetwork, each
 from rejeu.prng import nth
 from rejeu.schedules import at
-from rejeu.spaces import action_dimension, check_box_action, leaves
+from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
 from rejeu.validation import coerce, whole
 
 
@@ -83,9 +85,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     n_kept = config.n_critics * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
-    def critic(key: Array) -> QNetwork:
+    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
         widths = shape.critic_widths(HIDDEN_LAYERS)
-        return QNetwork(key, obs_leaves, action_dim, widths, shape, config.n_quantiles)
+        return QNetwork(key, leaves, action_dim, widths, shape, config.n_quantiles)
 
     def init(key: Array) -> State:
         return initial_state(key, obs_leaves, 2 * action_dim, critic, config, optimizer)
@@ -110,12 +112,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
     actor = lambda state: state.actor  # noqa: E731
-    return Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values)
+    algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values)
+    return remembering(algorithm, shape, networks)
 
 
 def action_quantiles(critics: QNetwork, obs: PyTree, action: Array) -> Array:
     """Returns the quantiles that each of the stacked critics gives, ``(n_critics, batch, n_quantiles)``, unordered."""
-    return jax.vmap(lambda critic: critic(obs, action))(critics)
+    return each(critics, obs, lambda critic, obs: critic(obs, action))
 
 
 def truncate(quantiles: Array, n_kept: int) -> Array:

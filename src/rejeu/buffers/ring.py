@@ -51,11 +51,13 @@ class Ring:
         action_dtype: Any,
         frame_stack: int | None = None,
         counters: Sequence[str] = (),
+        memory_size: int = 0,
     ) -> None:
         """Reserves ``capacity // n_envs`` rows for each environment (at least 2, and more than ``frame_stack``).
 
         Images whose first axis has length ``frame_stack`` are stored as single frames, oldest first. Each of ``counters``
-        (names in ``COUNTERS``) takes 4 bytes a row; ``frame_stack`` adds ``since_start``.
+        (names in ``COUNTERS``) takes 4 bytes a row; ``frame_stack`` adds ``since_start``. ``memory_size`` is how many numbers
+        a policy with memory remembers, of which each takes 4 bytes a row too.
 
         Raises:
             MemoryError: if the machine cannot hold the rows, with the numbers.
@@ -72,7 +74,7 @@ class Ring:
         record = record_dtype(obs_leaves, self.stacked, action_shape, action_dtype, self.counters)
         frames = [leaf.nbytes // leaf.shape[0] for leaf, is_ in zip(obs_leaves, self.stacked, strict=True) if is_]
         n = self.rows * n_envs
-        check_memory((record.itemsize + 1 + sum(frames)) * n, capacity)
+        check_memory((record.itemsize + 1 + sum(frames) + 4 * memory_size) * n, capacity)
         self.records = np.zeros(n, record)
         """The rows except for kinds and frames. ``obs``, ``action``, ``reward`` and the counters are views of it."""
         self.obs = [
@@ -84,6 +86,8 @@ class Ring:
         """Steps since the row's episode began, or since its oldest row in a file; None if not kept."""
         self.until_end = self.records["until_end"] if "until_end" in kept else None
         """Steps to the ``LAST`` row of the episode; 0 while it runs, and in that row itself; None if not kept."""
+        self.memory = np.zeros((n, memory_size), np.float32)
+        """What was remembered before each row's observation, ``(n, memory_size)``."""
         self.kind = np.zeros(n, np.uint8)
         """Separate from the records, where it would take 4 bytes, because sampling reads nothing else."""
         self.head = np.full(n_envs, -1, np.int64)
@@ -109,7 +113,7 @@ class Ring:
     def nbytes(self) -> int:
         """Bytes reserved."""
         stacks = [array for array, stacked in zip(self.obs, self.stacked, strict=True) if stacked]
-        return self.records.nbytes + self.kind.nbytes + sum(array.nbytes for array in stacks)
+        return self.records.nbytes + self.memory.nbytes + self.kind.nbytes + sum(array.nbytes for array in stacks)
 
     def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
         """Starts an episode with ``obs`` ``(n_envs, ...)`` in the environments ``envs`` (indices; None: all).
@@ -148,6 +152,11 @@ class Ring:
             self.since_start[following] = self.head[which] - self.start[which]
         self._write_obs(following, next_obs, which)
         return index, following
+
+    def remember(self, memory: np.ndarray, ended: np.ndarray, envs: np.ndarray | None = None) -> None:
+        """Writes what is remembered before the newest observations, ``(n_envs, memory_size)``; nothing where ``ended``."""
+        envs = self.all_envs if envs is None else envs
+        self.memory[self.index(envs, self.head[envs])] = np.where(ended[:, None], np.float32(0), memory)[envs]
 
     def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Returns the positions of rows given by environment and absolute time."""
@@ -268,7 +277,8 @@ class Ring:
     def stored(self) -> dict[str, np.ndarray]:
         """Returns what files hold of every row, by its name there, ``(n, ...)``; counters follow from ``kind``."""
         obs = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
-        return {**obs, "action": self.action, "reward": self.reward, "kind": self.kind}
+        memory = {"memory": self.memory} if self.memory.size else {}
+        return {**obs, "action": self.action, "reward": self.reward, "kind": self.kind, **memory}
 
     def recount(self, head: np.ndarray) -> None:
         """Sets the newest rows to the times ``head``, and counts steps and episodes by the kinds of the rows."""

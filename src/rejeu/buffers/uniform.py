@@ -18,7 +18,7 @@ import numpy as np
 from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.ring import LAST, TERMINATED, Ring, Rows
-from rejeu.core import Transition
+from rejeu.core import Masked, Sequences, Transition, unmasked
 
 
 class BaseReplayBuffer(ABC):
@@ -34,9 +34,15 @@ class BaseReplayBuffer(ABC):
         n_steps: int = 1,
         priorities: Priorities | None = None,
         each_reward: bool = False,
+        sequence: tuple[int, int] | None = None,
     ) -> None:
-        """Takes a ring; with ``each_reward``, transitions of several steps have :attr:`Transition.rewards`."""
+        """Takes a ring; with ``each_reward``, transitions of several steps have :attr:`Transition.rewards`.
+
+        ``sequence``, the numbers of steps that networks with memory learn from together and of those before them, makes the
+        observations of batches :class:`Sequences`.
+        """
         self.ring, self.gamma, self.n_steps, self.priorities = ring, gamma, n_steps, priorities
+        self.sequence = sequence
         self.each_reward = each_reward and n_steps > 1
         self.discounts = discounts_of(gamma, n_steps)
         """Discounts of the next observation: at ``2 i`` after ``i`` steps, at ``2 i + 1`` if the MDP terminated with them."""
@@ -107,18 +113,26 @@ class BaseReplayBuffer(ABC):
             goals: the new goals of some of them, or None.
         """
         ring, (step, obs) = self.ring, read
-        rewards, steps, terminated = outcome(np, ring, ring.index, rows, self.n_steps, goals)
-        _, next_obs = ring.read(ring.index(rows.env, rows.time + steps))
+        result = outcome(np, ring, ring.index, rows, self.n_steps, goals)
+        _, next_obs = ring.read(ring.index(rows.env, rows.time + result.steps))
         if goals is not None:
             for leaves in (obs, next_obs):
                 leaves[self.desired][goals.which] = goals.goal
+        return self.transition(shape, ring.tree(obs), step["action"], result, ring.tree(next_obs), weight)
+
+    def transition(
+        self, shape: tuple[int, ...], obs: Any, action: Any, result: Outcome, next_obs: Any, weight: Any = None
+    ) -> Transition:
+        """Returns transitions in ``shape``, from observations and actions ``(n, ...)`` and what they lead to."""
+        rewards, steps, terminated = result
         reward, each, discount = rewards, None, self.discounts.take(2 * steps + terminated)
         if self.n_steps > 1:
             powers = self.gamma ** np.arange(self.n_steps)
             reward = (rewards @ powers).astype(np.float32)
             each = (rewards * powers).astype(np.float32) if self.each_reward else None
-        flat = Transition(ring.tree(obs), step["action"], reward, ring.tree(next_obs), discount, weight, each)
-        shaped = flat if len(shape) == 1 else jax.tree.map(lambda array: array.reshape(shape + array.shape[1:]), flat)
+        flat = Transition(obs, action, reward, next_obs, discount, weight, each)
+        split = lambda array: array.reshape(*shape[:-1], -1, *array.shape[1:])  # noqa: E731
+        shaped = flat if len(shape) == 1 else jax.tree.map(split, flat)
         if weight is not None:
             return shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
         return shaped
@@ -146,8 +160,48 @@ class ReplayBuffer(BaseReplayBuffer):
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
     ) -> tuple[Transition, Draw | None]:
         """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`."""
+        if self.sequence is not None:
+            return self.draw_sequences(rng, shape, *self.sequence), None
         rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
         return self.batch(shape, rows, self.ring.read(rows.position), weight), drawn
+
+    def draw_sequences(self, rng: np.random.Generator, shape: tuple[int, ...], length: int, burn_in: int) -> Transition:
+        """Returns sequences of ``length`` steps as transitions whose observations are :class:`Sequences`.
+
+        The first step of each is drawn uniformly. ``burn_in`` rows before it belong to the sequence, and those after it that
+        the steps and their successors need. It may reach into the next episode. Where there are fewer steps, because the
+        newest one was reached or several episodes were short, they are repeated from the first on.
+        """
+        ring = self.ring
+        start = ring.draw(rng, math.prod(shape) // length)
+        env = start.env[:, None]
+        oldest, head = ring.oldest()[env], ring.head[env]
+        # One final observation is passed without a loss of steps.
+        times = start.time[:, None] + np.arange(-burn_in, length + 1 + self.n_steps)[None]
+        position = ring.index(env, times.clip(oldest, head))
+        kind = ring.kind[position]
+        is_step = ((kind != LAST) & (times < head))[:, burn_in : burn_in + length + 1]
+        steps_first = np.argsort(~is_step, axis=1, kind="stable")
+        which = np.arange(length)[None] % is_step.sum(axis=1, keepdims=True)
+        reads = burn_in + np.take_along_axis(steps_first, which, axis=1)
+        _, obs = ring.read(position)
+        begins = np.pad(kind[:, :-1] == LAST, ((0, 0), (1, 0)))
+        n_absent = (times[:, :burn_in] < oldest).sum(axis=1, dtype=np.int32)
+        memory = ring.memory[position[:, 0]]
+        tree, mask = unmasked(ring.tree(obs))
+
+        def read(rows: np.ndarray) -> Any:
+            sequences = Sequences(tree, begins, n_absent, memory, rows.astype(np.int32))
+            if mask is None:
+                return sequences
+            masks = np.take_along_axis(mask, rows[..., None], axis=1)
+            return Masked(sequences, masks.reshape(-1, mask.shape[-1]))
+
+        flat = lambda array: np.take_along_axis(array, reads, axis=1).ravel()  # noqa: E731
+        rows = ring.at(np.broadcast_to(env, reads.shape).ravel(), flat(times))
+        result = outcome(np, ring, ring.index, rows, self.n_steps)
+        after = reads + np.broadcast_to(result.steps, rows.env.shape).reshape(reads.shape)
+        return self.transition(shape, read(reads), ring.action[rows.position], result, read(after))
 
 
 def discounts_of(gamma: float, n_steps: int) -> np.ndarray:

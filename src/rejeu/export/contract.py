@@ -142,10 +142,8 @@ def policy_of(
     leaves, structure = spaces.leaves(observation_space), spaces.structure(observation_space)
     size = export.symbolic_shape("batch")[0] if batch is None else batch
     has_memory = algorithm.recall is not None
-    explorer = algorithm.explorer if has_memory else exploration.plain(algorithm)
-    assert explorer is not None
-    carry = explorer.init(actor, 1) if has_memory else ()
-    memory, carry_structure = jax.tree.flatten(carry)
+    explorer = exploration.plain(algorithm)
+    memory, carry_structure = jax.tree.flatten(explorer.init(actor, 1))
     n_carry, stacked = len(memory), [i for i, axis in enumerate(stack.axes) if axis is not None] if stack else []
     memory += [np.zeros((1, *leaves[i].shape), leaves[i].dtype) for i in stacked]
     has_state = bool(memory)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from rejeu import core, spaces
-from rejeu.core import Clock, Masked, Rollout, Transition
+from rejeu.core import Clock, Masked, Rollout, Sequences, Transition
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.loops.learner import bad_leaves, checked
@@ -66,6 +66,8 @@ def batch_like(agent: Any, names: set[str]) -> Transition | Rollout:
     structure = spaces.structure(agent.observation_space)
     obs: Any = jax.tree.unflatten(structure, [0] * structure.num_leaves)
     zero: Any = 0
+    if "obs.memory" in names or "obs.obs.memory" in names:
+        obs = Sequences(obs, zero, zero, zero, zero)
     obs = Masked(obs, zero) if agent.takes_masks else obs
     if "ended" not in names:
         return Transition(obs, zero, zero, obs, zero, **{name: zero for name in ("weight", "rewards") if name in names})

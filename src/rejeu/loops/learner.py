@@ -135,7 +135,7 @@ class Learner:
         self.packing = Packing(self.shapes)
         self.init = xla.run_once(self._init)
         self.act = self.sample = jax.jit(partial(self._act, self.explorer))
-        if algorithm.recall is None and (noise is not None or algorithm.explorer is not None):
+        if noise is not None or (algorithm.recall is None and algorithm.explorer is not None):
             self.sample = jax.jit(partial(self._act, exploration.plain(algorithm)))
         self.update = jax.jit(self._update, donate_argnums=0)
         self.observe = None if algorithm.observe is None else jax.jit(self._observe, donate_argnums=0)
@@ -230,6 +230,10 @@ class Learner:
     def bad_leaves(self, state: PackedState) -> list[str]:
         """Returns the names of the leaves of a packed state that are not finite; waits for the device."""
         return [] if is_finite(state) else bad_leaves(self.packing.unpack([np.asarray(a) for a in state]))
+
+    def initial_memory(self, n: int) -> PyTree:
+        """Returns the memory of the policy at the start of ``n`` episodes; ``()`` if it has none."""
+        return exploration.plain(self.algorithm).init(self.algorithm.actor(self.shapes), n)
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""

@@ -30,6 +30,7 @@ from jax import Array
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Clock, PyTree, unmasked
 from rejeu.envs.base import Step
+from rejeu.exploration.explorer import memory_in
 from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import gradient_steps
@@ -151,21 +152,31 @@ def choose(
 ) -> np.ndarray | Array:
     """Returns random actions at first, then those of the exploring policy, which the device may still be computing.
 
+    A policy with memory remembers the observations of random actions too, and the replay buffer what it remembered.
     ``run.obs`` must not change before they are read. ``which`` are the environments; None stands for all. Noise and other
     state of exploration advance in these only. What they share, arrays without an axis of environments, advances with every
     call.
     """
+    random = None
     if run.step < config.learning_starts:
         mask = unmasked(run.obs)[1]
         mask = mask if mask is None or which is None else mask[which]
-        return random_action(run.env.action_space, run.env.n_envs if which is None else len(which), run.rng, mask)
+        n = run.env.n_envs if which is None else len(which)
+        random = random_action(run.env.action_space, n, run.rng, mask)
+        if learner.algorithm.recall is None:
+            return random
+    if learner.algorithm.recall is not None:
+        run.replay.ring.remember(np.asarray(memory_in(run.carry)), run.ended, which)
     if which is None:
         action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+    else:
+        carry = jax.tree.map(lambda leaf: leaf[which] if leaf.ndim else leaf, run.carry)
+        action, carry = learner.act(run.state, carry, rows(run.obs, which), run.ended[which], run.key, clock)
+        run.carry = jax.tree.map(lambda old, new: old.at[which].set(new) if old.ndim else new, run.carry, carry)
+    if random is None:
         return action
-    carry = jax.tree.map(lambda leaf: leaf[which] if leaf.ndim else leaf, run.carry)
-    action, carry = learner.act(run.state, carry, rows(run.obs, which), run.ended[which], run.key, clock)
-    run.carry = jax.tree.map(lambda old, new: old.at[which].set(new) if old.ndim else new, run.carry, carry)
-    return action
+    jax.block_until_ready(action)  # until then the device may read the observations
+    return random
 
 
 def rows(obs: PyTree, which: np.ndarray | None) -> PyTree:

@@ -1,8 +1,9 @@
 """Neural networks: layers, and the networks that algorithms build from them.
 
 A network is an encoder (observation to features, images by convolution), a torso (hidden layers) and a linear head. Each
-of the three may be a module of the user's own. Every network is an ``equinox.Module`` whose leaves are arrays; static
-fields (names, shapes of observations) are hashable. Inputs have one batch axis.
+of the three may be a module of the user's own. Before the torso there may be a memory (a recurrent cell). Every network is
+an ``equinox.Module`` whose leaves are arrays; static fields (names, shapes of observations) are hashable. Inputs have one
+batch axis.
 """
 
 from rejeu.networks.encoder import (
@@ -13,6 +14,7 @@ from rejeu.networks.encoder import (
     reads_image,
 )
 from rejeu.networks.layers import ACTIVATIONS, ENCODERS, MLP, LayerNorm, Linear, register_encoder
+from rejeu.networks.memory import Cell, MemoryConfig, Recurrent, each, first, with_memory
 from rejeu.networks.network import (
     Branches,
     Network,
@@ -31,18 +33,23 @@ __all__ = [
     "ENCODERS",
     "MLP",
     "Branches",
+    "Cell",
     "Convolution",
     "Encoder",
     "LayerNorm",
     "Linear",
+    "MemoryConfig",
     "Network",
     "PolicyConfig",
     "QNetwork",
+    "Recurrent",
     "SimBa",
     "Torso",
     "Widths",
     "action_values",
     "convolutions",
+    "each",
+    "first",
     "make_encoder",
     "make_head",
     "make_torso",
@@ -51,4 +58,5 @@ __all__ = [
     "settled",
     "split_net_arch",
     "values_by_critics",
+    "with_memory",
 ]

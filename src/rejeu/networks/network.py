@@ -13,6 +13,7 @@ from jax import Array, ShapeDtypeStruct
 from rejeu.core import PyTree
 from rejeu.networks.encoder import make_encoder
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, own_module
+from rejeu.networks.memory import each
 from rejeu.networks.shape import PolicyConfig
 from rejeu.spaces import Leaf
 
@@ -200,7 +201,7 @@ class QNetwork(eqx.Module):
 
 def action_values(critics: Any, obs: PyTree, action: Array) -> Array:
     """Returns the value that each of the stacked critics gives, ``(n_critics, batch)``."""
-    return jax.vmap(lambda critic: critic(obs, action)[:, 0])(critics)
+    return each(critics, obs, lambda critic, obs: critic(obs, action)[:, 0])
 
 
 def values_by_critics(state: Any, obs: PyTree, action: Array) -> Array:

@@ -33,6 +33,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.network import sde_explorer, sde_log_std
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.algorithms.memory import remembering
 from rejeu.core import (
     AVERAGED,
     TD_ERROR,
@@ -53,7 +54,16 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import TanhNormal
-from rejeu.networks import Network, QNetwork, action_values, make_encoder, make_head, make_torso, values_by_critics
+from rejeu.networks import (
+    Network,
+    QNetwork,
+    action_values,
+    make_encoder,
+    make_head,
+    make_torso,
+    values_by_critics,
+    with_memory,
+)
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
@@ -116,6 +126,7 @@ class Config(EntropyConfig):
 
     name: ClassVar[str] = "SAC"
     can_mask: ClassVar[bool] = True
+    can_remember: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
@@ -127,6 +138,8 @@ class Config(EntropyConfig):
             raise ValueError("sde_sample_freq=0 would sample no noise; use 1 or more, or -1 for once per episode")
         if self.use_sde and self.action_noise is not None:
             raise ValueError("use_sde=True explores by itself; leave action_noise out")
+        if self.use_sde and self.has_memory:
+            raise ValueError("use_sde=True is not available for policies with memory; leave it or lstm_hidden_size out")
 
 
 class SdeActor(eqx.Module):
@@ -185,8 +198,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     target_entropy = config.entropy_target(-float(action_dim))
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
-    def critic(key: Array) -> QNetwork:
-        return QNetwork(key, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
+    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
+        return QNetwork(key, leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
 
     def init(key: Array) -> State:
         return initial_state(key, obs_leaves, 2 * action_dim, critic, config, optimizer)
@@ -209,7 +222,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         )
 
     actor = lambda state: state.actor  # noqa: E731
-    return Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values_by_critics)
+    algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values_by_critics)
+    return remembering(algorithm, shape, networks)
+
+
+def networks(state: State) -> tuple[Any, ...]:
+    """Returns the networks that may have a memory."""
+    return state.actor, state.critics
 
 
 def explorer_of(config: Config) -> Explorer | None:
@@ -221,13 +240,14 @@ def initial_state(
     key: Array,
     obs_leaves: tuple[Leaf, ...],
     n_outputs: int,
-    make_critic: Callable[[Array], Any],
+    make_critic: Callable[[Array, tuple[Leaf, ...], Any], Any],
     config: Config,
     optimizer: Optimizer,
 ) -> State:
     """Returns the state before the first update: an actor of ``n_outputs``, and ``config.n_critics`` critics.
 
-    With gSDE the actor has half as many outputs, the means.
+    ``make_critic(key, leaves, shape)`` returns one critic of such observations. With gSDE the actor has half as many
+    outputs, the means.
     """
     actor_key, critics_key, update_key = jax.random.split(key, 3)
     shape = config.policy_kwargs
@@ -235,8 +255,19 @@ def initial_state(
     if config.use_sde:
         actor = SdeActor(actor_key, obs_leaves, n_outputs // 2, config)
     else:
-        actor = Network(actor_key, obs_leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape)
-    critics = ensemble(make_critic, critics_key, config.n_critics)
+        actor = with_memory(
+            actor_key,
+            obs_leaves,
+            shape,
+            lambda leaves, shape: Network(actor_key, leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape),
+        )
+    critics = with_memory(
+        critics_key,
+        obs_leaves,
+        shape,
+        lambda leaves, shape: ensemble(lambda key: make_critic(key, leaves, shape), critics_key, config.n_critics),
+        slot=1,
+    )
     log_alpha, alpha_optimizer = initial_alpha(config)
     return State(
         actor=actor,

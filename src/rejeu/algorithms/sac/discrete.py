@@ -24,12 +24,14 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers
+from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
     Config,
     State,
     initial_state,
     metrics_of,
+    networks,
     temperature_and_targets,
 )
 from rejeu.core import (
@@ -45,9 +47,9 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import forbid
-from rejeu.networks import Network
+from rejeu.networks import Network, each
 from rejeu.schedules import at
-from rejeu.spaces import leaves
+from rejeu.spaces import Leaf, leaves
 
 TARGET_ENTROPY_SHARE = 0.3
 """Automatic target entropy as a share of the uniform policy's."""
@@ -64,8 +66,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
-    def critic(key: Array) -> Network:
-        return Network(key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
+    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> Network:
+        return Network(key, leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
 
     def init(key: Array) -> State:
         return initial_state(key, obs_leaves, n_actions, critic, config, optimizer)
@@ -89,7 +91,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         )
 
     values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+    algorithm = Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+    return remembering(algorithm, shape, networks)
 
 
 def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
@@ -115,7 +118,7 @@ def mean_log_count(obs: PyTree, n_actions: int) -> Any:
 
 def all_values(critics: PyTree, obs: PyTree) -> Array:
     """Returns every critic's value of every action, ``(n_critics, batch, n_actions)``."""
-    return jax.vmap(lambda critic: critic(obs))(critics)
+    return each(critics, obs, lambda critic, obs: critic(obs))
 
 
 def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Transition) -> Array:
@@ -127,10 +130,9 @@ def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Trans
 
 def critics_loss(critics: PyTree, batch: Transition, target: Array) -> tuple[Array, Array]:
     """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
-    index = jnp.broadcast_to(
-        batch.action[None, :, None], (jax.tree.leaves(critics)[0].shape[0], *batch.action.shape, 1)
-    )
-    values = jnp.take_along_axis(all_values(critics, batch.obs), index, axis=-1)[..., 0]
+    values = all_values(critics, batch.obs)
+    index = jnp.broadcast_to(batch.action[None, :, None], (*values.shape[:-1], 1))
+    values = jnp.take_along_axis(values, index, axis=-1)[..., 0]
     return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
 
 
