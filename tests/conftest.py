@@ -78,7 +78,7 @@ def forget_registered() -> Iterator[None]:
     """Removes what a test registered, for example with a page of the docs: algorithms, presets, encoders and so on."""
     import rejeu
     from rejeu import presets
-    from rejeu.buffers.strategies import STRATEGIES
+    from rejeu.buffers.hindsight import STRATEGIES
     from rejeu.envs.functional import REGISTRY
     from rejeu.networks.layers import ENCODERS
 

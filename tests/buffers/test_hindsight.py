@@ -14,9 +14,14 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
-from rejeu.buffers.hindsight import GoalSelectionStrategy, HerReplayBuffer, HindsightConfig, counters
+from rejeu.buffers.hindsight import (
+    GoalSelectionStrategy,
+    HerReplayBuffer,
+    HindsightConfig,
+    counters,
+    register_goal_strategy,
+)
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
-from rejeu.buffers.strategies import register_goal_strategy
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.goals import GoalFunctions
 from tests.replay_model import GOAL_OBSERVATION, Model, Turn, make_ring, observe_goal, play, turns

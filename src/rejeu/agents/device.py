@@ -13,9 +13,8 @@ import numpy as np
 from rejeu import devices
 from rejeu.agents.base import BaseAgent
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.hindsight import HerReplayBuffer
+from rejeu.buffers.hindsight import HerReplayBuffer, takes_generator
 from rejeu.buffers.rollout import RolloutBuffer
-from rejeu.buffers.strategies import takes_generator
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.envs.functional.vector import reset_all

@@ -18,9 +18,8 @@ from gymnasium import spaces
 from rejeu import normalization, schedules
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.search import SearchSpace
-from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
+from rejeu.buffers.hindsight import STRATEGIES, HerReplayBuffer, HindsightConfig
 from rejeu.buffers.prioritized import PriorityConfig
-from rejeu.buffers.strategies import STRATEGIES
 from rejeu.errors import MissingObjectError
 from rejeu.exploration import noise as action_noises
 from rejeu.exploration.parameter_space import ParameterNoise

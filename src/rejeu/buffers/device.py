@@ -24,9 +24,9 @@ from jax import Array
 from rejeu import schedules
 from rejeu.buffers import device_priorities
 from rejeu.buffers.device_priorities import DevicePriorities
+from rejeu.buffers.hindsight import BUILT_IN, GoalStrategy, HindsightSteps
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
-from rejeu.buffers.strategies import BUILT_IN, GoalStrategy, HindsightSteps
 from rejeu.buffers.uniform import NewGoals, discounts_of, outcome, replaced
 from rejeu.core import PyTree, Transition, copy
 from rejeu.prng import below

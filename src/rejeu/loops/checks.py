@@ -13,13 +13,14 @@ from rejeu.envs import validation
 from rejeu.envs.base import Step
 from rejeu.errors import BadEnvironmentError, NonFiniteError
 from rejeu.loops.learner import Learner
-from rejeu.loops.run import Run
+from rejeu.loops.run import Run, timed
 from rejeu.spaces import leaves
 
 VDOT_SIZE = 2**13
 """Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
 
 
+@timed("env")
 def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None) -> Step:
     """Steps the environments, or those that are ``active``, and checks what they return, bounds from time to time.
 
@@ -61,6 +62,7 @@ def check_finite(run: Run, step: Step, taken: int) -> None:
     check_obs(run, step.obs, taken, "returned")
 
 
+@timed("env")
 def checked_reset(run: Run, done: np.ndarray) -> PyTree:
     """Starts new episodes in the environments where ``done`` and returns the observations of all.
 

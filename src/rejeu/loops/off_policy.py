@@ -34,8 +34,11 @@ from rejeu.exploration.explorer import memory_in
 from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import gradient_steps
-from rejeu.loops.run import Episode, Progress, Run, Timer, clock_of, record_step, restart
+from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart, start_clock, timed
 from rejeu.spaces import action_scaler, random_action
+
+Choice = tuple[np.ndarray | Array, int]
+"""Actions, which the device may still be computing, and the number of updates that were started before them."""
 
 
 def off_policy(
@@ -58,39 +61,28 @@ def off_policy(
     env, scale = run.env, action_scaler(run.env.action_space)
     first, last = run.step, None if n_steps is None else run.step + n_steps
     check_state(run, learner)
-    timer = Timer(run.seconds)
+    start_clock(run)
     while last is None or run.step < last:
         if run.obs is None or env.must_reset:
             begin_episodes(run)
         if run.action is None:
-            run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)), None))
-        timer.lap()
+            run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)), None)[0])
         action = scale(run.action)
         step = checked_step(run, action)
-        timer.lap("env")
         n_kept, episodes = store(run, learner, config, step, last)
-        timer.lap("replay")
         last_obs = begin_where_ended(run, step)
-        timer.lap("env")
-        if last_obs is not None:
-            run.replay.begin(run.obs, np.flatnonzero(run.ended))
-        observe(run, learner, step.which)
+        if learner.observe is not None:
+            observe(run, learner, step.which)
         done = progress(run.step - first)
         clock = clock_of(run, done)
         n_updates = due(run, config, n_kept, len(episodes))
-        timer.lap("replay")
-        chosen = choose(run, learner, config, clock, step.which) if config.overlap else None
-        timer.lap("update")
-        shapes = batch_shapes(n_updates, config, env.wait_for or env.n_envs)
-        samples = [run.replay.draw(run.rng, shape, done) for shape in shapes]
-        timer.lap("replay")
-        n_unread = len(run.monitor)
+        if config.overlap:
+            chosen = choose(run, learner, config, clock, step.which)
+        samples = sample(run, config, n_updates, done)
         update(run, learner, samples, clock)
-        if chosen is None:
-            chosen, n_unread = choose(run, learner, config, clock, step.which), len(run.monitor)
-        run.action = merged(run.action, np.asarray(chosen), step.which)
-        run.monitor.read(n_unread)  # those are done, since the actions came after them
-        timer.lap("update")
+        if not config.overlap:
+            chosen = choose(run, learner, config, clock, step.which)
+        read(run, chosen, step.which)
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, n_kept, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 
@@ -101,6 +93,7 @@ def begin_episodes(run: Run) -> None:
     run.replay.begin(run.obs)
 
 
+@timed("replay")
 def store(
     run: Run, learner: Learner, config: OffPolicyConfig, step: Step, last: int | None
 ) -> tuple[int, list[Episode]]:
@@ -130,10 +123,11 @@ def begin_where_ended(run: Run, step: Step) -> PyTree:
         return None
     last_obs = jax.tree.map(np.copy, step.obs)
     run.obs = checked_reset(run, run.ended)
+    run.replay.begin(run.obs, np.flatnonzero(run.ended))
     return last_obs
 
 
-def merged(old: np.ndarray, new: np.ndarray, which: np.ndarray | None) -> np.ndarray:
+def merged(old: Any, new: np.ndarray, which: np.ndarray | None) -> np.ndarray:
     """Returns ``old`` with the rows ``which`` of ``new``, which has all rows or only these; ``new`` where that is None."""
     if which is None:
         return new
@@ -147,10 +141,9 @@ def mask(which: np.ndarray | None, n_envs: int) -> np.ndarray | None:
     return None if which is None else np.bincount(which, minlength=n_envs) > 0
 
 
-def choose(
-    run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock, which: np.ndarray | None
-) -> np.ndarray | Array:
-    """Returns random actions at first, then those of the exploring policy, which the device may still be computing.
+@timed("update")
+def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock, which: np.ndarray | None) -> Choice:
+    """Returns random actions at first, then those of the exploring policy, and how many updates are done when they are.
 
     A policy with memory remembers the observations of random actions too, and the replay buffer what it remembered.
     ``run.obs`` must not change before they are read. ``which`` are the environments; None stands for all. Noise and other
@@ -164,7 +157,7 @@ def choose(
         n = run.env.n_envs if which is None else len(which)
         random = random_action(run.env.action_space, n, run.rng, mask)
         if learner.algorithm.recall is None:
-            return random
+            return random, len(run.monitor)
     if learner.algorithm.recall is not None:
         run.replay.ring.remember(np.asarray(memory_in(run.carry)), run.ended, which)
     if which is None:
@@ -174,9 +167,16 @@ def choose(
         action, carry = learner.act(run.state, carry, rows(run.obs, which), run.ended[which], run.key, clock)
         run.carry = jax.tree.map(lambda old, new: old.at[which].set(new) if old.ndim else new, run.carry, carry)
     if random is None:
-        return action
+        return action, len(run.monitor)
     jax.block_until_ready(action)  # until then the device may read the observations
-    return random
+    return random, len(run.monitor)
+
+
+@timed("update")
+def read(run: Run, chosen: Choice, which: np.ndarray | None) -> None:
+    """Waits for the actions of the environments ``which``, and checks the updates that were started before them."""
+    run.action = merged(run.action, np.asarray(chosen[0]), which)
+    run.monitor.read(chosen[1])
 
 
 def rows(obs: PyTree, which: np.ndarray | None) -> PyTree:
@@ -184,16 +184,25 @@ def rows(obs: PyTree, which: np.ndarray | None) -> PyTree:
     return jax.tree.map(np.copy if which is None else (lambda leaf: leaf[which]), obs)
 
 
+@timed("update")
 def observe(run: Run, learner: Learner, which: np.ndarray | None) -> None:
-    """Adds the new observations to the statistics of the state, if it has some.
+    """Adds the new observations to the statistics of the state.
 
     They are copied: the device may read an array after the environments have written the next step to it.
     """
-    if learner.observe is not None:
-        returns = run.running_return if which is None else run.running_return[which]
-        run.state = run.monitor.follow(learner.observe, run.state, rows(run.obs, which), returns)
+    assert learner.observe is not None
+    returns = run.running_return if which is None else run.running_return[which]
+    run.state = run.monitor.follow(learner.observe, run.state, rows(run.obs, which), returns)
 
 
+@timed("replay")
+def sample(run: Run, config: OffPolicyConfig, n_updates: int, progress: float) -> list[tuple[Any, Any]]:
+    """Returns the batches of a number of gradient steps, each with its draw."""
+    shapes = batch_shapes(n_updates, config, run.env.wait_for or run.env.n_envs)
+    return [run.replay.draw(run.rng, shape, progress) for shape in shapes]
+
+
+@timed("update")
 def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Clock) -> None:
     """Starts and counts the updates on samples, and sets priorities by the TD errors of the last ones."""
     run.replay.update_priorities(run.td_errors)

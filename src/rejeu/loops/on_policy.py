@@ -21,7 +21,7 @@ from rejeu.core import GRADIENT_STEPS, Clock, PyTree
 from rejeu.envs.base import Step
 from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
 from rejeu.loops.learner import Learner
-from rejeu.loops.run import Episode, Progress, Run, Timer, clock_of, record_step, restart
+from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart, start_clock, timed
 from rejeu.spaces import action_scaler
 
 
@@ -48,35 +48,36 @@ def on_policy(
     env, n_envs, scale, rollout = run.env, run.env.n_envs, action_scaler(run.env.action_space), run.replay
     first, last = run.step, None if n_steps is None else run.step + n_steps
     check_state(run, learner)
-    timer = Timer(run.seconds)
+    start_clock(run)
     while last is None or run.step < last:
         if run.obs is None or (env.must_reset and not rollout.length):
             begin_episodes(run, config)
-        timer.lap()
-        clock = clock_of(run, progress(run.step - first))
-        chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
-        run.action = np.asarray(chosen)
-        run.monitor.read()  # before the rollout of the last update is overwritten
-        rollout.observe(run.obs)
-        timer.lap("update")
+        run.action = act(run, learner, clock_of(run, progress(run.step - first)))
         stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
         action = scale(run.action)
         step = checked_step(run, action, stepped)
-        timer.lap("env")
         episodes = store(run, config, step, stepped, last)
         is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
         is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
-        timer.lap("replay")
         last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
         run.obs = next_obs(run, step, config, is_done)
-        timer.lap("env")
         if is_done:
             update(run, learner, config, clock_of(run, progress(run.step - first)))
             begin(run, config)
-        timer.lap("update")
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
 
 
+@timed("update")
+def act(run: Run, learner: Learner, clock: Clock) -> np.ndarray:
+    """Returns the actions at the current observations, and puts these into the rollout."""
+    chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+    action = np.asarray(chosen)
+    run.monitor.read()  # before the rollout of the last update is overwritten
+    run.replay.observe(run.obs)
+    return action
+
+
+@timed("replay")
 def store(run: Run, config: RolloutConfig, step: Step, stepped: np.ndarray | None, last: int | None) -> list[Episode]:
     """Adds a step to the rollout and to the running episodes, and returns the episodes that ended."""
     counts = which_count(run, stepped, last)
@@ -91,6 +92,7 @@ def store(run: Run, config: RolloutConfig, step: Step, stepped: np.ndarray | Non
     return episodes
 
 
+@timed("update")
 def update(run: Run, learner: Learner, config: RolloutConfig, clock: Clock) -> None:
     """Starts the update on the rollout, and counts its gradient steps."""
     n_updates: float = config.gradient_steps(run.replay.size())

@@ -9,7 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -22,6 +23,7 @@ from rejeu.envs.base import Step, VectorEnv
 from rejeu.loops.learner import Learner, PackedState, is_finite
 from rejeu.loops.nonfinite import NonFiniteMonitor
 
+F = TypeVar("F", bound=Callable[..., Any])
 PARTS = ("env", "replay", "update")
 """Stepping environments; storing and sampling; waiting for the device."""
 
@@ -114,7 +116,9 @@ class Run:
     """Those of the newest updates, each with the draw of its batch; they set the priorities of the replay buffer one turn
     later."""
     seconds: dict[str, float] = field(default_factory=no_time)
-    """Wall time of the parts of the loop; see :class:`Timer`."""
+    """Wall time of the parts of the loop, and in total; see :func:`timed`."""
+    began: float = 0.0
+    """When training would have begun had it not been interrupted; see :func:`start_clock`."""
     next_look: float = 0
     """The environment step of the next check that observations are within their declared bounds."""
     fetch: Callable[[], None] | None = None
@@ -209,22 +213,32 @@ def initial_run(
     )
 
 
-class Timer:
-    """Adds the wall time of the parts to ``seconds``, each time :meth:`lap` is called."""
+def start_clock(run: Run) -> None:
+    """Goes on counting the wall time of a run in ``run.seconds``."""
+    run.began = time.perf_counter() - run.seconds["total"]
 
-    def __init__(self, seconds: dict[str, float]) -> None:
-        """Continues to count in ``seconds``, which is mutated."""
-        self.seconds = seconds
-        self._last = time.perf_counter()
-        self._began = self._last - seconds["total"]
 
-    def lap(self, part: str | None = None) -> None:
-        """Adds the time since the last call to ``part``, if one is given, and updates the total."""
-        now = time.perf_counter()
-        if part is not None:
-            self.seconds[part] += now - self._last
-        self._last = now
-        self.seconds["total"] = now - self._began
+def add_time(run: Run, part: str, since: float) -> None:
+    """Adds the wall time ``since`` a value of ``time.perf_counter`` to a part of ``run.seconds``, and updates the total."""
+    now, seconds = time.perf_counter(), run.seconds
+    seconds[part] += now - since
+    seconds["total"] = now - run.began
+
+
+def timed(part: str) -> Callable[[F], F]:
+    """Returns a decorator of functions ``(run, ...)`` that adds the time of each call to a part of ``run.seconds``."""
+
+    def decorate(function: F) -> F:
+        @wraps(function)
+        def call(run: Run, *arguments: Any) -> Any:
+            began = time.perf_counter()
+            result = function(run, *arguments)
+            add_time(run, part, began)
+            return result
+
+        return call  # type: ignore[return-value]
+
+    return decorate
 
 
 def time_shares(seconds: Mapping[str, float]) -> dict[str, float]:

@@ -19,7 +19,7 @@ from rejeu.loops.device.program import MAX_TURNS, NO_LIMIT, Limits, Remake
 from rejeu.loops.device.trainer import DeviceTrainer, group_size
 from rejeu.loops.learner import Learner
 from rejeu.loops.nonfinite import NonFiniteUpdate
-from rejeu.loops.run import Progress, Run, Timer
+from rejeu.loops.run import Progress, Run, add_time, start_clock
 
 SECONDS = 0.2
 """Wall time of a chunk that is aimed at: progress bar, callbacks and Ctrl-C wait for its end."""
@@ -117,21 +117,20 @@ def take_chunks(
 ) -> Iterator[list[Progress | None]]:
     """Takes chunks from the step ``first`` to the step ``last``; see :func:`train`."""
     runs, capacity, n_envs = trainer.runs, trainer.program.capacity, trainer.program.n_envs
-    timers = [Timer(run.seconds) for run in runs]
+    for run in runs:
+        start_clock(run)
     pace = Pace(capacity)
     known, trained = list[Any](), list[int]()
     while active and (last is None or runs[active[0]].step < last):
-        leader = runs[active[0]]
-        for timer in timers:
-            timer.lap()
+        leader, began = runs[active[0]], time.perf_counter()
         for run in runs:
             if run.obs is None or run.env.must_reset:
                 trainer.program.begin_episodes(run)
         if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
             trained = [*active]
             trainer.push(float(progress(leader.step - first)), leader)
-        for timer in timers:
-            timer.lap("replay")
+        for run in runs:
+            add_time(run, "replay", began)
         step = leader.step
         n_turns = min(pace.turns, turns_left(step, n_envs, last, stops))
         if step <= leader.learn_from:  # the turns that follow take longer
@@ -151,9 +150,10 @@ def take_chunks(
                 raise_fault(trainer, i, limits)
         turns: list[Progress | None] = [None] * len(runs)
         for i in active:
-            timers[i].lap("update")
+            add_time(runs[i], "update", began)
+            pulling = time.perf_counter()
             turns[i] = trainer.pull(i)
-            timers[i].lap("replay")
+            add_time(runs[i], "replay", pulling)
         pace.note(n_turns, time.perf_counter() - began)
         if step <= leader.learn_from <= leader.step:
             pace.turns = min(8, pace.turns)
