@@ -147,8 +147,7 @@ class Counting(gym.Env):
         return self.observation(), 0.0, self.n == 7, False, {}
 
 
-@pytest.mark.parametrize("padding", ["reset", "zero"])
-@pytest.mark.parametrize("target", ["onnx", "c", "stablehlo"])
+@pytest.mark.parametrize(("padding", "target"), crossed(["reset", "zero"], ["onnx", "c", "stablehlo"]))
 def test_frames_are_stacked_inside_of_a_file(padding, target, tmp_path, monkeypatch):
     make = lambda: FrameStackObservation(Counting(), 4, padding_type=padding)  # noqa: E731
     agent = rejeu.PPO("MlpPolicy", make(), seed=0, policy_kwargs={"net_arch": [16]})
