@@ -158,8 +158,9 @@ def test_neutral_arguments_are_accepted_and_those_not_followed_warn():
         optimize_memory_usage=True, use_sde=False, sde_sample_freq=-1, action_noise=noise, train_freq=(1, "step")
     )
     assert model.config.action_noise == noise.base_noise
+    env = sb3.common.env_util.make_vec_env("Pendulum-v1")
     with pytest.warns(UserWarning, match="handle_timeout_termination"):
-        sac(replay_buffer_kwargs={"handle_timeout_termination": False})
+        sb3.SAC("MlpPolicy", env, replay_buffer_kwargs={"handle_timeout_termination": False}, **SMALL)
     with pytest.raises(TypeError, match="no_such_argument"):
         sac(no_such_argument=1)
 
@@ -408,3 +409,64 @@ def test_trust_regions_and_random_search_are_at_their_paths():
         (64, 64),
         (64, 2),
     }
+
+
+class Reach(gym.Env):
+    """A point that moves on a line, and a place that it must reach, far from 0; five steps an episode."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = spaces.Dict(
+        {key: spaces.Box(-200, 200, (1,), np.float32) for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def _obs(self):
+        place = np.full(1, self.place, np.float32)
+        return {"observation": place, "achieved_goal": place, "desired_goal": np.full(1, self.goal, np.float32)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.t, self.goal = 100.0, 0, self.np_random.integers(97, 104)
+        return self._obs(), {}
+
+    def step(self, action):
+        self.place, self.t = float(np.float32(self.place + np.round(action[0]))), self.t + 1
+        obs = self._obs()
+        return obs, self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {}), False, self.t >= 5, {}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return np.where(np.any(achieved_goal != desired_goal, axis=-1), -1.0, 0.0)
+
+
+@pytest.mark.parametrize("her", [False, True])
+def test_a_replay_buffer_behind_vec_normalize_keeps_original_values_and_draws_scaled_ones(her):
+    from rejeu.sb3.common.env_util import make_vec_env
+    from rejeu.sb3.common.vec_env import VecNormalize
+
+    env = VecNormalize(make_vec_env(Reach, n_envs=2))
+    kwargs = {"replay_buffer_class": HerReplayBuffer} if her else {}
+    model = sb3.SAC("MultiInputPolicy", env, learning_starts=10, batch_size=8, seed=0, **SMALL, **kwargs).learn(44)
+    shown = model.replay_buffer
+    places = shown.observations["observation"]
+    assert np.array_equal(places, np.round(places))
+    assert places.min() > 90
+    ended = shown.dones.astype(bool)
+    assert np.abs(shown.next_observations["observation"][ended] - places[ended]).max() <= 1
+    batch = model.run.replay.draw(np.random.default_rng(0), (32,))[0]
+    reached, goal = (env.unnormalize_obs(batch.next_obs)[key] for key in ("achieved_goal", "desired_goal"))
+    expected = env.normalize_reward(np.where(np.round(reached[:, 0]) == np.round(goal[:, 0]), 0.0, -1.0))
+    np.testing.assert_allclose(batch.reward, expected, rtol=1e-5)
+    model.set_env(VecNormalize(make_vec_env(Reach, n_envs=2), training=False))
+    model.learn(10)
+
+
+def test_time_limits_are_terminal_without_handle_timeout_termination():
+    kwargs = {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "learning_starts": 20, **SMALL}
+    shown = sb3.SAC("MultiInputPolicy", Reach(), **kwargs).learn(12).replay_buffer
+    assert (shown.dones.sum(), shown.timeouts.sum()) == (2, 0)
+    assert sb3.SAC("MultiInputPolicy", Reach(), learning_starts=20, **SMALL).learn(12).replay_buffer.timeouts.sum() == 2
+
+
+def test_noise_of_one_component_is_that_of_every_action():
+    env, noise = envs.IdentityEnvBox(), NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
+    env.action_space = spaces.Box(-1, 1, (3,), np.float32)
+    assert sb3.TD3("MlpPolicy", env, action_noise=noise, **SMALL).config.action_noise.sigma == (0.1, 0.1, 0.1)

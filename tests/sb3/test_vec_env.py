@@ -420,12 +420,12 @@ def test_nothing_moves_while_training_is_off():
 
 def test_only_boxes_are_scaled():
     choices = DummyVecEnv([lambda: gym.make("FrozenLake-v1")])
-    with pytest.raises(ValueError, match="normalizes Box observations"):
+    with pytest.raises(ValueError, match="only supports Box observations"):
         VecNormalize(choices)
     assert VecNormalize(choices, norm_obs=False).reset().shape == (1,)
     with pytest.raises(ValueError, match="norm_obs_keys contains 'goal'"):
         VecNormalize(DummyVecEnv([Reach]), norm_obs_keys=["goal"])
-    with pytest.raises(ValueError, match="needs Dict observations"):
+    with pytest.raises(ValueError, match="applicable only to Dict observations"):
         VecNormalize(walks(), norm_obs_keys=["goal"])
 
 

@@ -78,3 +78,30 @@ def alias(module: str, *names: str) -> None:
     for name in names:
         sys.modules[f"{module}.{name}"] = sys.modules[module]
         setattr(sys.modules[module], name, sys.modules[module])
+
+
+def define_lazily(path: str, names: Mapping[str, str]) -> None:
+    """Makes names importable from the module ``path``, each by the module that has it, which is imported when it is used."""
+
+    def found(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {path!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(names[name]), name)
+
+    define(path, {})
+    sys.modules[path].__dict__.update(__getattr__=found, __all__=[*names])
+
+
+POLICIES = ("CnnPolicy", "MlpPolicy", "MultiInputPolicy", "Actor", "DQNPolicy", "QNetwork", "SACPolicy", "TD3Policy")
+for _name in ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3"):
+    _path, _names = (
+        f"{__name__}.{_name.lower()}",
+        {_name: f"{__name__}.algorithms"} | dict.fromkeys(POLICIES, f"{__name__}.policy"),
+    )
+    define_lazily(_path, _names)
+    alias(_path, _name.lower(), "policies")
+define_lazily(
+    f"{__name__}.her",
+    {"HerReplayBuffer": f"{__name__}.common.buffers", "GoalSelectionStrategy": "rejeu.buffers.hindsight"},
+)
+alias(f"{__name__}.her", "goal_selection_strategy", "her_replay_buffer")

@@ -28,6 +28,8 @@ from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.envs.masks import split
+from rejeu.envs.wrappers import TimeLimitTerminates
+from rejeu.exploration.noise import ActionNoise
 from rejeu.io import checkpoint
 from rejeu.reporting import logging
 from rejeu.sb3 import policy as policies
@@ -35,6 +37,7 @@ from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import encoder_of, register_again
+from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
 from rejeu.sb3.policy import BasePolicy
 from rejeu.sb3.zip_files import load_zip
 
@@ -162,6 +165,10 @@ class Original(Agent):
         made = None
         if isinstance(policy, type):
             env, policy, made = self._prepared(policy, env, settings)
+        replay = settings.get("replay_buffer_kwargs") or {}
+        if replay.get("handle_timeout_termination", True) is False and isinstance(env, str | gym.Env):
+            env = TimeLimitTerminates(gym.make(env) if isinstance(env, str) else env)
+            settings["replay_buffer_kwargs"] = {**replay, "handle_timeout_termination": True}
         name = policy.replace("LstmPolicy", "Policy") if isinstance(policy, str) else policy
         if self.name == "ARS":  # whose policy is linear without hidden layers
             widths, name = ([], "MlpPolicy") if name == "LinearPolicy" else ([64, 64], name)
@@ -230,7 +237,11 @@ class Original(Agent):
                 settings["gamma"] = given.pop("gamma", settings.get("gamma", 0.99))
             settings["replay_buffer_class"] = "HerReplayBuffer" if kind is buffers.HerReplayBuffer else "ReplayBuffer"
         if given.pop("handle_timeout_termination", True) is False:
-            unsupported("handle_timeout_termination", False, "is not followed: time limits are never terminal")
+            unsupported(
+                "handle_timeout_termination",
+                False,
+                "is not followed for vector environments: wrap theirs in TimeLimitTerminates",
+            )
         if given.pop("copy_info_dict", False):
             unsupported("copy_info_dict", True, "is not followed: rewards are computed from the goals alone")
         given.pop("optimize_memory_usage", None)
@@ -389,6 +400,32 @@ class Original(Agent):
         shown.episode_starts[0], shown.episode_starts[1:] = rollout.started, rollout.ended[:-1]
         shown.pos, shown.full = core.length, core.full
         return shown
+
+    def make_buffer(self, env: Any) -> Any:
+        """Returns a new buffer; one for ``VecNormalize`` stores what was not normalized, and scales what is drawn."""
+        scales = self._asks_for_originals(env)
+        buffer: Any = super().make_buffer(env)  # type: ignore[safe-super]
+        return Scaled.by(buffer, self) if scales else buffer
+
+    def keep_buffer(self, env: Any) -> None:
+        """Keeps the buffer for other environments."""
+        self._asks_for_originals(env)
+        super().keep_buffer(env)  # type: ignore[safe-super]
+
+    def _asks_for_originals(self, env: Any) -> bool:
+        """Returns whether ``VecNormalize`` is the outermost wrapper of an off-policy agent, and asks for original values."""
+        asks = isinstance(self, OffPolicyAgent) and isinstance(getattr(env, "venv", None), VecNormalize)
+        if asks:
+            env.gives_originals = True
+        return asks
+
+    def make_noise(self) -> Any:
+        """Returns the noise of the actions; noise of one component is that of every action dimension."""
+        noise, n = getattr(self.config, "action_noise", None), np.prod(self.action_space.shape or (1,), dtype=int)
+        if isinstance(noise, ActionNoise) and len(noise.mean) == 1 < n:
+            each: Any = {"mean": noise.mean * int(n), "sigma": noise.sigma * int(n)}
+            self.config = dataclasses.replace(self.config, action_noise=dataclasses.replace(noise, **each))  # type: ignore[type-var]
+        return super().make_noise()  # type: ignore[safe-super]
 
     @property
     def _last_obs(self) -> Any:
@@ -576,6 +613,37 @@ class Original(Agent):
                 agent = load_agent(cls, found, env, changes)
         agent.device = utils.Device(agent.device)
         return agent
+
+
+class Scaled:
+    """The methods of a replay buffer that stores original observations and rewards, and draws them normalized."""
+
+    def __init__(self, buffer: Any, agent: Original) -> None:
+        self.buffer, self.kind, self.agent = buffer, type(buffer), agent
+
+    @classmethod
+    def by(cls, buffer: Any, agent: Original) -> Any:
+        """Returns a buffer with these methods."""
+        scaled = cls(buffer, agent)
+        buffer.begin, buffer.add, buffer.draw = scaled.begin, scaled.add, scaled.draw
+        return buffer
+
+    def begin(self, obs: Any, which: Any = None) -> None:
+        """Begins episodes with the first observations of the environments."""
+        self.kind.begin(self.buffer, self.agent.run.env.original_obs(final=False), which)
+
+    def add(self, action: Any, reward: Any, terminated: Any, obs: Any, which: Any = None) -> None:
+        """Adds the last step of the environments."""
+        env: Any = self.agent.run.env
+        original = env.vec_normalize.get_original_reward()
+        self.kind.add(self.buffer, action, original, terminated, env.original_obs(final=True), which)
+
+    def draw(self, *args: Any) -> Any:
+        """Returns a batch, normalized by the current statistics, and what was drawn."""
+        batch, drawn = self.kind.draw(self.buffer, *args)
+        scale: Any = self.agent.run.env.vec_normalize
+        obs, following = scale.normalize_obs(batch.obs), scale.normalize_obs(batch.next_obs)
+        return batch._replace(obs=obs, next_obs=following, reward=scale.normalize_reward(batch.reward)), drawn
 
 
 def load_agent(kind: type[Original], path: Path, env: Any, changes: Mapping[str, Any]) -> Any:

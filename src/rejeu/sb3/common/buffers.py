@@ -235,9 +235,10 @@ class ReplayBuffer(BaseBuffer):
     def _add_to_core(self, obs: Any, next_obs: Any, action: Any, reward: Any, terminated: np.ndarray) -> None:
         """Adds a step to the buffer of the agent, whose running episodes end."""
         ring = self.core.ring
-        self.core.begin(obs)
+        kind = type(self.core)  # whose methods take what is given, also where an agent's are those of Scaled
+        kind.begin(self.core, obs)
         actions = np.asarray(action, ring.action.dtype).reshape(ring.n_envs, *ring.action.shape[1:])
-        self.core.add(actions, np.asarray(reward, np.float32), terminated, next_obs)
+        kind.add(self.core, actions, np.asarray(reward, np.float32), terminated, next_obs)
         for name in self.SHOWN:
             self.__dict__.pop(name, None)
         self.pos = int(ring.n_steps.min())

@@ -89,6 +89,8 @@ class VecEnvAdapter(VectorEnv):
             self.reward_threshold = spec.reward_threshold
         self.wrapped_by = type(venv).__name__ if isinstance(venv, VecEnvWrapper) else None
         self.vec_normalize = unwrap_vec_normalize(venv)
+        self.gives_originals = False
+        """Whether the replay buffer stores what was not normalized: :meth:`original_obs` and :meth:`original_reward`."""
         self.n_steps = 0
         """Number of steps of the vector."""
         self._seed = None if seed is None else self._single_seed(seed)
@@ -187,7 +189,7 @@ class VecEnvAdapter(VectorEnv):
         return success_of(step.info[env])
 
     def goals(self) -> GoalFunctions | None:
-        if self.vec_normalize is not None:
+        if self.vec_normalize is not None and not self.gives_originals:
             raise ValueError(
                 "hindsight replay computes rewards from goals, which VecNormalize normalizes; remove it and use the "
                 "agent's option normalize=True"
@@ -204,6 +206,17 @@ class VecEnvAdapter(VectorEnv):
     def _remote(self, name: str) -> Any:
         """Returns a method of the first environment as a function."""
         return lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]
+
+    def original_obs(self, final: bool) -> Any:
+        """Returns the observations of the last step as they were before ``VecNormalize``, the outermost wrapper.
+
+        With ``final``, those where an episode ended are its last ones, else the first ones of the next.
+        """
+        assert self.vec_normalize is not None
+        obs = jax.tree.map(np.copy, self._cast(self.vec_normalize.get_original_obs()))
+        for i, last in self.vec_normalize.old_finals.items() if final else ():
+            self._write_final(obs, i, {TERMINAL_OBSERVATION: last})
+        return obs
 
     def identities(self) -> set[int]:
         return {id(self)} | identities(self.venv)

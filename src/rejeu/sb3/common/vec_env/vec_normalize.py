@@ -113,12 +113,16 @@ class VecNormalize(VecEnvWrapper):
         """Discounted sum of the rewards of each environment so far."""
         self.old_obs: Any = None
         self.old_reward = np.zeros(self.num_envs, np.float32)
+        self.old_finals: dict[int, Any] = {}
+        """Original final observations of the episodes that ended in the last step."""
 
     def _init_observations(self, space: spaces.Space) -> None:
         """Creates the moments of the observations and the space of the normalized observations."""
         is_dict = isinstance(space, spaces.Dict)
         if self.norm_obs_keys is not None and not is_dict:
-            raise ValueError(f"norm_obs_keys={self.norm_obs_keys!r} needs Dict observations, got {space}")
+            raise ValueError(
+                f"norm_obs_keys={self.norm_obs_keys!r} is applicable only to Dict observations, got {space}"
+            )
         parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
         keys = list(parts) if self.norm_obs_keys is None else self.norm_obs_keys
         for key in keys:
@@ -167,9 +171,13 @@ class VecNormalize(VecEnvWrapper):
         if self.training:
             self.returns = self.returns * self.gamma + rewards
             self.ret_rms.update(self.returns)
-        for info in infos:
-            if TERMINAL_OBSERVATION in info:
-                info[TERMINAL_OBSERVATION] = self.normalize_obs(info[TERMINAL_OBSERVATION])
+        self.old_finals = {
+            i: infos[i][TERMINAL_OBSERVATION]
+            for i in np.flatnonzero(dones).tolist()
+            if TERMINAL_OBSERVATION in infos[i]
+        }
+        for i, final in self.old_finals.items():
+            infos[i][TERMINAL_OBSERVATION] = self.normalize_obs(final)
         self.returns[dones] = 0.0
         return self.normalize_obs(obs), self.normalize_reward(rewards), dones, infos
 
@@ -326,6 +334,6 @@ def _check_box(space: spaces.Space, key: str) -> None:
     if not isinstance(space, spaces.Box):
         where = f" under {key!r}" if key else ""
         raise ValueError(
-            f"VecNormalize normalizes Box observations, got {space}{where}; select others with norm_obs_keys, or set "
-            "norm_obs=False"
+            f"VecNormalize only supports Box observations, got {space}{where}; explicitly pass the observation keys to normalize "
+            "as norm_obs_keys, or set norm_obs=False"
         )
