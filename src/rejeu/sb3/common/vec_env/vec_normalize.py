@@ -334,6 +334,6 @@ def _check_box(space: spaces.Space, key: str) -> None:
     if not isinstance(space, spaces.Box):
         where = f" under {key!r}" if key else ""
         raise ValueError(
-            f"VecNormalize only supports Box observations, got {space}{where}; explicitly pass the observation keys to normalize "
-            "as norm_obs_keys, or set norm_obs=False"
+            f"VecNormalize only supports Box observations, got {space}{where}; explicitly pass the observation keys "
+            "to normalize as norm_obs_keys, or set norm_obs=False"
         )
