@@ -15,10 +15,13 @@ from scipy import stats
 import rejeu
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind
 from rejeu.algorithms.actor_critic.steps import entropy_of
+from rejeu.algorithms.sac import mixed
+from rejeu.core import Clock, Transition
 from rejeu.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal
 from rejeu.envs.functional import FunctionalEnv
 from rejeu.spaces import action_width, random_action, rows, scale_action
 from tests.helpers import assert_same_parameters
+from tests.tiers import only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -31,7 +34,12 @@ NESTED = spaces.Dict(
 )
 SPACES = {"nested": NESTED, "tuple": spaces.Tuple([spaces.Discrete(4), spaces.Box(-1.0, 1.0, (2,))])}
 ON = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 16, "seed": 0}
+CONFIG = rejeu.SAC.algorithm.Config(policy_kwargs={"net_arch": [8]})
+MANY = spaces.Dict({"bits": spaces.MultiBinary(12)})
 KINDS = {
+    "SAC": functools.partial(
+        rejeu.SAC, policy_kwargs={"net_arch": [8]}, learning_starts=20, batch_size=8, buffer_size=200, n_steps=2, seed=0
+    ),
     "PPO": functools.partial(rejeu.PPO, **ON, batch_size=16),
     "A2C": functools.partial(rejeu.A2C, **ON),
     "TRPO": functools.partial(rejeu.TRPO, **ON),
@@ -203,7 +211,23 @@ def test_the_network_gives_every_part_its_outputs(settings):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda env: rejeu.SAC("MlpPolicy", env), "SAC needs a Box action space, got Dict"),
+        (lambda env: rejeu.SAC("MlpPolicy", env, use_sde=True), "use_sde=True needs Box actions"),
+        (
+            lambda env: rejeu.SAC("MlpPolicy", env, action_masks=True),
+            "masks need Discrete, MultiDiscrete or MultiBinary",
+        ),
+        (
+            lambda env: rejeu.SAC("MlpPolicy", env, policy_kwargs={"lstm_hidden_size": 8}),
+            "lstm_hidden_size is not available for Dict and Tuple actions",
+        ),
+        (
+            lambda env: rejeu.SAC("MlpPolicy", env).q_values(np.zeros(2)),
+            "SAC.q_values has no critics, or their values depend on",
+        ),
+        (
+            lambda env: mixed.make(CONFIG, Strict.observation_space, MANY),
+            "at most 1,024 combinations of choices, got 4,096",
+        ),
         (lambda env: rejeu.TD3("MlpPolicy", env), "TD3 needs a Box action space, got Dict"),
         (lambda env: rejeu.DQN("MlpPolicy", env), "DQN needs a Discrete action space, got Dict"),
         (lambda env: rejeu.ARS("MlpPolicy", env), "ARS needs Box or Discrete actions, got Dict"),
@@ -221,3 +245,83 @@ def test_the_network_gives_every_part_its_outputs(settings):
 def test_what_does_not_take_them_says_so(make, message):
     with pytest.raises(ValueError, match=message):
         make(Strict())
+
+
+# SAC
+
+
+def batch_of(rng, n=16):
+    action = random_action(NESTED, n, rng)
+    obs, next_obs = rng.normal(size=(2, n, 2)).astype(np.float32)
+    return Transition(obs, action, rng.normal(size=n).astype(np.float32), next_obs, rng.random(n).astype(np.float32))
+
+
+def soft(actor, critics, alpha, obs, key, n):
+    """V and the two mean log-probabilities, by loops over observations and combinations."""
+    outputs = np.asarray(actor(obs), np.float64)
+    _, normal = mixed.policy(actor, obs, n)
+    sample = np.asarray(normal.sample(key))
+    log_c = np.asarray(normal.log_prob(sample), np.float64)
+    values = np.asarray(jax.vmap(lambda critic: critic(obs, sample))(critics)).min(axis=0)
+    found, entropies = [], []
+    for row in range(len(obs)):
+        p = np.exp(outputs[row, :n]) / np.exp(outputs[row, :n]).sum()
+        found.append(sum(p[d] * (values[row, d] - alpha[0] * np.log(p[d])) for d in range(n)) - alpha[1] * log_c[row])
+        entropies.append(-(p * np.log(p)).sum())
+    return np.array(found), np.array(entropies), log_c
+
+
+def test_the_equations_of_sac_with_choices_and_components():
+    rng, n = np.random.default_rng(0), 3 * 2 * 2 * 2 * 3
+    algorithm = mixed.make(CONFIG, Strict.observation_space, NESTED)
+    state, batch = algorithm.init(jax.random.PRNGKey(0)), batch_of(rng)
+    alpha, key = np.float32([0.5, 0.2]), jax.random.PRNGKey(1)
+    value, _, _ = soft(state.actor, state.target_critics, alpha, batch.next_obs, key, n)
+    target = mixed.td_target(state.actor, state.target_critics, jnp.array(alpha), batch, key, n)
+    np.testing.assert_allclose(target, batch.reward + batch.discount * value, rtol=1e-4, atol=1e-4)
+    value, entropy, log_c = soft(state.actor, state.critics, alpha, batch.obs, key, n)
+    loss, log_prob = mixed.actor_loss(state.actor, state.critics, jnp.array(alpha), batch.obs, key, n)
+    np.testing.assert_allclose(loss, -value.mean(), rtol=1e-4)
+    np.testing.assert_allclose(log_prob, np.column_stack([-entropy, log_c]), rtol=1e-3, atol=1e-3)
+    after, metrics = jax.jit(algorithm.update)(state, batch, Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+    targets = np.array([0.3 * np.log(n), -3.0])
+    entropies = np.array([metrics["entropy"], metrics["entropy_box"]])
+    np.testing.assert_allclose(np.sign(after.log_alpha), np.sign(targets - entropies))
+    np.testing.assert_allclose(np.abs(after.log_alpha), 3e-4, rtol=1e-3)  # Adam's first step, from log 1
+
+
+def test_the_critic_learns_the_value_of_the_combination_that_was_taken():
+    rng = np.random.default_rng(1)
+    algorithm = mixed.make(CONFIG, Strict.observation_space, NESTED)
+    state, batch = algorithm.init(jax.random.PRNGKey(0)), batch_of(rng)
+    # columns: two bits, choices of 2 and 3, a component, a gear of 3, two components
+    index = np.ravel_multi_index(batch.action[:, [0, 1, 2, 3, 5]].astype(int).T, (2, 2, 2, 3, 3))
+    box, rows_ = batch.action[:, [4, 6, 7]], np.arange(16)
+    values = np.asarray(jax.vmap(lambda critic: critic(batch.obs, box))(state.critics))[:, rows_, index]
+    _, metrics = algorithm.update(state, batch, Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+    np.testing.assert_allclose(metrics["q_value"], values.mean(), rtol=1e-4)
+    action = np.asarray(algorithm.explore(state.actor, np.zeros((400, 2), np.float32), jax.random.PRNGKey(0), None))
+    for column, size in {0: 2, 1: 2, 2: 2, 3: 3, 5: 3}.items():
+        assert set(action[:, column].tolist()) == {*map(float, range(size))}
+    assert (np.abs(action[:, [4, 6, 7]]) <= 1).all()
+
+
+@pytest.mark.parametrize("on_device", only([True], [True, False]))
+def test_sac_learns_choices_and_components(on_device):
+    agent = rejeu.SAC(
+        "MlpPolicy",
+        rejeu.make_vector(Functional(), 1, seed=0),
+        **{**KINDS["SAC"].keywords, "learning_rate": 0.01, "batch_size": 64, "buffer_size": 2000, "gamma": 0.5},
+    )
+    agent.on_device = on_device
+    agent.learn(700)
+    assert agent.evaluate(8, seed=1).mean_return > 0.8 * 8 * 1.3
+
+
+@pytest.mark.parametrize("space", [spaces.Dict({"a": spaces.Box(-1.0, 1.0, (2,))}), spaces.Tuple([spaces.Discrete(3)])])
+def test_sac_takes_a_dict_of_one_kind(space):
+    algorithm = mixed.make(CONFIG, Strict.observation_space, space)
+    state, rng = algorithm.init(jax.random.PRNGKey(0)), np.random.default_rng(0)
+    batch = batch_of(rng)._replace(action=random_action(space, 16, rng))
+    after, _ = jax.jit(algorithm.update)(state, batch, Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after) if leaf.dtype.kind == "f")

@@ -158,7 +158,7 @@ class OffPolicyAgent(Agent):
 
 
 class SAC(OffPolicyAgent):
-    """Soft actor-critic (Haarnoja et al. 2018), for continuous and Discrete actions."""
+    """Soft actor-critic (Haarnoja et al. 2018), for Box and Discrete actions, and Dict and Tuple of any kind."""
 
     algorithm: ClassVar[ModuleType] = sac
 

@@ -136,7 +136,8 @@ def q_values(
         raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
     if agent.learner.algorithm.action_values is None:
         raise ValueError(
-            f"{agent.name}.q_values has no critics, or their values depend on a memory of observations before"
+            f"{agent.name}.q_values has no critics, or their values depend on a memory of observations before, or the actions "
+            "are a Dict or Tuple"
         )
     observation = split(observation, None)[0] if agent.takes_masks else observation
     obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)

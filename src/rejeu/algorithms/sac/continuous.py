@@ -287,7 +287,7 @@ def temperature_and_targets(
     actor: tuple[Network | SdeActor, PyTree],
     critics: tuple[Any, PyTree],
     log_prob: Array,
-    target_entropy: float,
+    target_entropy: Any,
     config: Any,
     rate: Any,
 ) -> State:
@@ -387,13 +387,17 @@ def initial_alpha(config: EntropyConfig) -> tuple[Array, PyTree]:
     return log_alpha, ALPHA_OPTIMIZER.init(log_alpha)
 
 
-def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: float) -> Array:
-    """Returns the loss that raises the temperature while the policy's entropy is below its target."""
-    return -jnp.mean(log_alpha * (jax.lax.stop_gradient(log_prob) + target_entropy))
+def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: Any) -> Array:
+    """Returns the loss that raises the temperature while the policy's entropy is below its target.
+
+    Of several temperatures ``(n,)``, with ``log_prob (batch, n)`` and targets ``(1, n)``, it is the sum.
+    """
+    weight = jnp.broadcast_to(log_alpha, log_prob.shape)
+    return -jnp.sum(jnp.mean(weight * (jax.lax.stop_gradient(log_prob) + target_entropy), axis=0))
 
 
 def temperature_step(
-    log_alpha: Array, optimizer_state: PyTree, log_prob: Array, target_entropy: float, config: EntropyConfig, rate: Any
+    log_alpha: Array, optimizer_state: PyTree, log_prob: Array, target_entropy: Any, config: EntropyConfig, rate: Any
 ) -> tuple[Array, PyTree]:
     """Returns the temperature's logarithm and optimizer state after one step, unchanged if the temperature is fixed."""
     if not config.learns_temperature:

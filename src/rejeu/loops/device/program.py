@@ -433,6 +433,11 @@ def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = Non
     if isinstance(space, gym.spaces.Box):
         bits = jax.random.bits(key, (n, int(np.prod(space.shape))), jnp.uint32)
         return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-23) - 1.0
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        keys = [jax.random.fold_in(key, i) for i in range(len(space.spaces))]
+        pairs = zip(spaces.members(space), keys, strict=True)
+        parts = [random_action(part, n, own).reshape(n, -1).astype(jnp.float32) for part, own in pairs]
+        return jnp.concatenate(parts, axis=-1)
     sizes: Any = {
         gym.spaces.Discrete: lambda: np.int32(space.n),  # type: ignore[attr-defined]
         gym.spaces.MultiDiscrete: lambda: space.nvec.ravel().astype(np.int32),  # type: ignore[attr-defined]

@@ -1,0 +1,195 @@
+"""Soft actor-critic for Dict and Tuple actions: expectations over the choices, samples of the Box components.
+
+Source: Delalleau et al. 2019, "Discrete and Continuous Action Representation for Practical RL in Video Games" (arXiv
+1912.11077), with its two temperatures, in the special case in which the Box components ``c`` do not depend on the choice
+``d``, one of the combinations of all Discrete, MultiDiscrete and MultiBinary parts. With ``pi(d, c | s) = pi_d(d | s)
+pi_c(c | s)``, critics ``Q_i(s, c)`` with one value per combination, target critics ``Q'_i`` and discount ``g``::
+
+    V(s')  = sum_d pi_d(d | s') (min_i Q'_i(s', c')[d] - alpha_d log pi_d(d | s')) - alpha_c log pi_c(c' | s')
+    J_Q    = mean_i mean (Q_i(s, c)[d] - (r + g V(s')))^2 / 2
+    J_pi   = mean (sum_d pi_d(d | s) (alpha_d log pi_d(d | s) - min_i Q_i(s, c)[d]) + alpha_c log pi_c(c | s))
+
+where ``c ~ pi_c(. | s)`` is reparameterized, and likewise ``c'``. Each temperature is learned as in :mod:`continuous`. The
+automatic target entropies are 0.3 log n of the choices, n being the number of combinations, and minus the number of Box
+components; a number given as ``target_entropy`` is that of the Box components.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jax import Array
+
+from rejeu.algorithms import optimizers
+from rejeu.algorithms.sac.continuous import (
+    ALPHA_OPTIMIZER,
+    HIDDEN_LAYERS,
+    LOG_STD_RANGE,
+    Config,
+    State,
+    initial_state,
+    temperature_and_targets,
+)
+from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE
+from rejeu.core import (
+    TD_ERROR,
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    minimize,
+    weighted_mean,
+    without_gradient,
+)
+from rejeu.distributions import Categorical, TanhNormal
+from rejeu.networks import Network, QNetwork
+from rejeu.prng import nth
+from rejeu.schedules import at
+from rejeu.spaces import Leaf, action_width, check_action, check_box_action, leaves, members
+
+MOST_COMBINATIONS = 1024
+"""Upper limit on the combinations of choices, each of which is an output of every critic."""
+
+
+def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
+    """Returns SAC for Dict or Tuple actions.
+
+    Raises:
+        ValueError: with gSDE or memory, for a Box without finite bounds, and for more than :data:`MOST_COMBINATIONS`.
+    """
+    if config.use_sde:
+        raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
+    if config.has_memory:
+        raise ValueError(
+            "lstm_hidden_size is not available for Dict and Tuple actions; leave it out, or use RecurrentPPO"
+        )
+    sizes = column_sizes(check_action(action_space, config.name))
+    choices = tuple(size for size in sizes if size)
+    n, n_box = math.prod(choices), len(sizes) - len(choices)
+    if n > MOST_COMBINATIONS:
+        raise ValueError(f"SAC takes at most {MOST_COMBINATIONS:,} combinations of choices, got {n:,}; use PPO")
+    order = np.argsort(np.argsort([size > 0 for size in sizes], kind="stable"))
+    obs_leaves = leaves(observation_space)
+    targets = jnp.array([[TARGET_ENTROPY_SHARE * math.log(n), config.entropy_target(-float(n_box))]])
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+
+    def joined(choice: Array, box: Array) -> Array:
+        """Returns combinations ``(batch,)`` and Box components as actions ``(batch, action_width)``."""
+        each = [one.astype(jnp.float32)[:, None] for one in jnp.unravel_index(choice, choices)] if choices else []
+        return jnp.concatenate([box, *each], axis=-1)[:, order]
+
+    def parted(action: Array) -> tuple[Array, Array]:
+        """Returns the combinations and Box components of actions."""
+        is_choice = np.array(sizes) > 0
+        strides = np.cumprod([1, *choices[:0:-1]])[::-1].astype(np.int32)[: len(choices)]
+        chosen = action[:, is_choice].astype(jnp.int32) * strides[None]
+        return jnp.sum(chosen, axis=-1, dtype=jnp.int32), action[:, ~is_choice]
+
+    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
+        return QNetwork(key, leaves, n_box, shape.critic_widths(HIDDEN_LAYERS), shape, n)
+
+    def init(key: Array) -> State:
+        state = initial_state(key, obs_leaves, n + 2 * n_box, critic, config, optimizer)
+        log_alpha = jnp.full((2,), state.log_alpha)
+        alphas = (log_alpha, ALPHA_OPTIMIZER.init(log_alpha))
+        return eqx.tree_at(lambda s: (s.log_alpha, s.alpha_optimizer), state, alphas)
+
+    def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
+        choice_key, box_key = jax.random.split(key)
+        choice, box = policy(actor, obs, n)
+        return joined(choice.sample(choice_key), box.sample(box_key))
+
+    def exploit(actor: Network, obs: PyTree) -> Array:
+        choice, box = policy(actor, obs, n)
+        return joined(choice.mode(), box.mode())
+
+    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
+        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
+        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
+        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch, target_key, n)
+        choice, box = parted(batch.action)
+        critics, critics_optimizer, critic_loss, values = minimize(
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, choice, box, target
+        )
+        actor, actor_optimizer, policy_loss, log_prob = minimize(
+            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key, n
+        )
+        state = temperature_and_targets(
+            state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, targets, config, rate
+        )
+        entropies = -jnp.mean(log_prob, axis=0)
+        return state, {
+            "critic_loss": critic_loss,
+            "actor_loss": policy_loss,
+            "ent_coef": alpha[0],
+            "ent_coef_box": alpha[1],
+            "entropy": entropies[0],
+            "entropy_box": entropies[1],
+            "q_value": jnp.mean(values),
+            TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
+        }
+
+    return Algorithm(init, lambda state: state.actor, explore, exploit, update)
+
+
+def column_sizes(space: spaces.Space) -> list[int]:
+    """Returns the number of possibilities of each number of an action, 0 for the components of a Box."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return [size for part in members(space) for size in column_sizes(part)]
+    if isinstance(space, spaces.Box):
+        return [0] * action_width(check_box_action(space, Config.name))
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    return (
+        [int(n) for n in space.nvec.ravel()] if isinstance(space, spaces.MultiDiscrete) else [2] * action_width(space)
+    )
+
+
+def policy(actor: Network, obs: PyTree, n: int) -> tuple[Categorical, TanhNormal]:
+    """Returns the distributions of the ``n`` combinations and of the Box components."""
+    outputs = actor(obs)
+    mean, log_std = jnp.split(outputs[:, n:], 2, axis=-1)
+    return Categorical(outputs[:, :n]), TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+
+
+def all_values(critics: PyTree, obs: PyTree, box: Array) -> Array:
+    """Returns every critic's value of every combination with Box components, ``(n_critics, batch, n)``."""
+    return jax.vmap(lambda critic: critic(obs, box))(critics)
+
+
+def soft_value(
+    actor: Network, critics: PyTree, alpha: Array, obs: PyTree, key: Array, n: int
+) -> tuple[Array, tuple[Array, Array]]:
+    """Returns ``V``, ``(batch,)``, and the mean log-probability of the choice and that of the sampled Box components."""
+    choice, box = policy(actor, obs, n)
+    sample, box_log_prob = box.sample_and_log_prob(key)
+    log_probabilities = jax.nn.log_softmax(choice.logits)
+    values = jnp.min(all_values(critics, obs, sample), axis=0) - alpha[0] * log_probabilities
+    value = jnp.sum(jnp.exp(log_probabilities) * values, axis=-1) - alpha[1] * box_log_prob
+    return value, (-choice.entropy(), box_log_prob)
+
+
+def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Transition, key: Array, n: int) -> Array:
+    """Returns the TD targets, ``(batch,)``; ``alpha`` are the temperatures of choice and Box components, ``(2,)``."""
+    return batch.reward + batch.discount * soft_value(actor, target_critics, alpha, batch.next_obs, key, n)[0]
+
+
+def critics_loss(critics: PyTree, batch: Transition, choice: Array, box: Array, target: Array) -> tuple[Array, Array]:
+    """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
+    values = all_values(critics, batch.obs, box)
+    index = jnp.broadcast_to(choice[None, :, None], (*values.shape[:2], 1))
+    taken = jnp.take_along_axis(values, index, axis=-1)[..., 0]
+    return 0.5 * jnp.sum(weighted_mean(jnp.square(taken - target[None]), batch.weight)), taken
+
+
+def actor_loss(actor: Network, critics: PyTree, alpha: Array, obs: PyTree, key: Array, n: int) -> tuple[Array, Any]:
+    """Returns the soft policy loss, and the log-probabilities of choice and Box components, ``(batch, 2)``."""
+    value, log_probs = soft_value(actor, critics, alpha, obs, key, n)
+    return -jnp.mean(value), jnp.stack(log_probs, axis=-1)
