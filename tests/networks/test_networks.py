@@ -23,6 +23,7 @@ from rejeu.networks import (
     Convolution,
     Encoder,
     Linear,
+    MemoryConfig,
     Network,
     PolicyConfig,
     QNetwork,
@@ -244,7 +245,7 @@ def test_impossible_shapes_are_refused(given, message):
 def test_a_shape_survives_json(kind):
     config = sac.Config(policy_kwargs=SHAPES[kind])
     assert validation.build(sac.Config, configs.to_json(config)) == config
-    assert hash(config.policy_kwargs) == hash(PolicyConfig(**SHAPES[kind]))
+    assert hash(config.policy_kwargs) == hash(MemoryConfig(**SHAPES[kind]))
 
 
 # --- encoders -------------------------------------------------------------------------------------------------------

@@ -46,8 +46,7 @@ def make(algorithm: Algorithm, noise: Noise | None) -> Explorer:
 
 def plain(algorithm: Algorithm) -> Explorer:
     """Returns the algorithm's own exploration without noise; the carry is its memory, or empty."""
-    if algorithm.recall is not None:
-        assert algorithm.explorer is not None
+    if algorithm.recall is not None and algorithm.explorer is not None:
         return algorithm.explorer
 
     def act(carry: PyTree, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, PyTree]:

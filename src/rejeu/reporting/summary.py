@@ -26,7 +26,18 @@ from rejeu import normalization
 from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.algorithms.recurrent_ppo import RecurrentActorCritic
 from rejeu.core import averaged_fields
-from rejeu.networks import MLP, Branches, Encoder, Linear, Network, PolicyConfig, QNetwork, SimBa, convolutions
+from rejeu.networks import (
+    MLP,
+    Branches,
+    Encoder,
+    Linear,
+    Network,
+    PolicyConfig,
+    QNetwork,
+    Recurrent,
+    SimBa,
+    convolutions,
+)
 from rejeu.spaces import Leaf
 
 ARROW = " -> "
@@ -84,12 +95,15 @@ def draw(network: Any, reach: int = 0) -> str:
     if isinstance(network, RecurrentActorCritic):
         cells = [f"state [{cell.kind} {cell.size}]" for cell in network.cells]
         return draw_policy_and_value(network.readers, cells[0], cells[-1])
+    entrance = "state"
+    if isinstance(network, Recurrent):
+        entrance, network = f"state [{network.cell.kind} {network.cell.size}]", network.reader
     if not isinstance(network, Network | QNetwork):
         return f"({type(network).__name__})"
     output = network.head.n_outputs
     if isinstance(network.torso, Branches):
         return draw_branches(network.torso, output, reach)
-    return draw_torso("state, action" if isinstance(network, QNetwork) else "state", network.torso, output)
+    return draw_torso(entrance + ", action" * isinstance(network, QNetwork), network.torso, output)
 
 
 def draw_policy_and_value(network: ActorCritic, policy_entrance: str, value_entrance: str) -> str:
