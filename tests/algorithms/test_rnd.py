@@ -123,6 +123,18 @@ def test_every_on_policy_algorithm_takes_it(name, tmp_path):
     check(lambda **more: rejeu.AGENTS[name]("MlpPolicy", "CartPole-v1", **settings, **more), tmp_path)
 
 
+def test_it_goes_with_memory_and_masks(tmp_path):
+    from tests.worker_environments import Rules
+
+    memory = {"net_arch": [4], "lstm_hidden_size": 4, "sequence_length": 4, "burn_in": 2}
+    settings = {**OFF, "policy_kwargs": memory, "action_masks": True, "rnd": 0.5}
+    env = Rules()
+    agent = rejeu.DQN("MlpPolicy", env, **settings).learn(80)
+    assert env.taken == 80
+    assert float(agent.run.metrics["rnd_bonus"]) > 0
+    assert_same_parameters(agent, rejeu.load(agent.save(tmp_path / "model")))
+
+
 def check(make, tmp_path):
     agent = make(rnd=0.5, normalize={"norm_reward": False}).learn(70)
     assert {"rnd_bonus", "rnd_loss"} <= {*agent.run.metrics}
