@@ -56,6 +56,8 @@ SHARED = (
 """Configurations from which others are derived, and where their hyperparameters are explained."""
 JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
+HIDDEN = "velocities hidden"
+"""How results are named of environments of whose observations ``--shown`` leaves only some components."""
 
 
 def load(name: str, folder: Path = DATA) -> Any:
@@ -80,6 +82,9 @@ def result_of(data: dict[str, Any]) -> Result:
     options = {word: words[i + 1] for i, word in enumerate(words[:-1]) if word.startswith("--")}
     settings = ["best weights"] if "--best" in words else []
     settings += [f"in {twin}"] if twin != env_id else []
+    if "--shown" in words:
+        size = data["hyperparameters"]["policy_kwargs"].get("lstm_hidden_size")
+        settings += [HIDDEN, "without memory" if size is None else f"memory of {size}"]
     settings += [f"sigma={v:g}" for k, v in json.loads(options.get("--env", "{}")).items() if k == "sigma"]
     is_success = env_id in JUDGED_BY_SUCCESS
     values = [run["success_rate" if is_success else "mean_return"] for run in runs]
@@ -106,7 +111,8 @@ def published(result: Result) -> str:
     """Returns the published return for the algorithm, environment and number of steps of a result, with its source."""
     for entry in load("published.json"):
         same = (entry["algorithm"], entry["env"], f"{entry['steps']:,} steps")
-        if same == (result.algorithm, result.env_id, result.budget) and result.measure == "mean return":
+        is_whole = result.measure == "mean return" and HIDDEN not in result.setting
+        if same == (result.algorithm, result.env_id, result.budget) and is_whole:
             version = f" ({entry['version']})" if "version" in entry else ""
             return f"[{entry['return']:.1f}]({entry['source']}){version}"
     return ""
