@@ -17,8 +17,10 @@ differences and writes them to ``trials/results/verify.json``, from which the pa
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -247,6 +249,18 @@ def parts(folder: Path) -> None:
     names = ("rewards", "dones", "discounts", "next_observations")
     n_step = {name: getattr(sampled, name).numpy().ravel() for name in names}
 
+    import torch
+    from sb3_contrib import ARS
+
+    model = ARS("LinearPolicy", made_up("PPO")(), n_delta=8, n_top=5, delta_std=0.05, learning_rate=0.02, seed=0)
+    model._setup_learn(100)
+    deltas, returns = rng.normal(size=(8, model.n_params)), 10 * rng.normal(size=16)
+    before = model.weights.numpy().copy()
+    model.evaluate_candidates = lambda weights, callback, async_eval: torch.tensor(returns, dtype=torch.float32)
+    with mock.patch.object(torch, "normal", return_value=torch.tensor(deltas, dtype=torch.float32)):
+        model._do_one_update(None, None)
+    ars = {"ars.deltas": deltas, "ars.returns": returns, "ars.step": model.weights.numpy() - before}
+
     envs = VecNormalize(DummyVecEnv([made_up("PPO")] * ENVS), gamma=0.9)
     envs.seed(0)
     found: dict[str, list[Any]] = {name: [] for name in ("raw", "scaled", "reward", "scaled_reward", "ended")}
@@ -264,7 +278,7 @@ def parts(folder: Path) -> None:
             found[name].append(value.copy())
     normalized = {f"normalized.{name}": np.array(values) for name, values in found.items()}
     n_step = {f"n_step.{name}": value for name, value in n_step.items()}
-    np.savez_compressed(folder / "parts.npz", ends=ends, rewards=rewards, **n_step, **normalized)
+    np.savez_compressed(folder / "parts.npz", ends=ends, rewards=rewards, **ars, **n_step, **normalized)
 
 
 # With rejeu.
@@ -279,20 +293,22 @@ def compare(folder: Path) -> None:
     import rejeu
 
     rows = []
-    for name in (*OFF, *ON):
-        rows.append(row := {"algorithm": name} | compared(folder, name))
-        shown = [f"{key} {value:.1e}" for key, value in row.items() if isinstance(value, float)]
-        print(f"{name:15} {'  '.join(shown)}  {row['note']}", flush=True)
-    for row in compared_parts(folder):
+    for row in itertools.chain(({"algorithm": n} | compared(folder, n) for n in (*OFF, *ON)), compared_parts(folder)):
         rows.append(row)
-        print(f"{row['algorithm']:15} numbers {row['numbers']:.1e}  {row['note']}", flush=True)
+        shown = [f"{key} {value:.1e}" for key, value in row.items() if isinstance(value, float)]
+        print(f"{row['algorithm']:15} {'  '.join(shown)}  {row['note']}", flush=True)
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=RESULTS.parent, capture_output=True, text=True, check=True
     )
     versions = json.loads((folder / "versions.json").read_text())
     versions |= {"rejeu": rejeu.__version__, "jax": jax.__version__}
-    command = "python trials/verify.py record FOLDER; python trials/verify.py compare FOLDER"
-    content = {"command": command, "commit": commit.stdout.strip(), "versions": versions, "rows": rows}
+    content = {
+        "command": "python trials/verify.py compare FOLDER",
+        "commit": commit.stdout.strip(),
+        "date": time.strftime("%Y-%m-%d"),
+        "versions": versions,
+        "rows": rows,
+    }
     RESULTS.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -422,6 +438,7 @@ def compared_parts(folder: Path) -> list[dict[str, Any]]:
     import jax.numpy as jnp
 
     from rejeu import spaces
+    from rejeu.algorithms import ars
     from rejeu.buffers.ring import Ring
     from rejeu.buffers.uniform import ReplayBuffer
     from rejeu.normalization import NormalizationConfig, Normalizer, Statistics, merged, no_moments
@@ -446,7 +463,12 @@ def compared_parts(folder: Path) -> list[dict[str, Any]]:
     goes_on = discount > 0
     apart = [difference(batch.reward, data["n_step.rewards"]), difference(batch.discount, discount)]
     apart.append(difference(batch.next_obs[goes_on, 0], data["n_step.next_observations"][goes_on]))
-    found = [{"algorithm": "n-step returns", "numbers": max(apart), "note": "NStepReplayBuffer"}]
+    plus, minus = jnp.asarray(data["ars.returns"].reshape(2, 8), jnp.float32)
+    weight, _ = ars.weights(plus, minus, 5)
+    weight = np.float64(weight) / np.sqrt(10 / 9)  # the deviation of 10 returns, divided by 10 and not by 9
+    found = [{"algorithm": "ARS", "weights": difference(0.02 * weight @ data["ars.deltas"], data["ars.step"])}]
+    found[0]["note"] = "with the unbiased deviation of the returns, which is biased here"
+    found += [{"algorithm": "n-step returns", "numbers": max(apart), "note": "NStepReplayBuffer"}]
 
     recorded = {key.removeprefix("normalized."): value for key, value in data.items() if key.startswith("normalized.")}
     normalizer = Normalizer([0], {0: (OBS,)}, NormalizationConfig(), 1.0)
