@@ -34,7 +34,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from provenance import provenance, write
+from provenance import commit, provenance, write
 
 RESULTS = Path(__file__).parent / "results" / "sb3_suite.json"
 SOURCES = Path(__file__).resolve().parents[1] / "src"
@@ -136,7 +136,9 @@ def main() -> None:
         (folder / "conftest.py").write_text(CONFTEST.format(packages=arguments.packages))
         names = arguments.only or sorted(path.name for path in folder.glob("test_*.py"))
         for name in names:
-            rows.append(run_file(folder, name, arguments.limit, arguments.log, tests.get(name, 1)))
+            rows.append(
+                run_file(folder, name, arguments.limit, arguments.log, tests.get(name, 1)) | {"commit": commit()}
+            )
             print({key: value for key, value in rows[-1].items() if key != "failures"}, flush=True)
     print(total_of(rows))
     names = {str(arguments.folder): "FOLDER", str(arguments.log): "LOG", str(arguments.output): "OUTPUT"}
