@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         ARS as ARS,
         DDPG as DDPG,
         DQN as DQN,
+        IQL as IQL,
         PPO as PPO,
         PQN as PQN,
         QRDQN as QRDQN,
@@ -78,8 +79,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS ARS DDPG DQN PPO PQN QRDQN SAC TD3 TQC TRPO CrossQ MaskablePPO OffPolicyAgent OnPolicyAgent "
-    "RecurrentPPO load register",
+    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL PPO PQN QRDQN SAC TD3 TQC TRPO CrossQ MaskablePPO OffPolicyAgent "
+    "OnPolicyAgent RecurrentPPO load register",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",

@@ -191,6 +191,9 @@ class Algorithm(NamedTuple):
     state_value: Callable[[PyTree, PyTree, PyTree, Array], Array] | None = None
     """``state_value(carry, actor, obs, ended) -> (batch,)``: the critic's values of observations, with the carry of
     ``explorer`` where the policy has a memory and ``()`` elsewhere. None for algorithms without such a critic."""
+    imitation: Callable[[PyTree, PyTree, Any], Array] | None = None
+    """``imitation(actor, obs, action) -> (batch,)``: the loss of an actor for actions that were demonstrated. None: the
+    squared error of ``exploit``, for continuous actions."""
     observe: Callable[[PyTree, PyTree, Array], PyTree] | None = None
     """``observe(state, obs, running_return) -> state``: adds observations ``(batch, ...)`` and discounted sums of
     rewards ``(batch,)`` to running statistics. None where the state needs no more than ``update``."""

@@ -147,6 +147,7 @@ class Normalizer(NamedTuple):
 
     def standardize(self, moments: Moments, x: Array) -> Array:
         """Returns ``x`` ``(..., *shape)`` standardized and clipped; unchanged before the first update of the moments."""
+        moments = jax.lax.stop_gradient(moments)  # which are counted, not learned
         axes = x.ndim - moments.mean.ndim
         mean, variance = (m.reshape(*[1] * axes, *m.shape) for m in (moments.mean, moments.variance))
         z = (x.astype(jnp.float32) - mean) * jax.lax.rsqrt(variance + self.config.epsilon)
@@ -275,6 +276,10 @@ def acting_normalized(algorithm: Algorithm, explorer: Explorer, normalizer: Norm
         assert algorithm.state_value is not None
         return algorithm.state_value(carry, actor[0], normalizer.obs(actor[1], obs), ended)
 
+    def imitation(actor: tuple[PyTree, Statistics], obs: PyTree, action: Any) -> Array:
+        assert algorithm.imitation is not None
+        return algorithm.imitation(actor[0], normalizer.obs(actor[1], obs), action)
+
     return algorithm._replace(
         actor=lambda state: (algorithm.actor(state.learner), state.statistics),
         explore=explore,
@@ -283,4 +288,5 @@ def acting_normalized(algorithm: Algorithm, explorer: Explorer, normalizer: Norm
         recall=None if algorithm.recall is None else recall,
         action_values=None if algorithm.action_values is None else action_values,
         state_value=None if algorithm.state_value is None else state_value,
+        imitation=None if algorithm.imitation is None else imitation,
     )

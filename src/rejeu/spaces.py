@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -366,14 +366,17 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
 def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     """Returns actions of an algorithm from those in the range of the environment: the inverse of :func:`scale_action`.
 
-    ``space`` is a Box or Discrete, ``action`` ``(batch, *shape)``. Actions outside the bounds of a Box are outside [-1, 1];
-    if both bounds are equal, they are 0.
+    ``space`` is a Box, Discrete, MultiDiscrete or MultiBinary, ``action`` ``(batch, *shape)``. Actions outside the bounds of a
+    Box are outside [-1, 1]; if both bounds are equal, they are 0.
 
     >>> unscale_action(spaces.Box(0.0, 4.0, (1,)), np.array([[3.0]])).tolist()
     [[0.5]]
     """
     if isinstance(space, spaces.Discrete):
         return (action - space.start).astype(np.int32)
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        first = space.start if isinstance(space, spaces.MultiDiscrete) else 0
+        return (action - first).astype(np.int32).reshape(len(action), -1)
     assert isinstance(space, spaces.Box)
     bounded = np.isfinite(space.low) & np.isfinite(space.high)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -532,3 +535,48 @@ def _skeleton(space: spaces.Space) -> Any:
     if isinstance(space, spaces.Tuple):
         return tuple(_skeleton(part) for part in space.spaces)
     return 0
+
+
+def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
+    """Returns observations as a batch of arrays of the right types, and whether it was a single observation.
+
+    Args:
+        observation: one of ``space``, or a batch with a leading axis; arrays, or lists of numbers.
+        space: the observation space.
+        leaves: of ``space``.
+
+    Raises:
+        ValueError: if structure or shapes do not match, or the parts are batches of different sizes.
+    """
+    expected = structure(space)
+    try:
+        nested = plain(space, observation)
+        arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(expected.flatten_up_to(nested), leaves, strict=True)]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"the observation has the structure {described(observation)}, expected {space}, or a batch of it: "
+            f"{' '.join(str(error).split())[:200]}"
+        ) from None
+    single = arrays[0].ndim == len(leaves[0].shape)
+    if not single and len({array.shape[:1] for array in arrays}) > 1:
+        raise ValueError(
+            f"the parts of the observations are batches of {[a.shape[:1] for a in arrays]}, not of one size"
+        )
+    for array, leaf in zip(arrays, leaves, strict=True):
+        if (array.shape if single else array.shape[1:]) != leaf.shape:
+            where = f" of {leaf.path!r}" if leaf.path else ""
+            raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
+    return expected.unflatten([array[None] if single else array for array in arrays]), single
+
+
+def described(observation: Any) -> str:
+    """Returns the structure of an invalid observation, in words.
+
+    >>> described({"goal": [0.0], "place": None}), described((1, 2))
+    ('dict(goal: list, place: NoneType)', 'tuple(int, int)')
+    """
+    if isinstance(observation, Mapping):
+        return f"dict({', '.join(f'{key}: {type(part).__name__}' for key, part in observation.items())})"
+    if isinstance(observation, tuple):
+        return f"tuple({', '.join(type(part).__name__ for part in observation)})"
+    return type(observation).__name__

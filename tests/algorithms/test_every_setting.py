@@ -43,7 +43,7 @@ SIZE, N_STEPS, N_ENVS = 8, 8, 2
 PROGRESS = 0.25
 LAST = 1 - PROGRESS
 KINDS = {
-    **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ", "PPO", "A2C", "TRPO", "RecurrentPPO", "ARS"), BOX),
+    **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ", "IQL", "PPO", "A2C", "TRPO", "RecurrentPPO", "ARS"), BOX),
     **dict.fromkeys(("SAC, Discrete", "DDPG, Discrete", "DQN", "QRDQN", "PQN", "MaskablePPO"), DISCRETE),
 }
 NOT_LEARNED = ("optimizer", "target_", "key", "n_updates", "n_rollouts", "mean", "variance", "n_batches", "actor_loss")
@@ -84,7 +84,9 @@ class Result(NamedTuple):
     def first(self) -> dict[str, np.ndarray]:
         """The same of the part that learns first, whose gradient no other step of the update has changed."""
         part = next(
-            part for part in ("critics.", "critic.", "network.") if any(map(part.__eq__, parts_of(self.before)))
+            part
+            for part in ("value.", "critics.", "critic.", "network.")
+            if any(map(part.__eq__, parts_of(self.before)))
         )
         return {name: value for name, value in self.moved.items() if name.startswith(part)}
 
@@ -746,6 +748,13 @@ ELSEWHERE = {
     "replay_buffer_kwargs": f"{HINDSIGHT}::test_of_every_batch_the_share_k_over_k_plus_one_is_relabelled",
     "n_steps": "tests/buffers/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept",
     "priorities": f"{PRIORITIZED}::test_steps_are_drawn_in_proportion_to_their_priorities",
+    "demonstrations": "tests/test_demonstrations.py::test_a_run_with_demonstrations_resumes_equal",
+    "demonstration_share": "tests/test_demonstrations.py::test_every_batch_has_its_share",
+    "rnd": "tests/algorithms/test_rnd.py::test_the_bonus_is_the_error_over_its_running_deviation",
+    "sequence_length": "tests/algorithms/test_memory.py::test_the_transitions_of_sequences_are_steps_with_their_successors",
+    "burn_in": "tests/algorithms/test_memory.py::test_burn_in_brings_no_gradient_and_the_rest_does",
+    "expectile": "tests/test_demonstrations.py::test_good_actions_of_iql_weigh_more",
+    "inverse_temperature": "tests/test_demonstrations.py::test_good_actions_of_iql_weigh_more",
     "frame_stack": "tests/networks/test_images.py::test_sampled_stacks_are_those_that_the_agent_saw",
     "action_masks": "tests/algorithms/test_action_masks.py::test_what_is_forbidden_is_never_done_and_nothing_becomes_infinite",
     "overlap": "tests/agents/test_determinism.py::test_actions_follow_the_newest_update_unless_they_overlap_with_it",

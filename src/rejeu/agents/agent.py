@@ -123,7 +123,7 @@ class Agent(BaseAgent):
         """
         if self.takes_masks:
             observation, action_masks = split(observation, action_masks)
-        batch, single = policy.as_batch(observation, self.observation_space, self.obs_leaves)
+        batch, single = spaces.as_batch(observation, self.observation_space, self.obs_leaves)
         batch = self.with_masks(batch, action_masks)
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)

@@ -149,6 +149,8 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
     """Returns why a replay buffer cannot be on the device, None if it can."""
     if config.has_memory:
         return "networks with memory learn from replay on the host only"
+    if config.demonstrations is not None:
+        return "demonstrations are on the host"
     strategy = None if config.hindsight is None else config.hindsight.goal_selection_strategy
     if type(buffer) not in (ReplayBuffer, HerReplayBuffer):
         return f"the replay buffer {type(buffer).__name__} is your own"

@@ -1,11 +1,11 @@
-"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC and CrossQ."""
+"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC, CrossQ and IQL."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import numpy as np
@@ -13,11 +13,11 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
-from rejeu.algorithms import crossq, ddpg, dqn, qrdqn, sac, td3, tqc
+from rejeu.algorithms import crossq, ddpg, dqn, iql, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import ring_io
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
-from rejeu.buffers.prioritized import Priorities
+from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.goals import GoalFunctions
@@ -30,6 +30,9 @@ from rejeu.io.records import brief
 from rejeu.loops.device import chunks
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
+
+if TYPE_CHECKING:
+    from rejeu.demonstrations import Demonstrations
 
 BUFFERS: dict[str, Any] = {"ReplayBuffer": ReplayBuffer, "HerReplayBuffer": HerReplayBuffer}
 """Replay buffers by the name of their class."""
@@ -111,14 +114,41 @@ class OffPolicyAgent(Agent):
     def start_episodes(self) -> None:
         begin_episodes(self.run)
 
-    def make_buffer(self, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
+    def make_buffer(self, env: VectorEnv) -> Any:
+        config = self.config
+        own = self.empty_buffer(env, env.n_envs, config.buffer_size, config.priorities)
+        if config.demonstrations is None:
+            return own
+        from rejeu import demonstrations
+
+        recorded = demonstrations.read(config.demonstrations)
+        return demonstrations.WithDemonstrations(own, self.replay_of(recorded, env), config.demonstration_share)
+
+    def replay_of(self, recorded: Demonstrations, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
+        """Returns a replay buffer that holds demonstrations, from which batches are drawn as from the agent's own.
+
+        Raises:
+            ValueError: if the spaces differ.
+        """
+        from rejeu import demonstrations
+
+        demonstrations.check(self, recorded)
+        n_rows = recorded.n_steps + len(recorded.episodes) + 1
+        buffer = self.empty_buffer(env, 1, n_rows, None)
+        demonstrations.fill(buffer, self, recorded)
+        return buffer
+
+    def empty_buffer(
+        self, env: VectorEnv, n_envs: int, size: int, priorities: PriorityConfig | None
+    ) -> ReplayBuffer | HerReplayBuffer:
+        """Returns an empty replay buffer for ``n_envs`` environments like those of ``env``, and ``size`` steps in all."""
         config = self.config
         if config.hindsight is not None:
             spaces.check_goal_space(env.observation_space)
         action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
         ring = Ring(
-            config.buffer_size,
-            env.n_envs,
+            size,
+            n_envs,
             *self.observed(env),
             action.shape[1:],
             action.dtype,
@@ -126,25 +156,27 @@ class OffPolicyAgent(Agent):
             counters(config.hindsight),
             sum(leaf.size for leaf in jax.tree.leaves(self.learner.initial_memory(1))),
         )
-        priorities = None if config.priorities is None else Priorities(ring, config.priorities)
+        tree = None if priorities is None else Priorities(ring, priorities)
         each_reward = config.normalize is not None and config.normalize.norm_reward
         kind: Any = config.replay_buffer_class
         kind = BUFFERS[kind] if isinstance(kind, str) else kind
         if config.hindsight is not None:
             goals = self._goals(env)
-            return kind(ring, config.gamma, config.hindsight, goals, config.n_steps, priorities, each_reward)
+            return kind(ring, config.gamma, config.hindsight, goals, config.n_steps, tree, each_reward)
         settings: Any = config.replay_buffer_kwargs or ()
         if config.has_memory:
             shape = config.policy_kwargs
             settings = {"sequence": (shape.sequence_length, shape.burn_in)}
-        return kind(ring, config.gamma, config.n_steps, priorities, each_reward, **dict(settings))
+        return kind(ring, config.gamma, config.n_steps, tree, each_reward, **dict(settings))
 
     def drop_rollout(self) -> None:
         """Does nothing: off-policy algorithms learn from the transitions of any policy."""
 
     def keep_buffer(self, env: VectorEnv) -> None:
-        if isinstance(self.run.replay, HerReplayBuffer):
-            self.run.replay.goals = self._goals(env)
+        replay = self.run.replay
+        for buffer in (getattr(replay, "own", replay), getattr(replay, "demonstrations", None)):
+            if isinstance(buffer, HerReplayBuffer):
+                buffer.goals = self._goals(env)
 
     @staticmethod
     def _goals(env: VectorEnv) -> GoalFunctions:
@@ -197,3 +229,9 @@ class CrossQ(OffPolicyAgent):
     """SAC with batch renormalization instead of target networks (Bhatt et al. 2024), for continuous actions."""
 
     algorithm: ClassVar[ModuleType] = crossq
+
+
+class IQL(OffPolicyAgent):
+    """Implicit Q-learning from recorded episodes (Kostrikov et al. 2022), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = iql

@@ -56,7 +56,7 @@ class OnPolicyAgent(Agent):
         """
         if self.takes_masks:
             observation, _ = split(observation, None)
-        obs, single = policy.as_batch(observation, self.observation_space, self.obs_leaves)
+        obs, single = spaces.as_batch(observation, self.observation_space, self.obs_leaves)
         n = len(jax.tree.leaves(obs)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
         with devices.chosen(self.device):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
@@ -18,7 +18,6 @@ from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
 from rejeu.loops import nonfinite
 from rejeu.loops.run import clock_of
-from rejeu.spaces import Leaf
 
 CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "min": lambda values: values.min(axis=0),
@@ -26,51 +25,6 @@ CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "all": lambda values: values,
 }
 """How :func:`q_values` reduces the values of several critics, ``(n_critics, ...)``."""
-
-
-def as_batch(observation: Any, space: gym.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
-    """Returns observations as a batch of arrays of the right types, and whether it was a single observation.
-
-    Args:
-        observation: one of ``space``, or a batch with a leading axis; arrays, or lists of numbers.
-        space: the observation space.
-        leaves: of ``space``.
-
-    Raises:
-        ValueError: if structure or shapes do not match, or the parts are batches of different sizes.
-    """
-    expected = spaces.structure(space)
-    try:
-        nested = spaces.plain(space, observation)
-        arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(expected.flatten_up_to(nested), leaves, strict=True)]
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"the observation has the structure {described(observation)}, expected {space}, or a batch of it: "
-            f"{' '.join(str(error).split())[:200]}"
-        ) from None
-    single = arrays[0].ndim == len(leaves[0].shape)
-    if not single and len({array.shape[:1] for array in arrays}) > 1:
-        raise ValueError(
-            f"the parts of the observations are batches of {[a.shape[:1] for a in arrays]}, not of one size"
-        )
-    for array, leaf in zip(arrays, leaves, strict=True):
-        if (array.shape if single else array.shape[1:]) != leaf.shape:
-            where = f" of {leaf.path!r}" if leaf.path else ""
-            raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
-    return jax.tree.unflatten(expected, [array[None] if single else array for array in arrays]), single
-
-
-def described(observation: Any) -> str:
-    """Returns the structure of an invalid observation, in words.
-
-    >>> described({"goal": [0.0], "place": None}), described((1, 2))
-    ('dict(goal: list, place: NoneType)', 'tuple(int, int)')
-    """
-    if isinstance(observation, Mapping):
-        return f"dict({', '.join(f'{key}: {type(part).__name__}' for key, part in observation.items())})"
-    if isinstance(observation, tuple):
-        return f"tuple({', '.join(type(part).__name__ for part in observation)})"
-    return type(observation).__name__
 
 
 def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
@@ -140,7 +94,7 @@ def q_values(
             "are a Dict or Tuple"
         )
     observation = split(observation, None)[0] if agent.takes_masks else observation
-    obs, single = as_batch(observation, agent.observation_space, agent.obs_leaves)
+    obs, single = spaces.as_batch(observation, agent.observation_space, agent.obs_leaves)
     n = len(jax.tree.leaves(obs)[0])
     space = agent.action_space
     is_discrete = isinstance(space, gym.spaces.Discrete)

@@ -172,6 +172,11 @@ class OffPolicyConfig(AlgorithmConfig):
     off-policy bias."""
     priorities: PriorityConfig | None = None
     """Prioritized experience replay: ``dict(alpha=0.6, beta=0.4)``, or ``{}`` for the defaults. None samples uniformly."""
+    demonstrations: str | None = None
+    """Folder of a Minari dataset, such as ``rejeu play --record`` writes, a share of which is in every batch. Observations and
+    actions must be those of the environment. None for none."""
+    demonstration_share: float = 0.5
+    """Share of each batch that is drawn from ``demonstrations``, in [0, 1]. A larger share stays closer to them."""
     frame_stack: int | None = None
     """Number of frames that observations stack along the first axis. The replay buffer then stores each frame once and
     builds the stacks when it samples. None stores observations as they are."""
@@ -199,6 +204,12 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "gradient_steps", gradient_steps)
         coerce(self, "overlap", flag)
         coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
+        coerce(self, "demonstration_share", number, least=0, most=1)
+        assign(self, demonstrations=None if self.demonstrations is None else str(self.demonstrations))
+        if self.demonstrations is not None and self.priorities is not None:
+            raise ValueError(
+                "demonstrations and priorities cannot be combined: the share is drawn uniformly; leave one out"
+            )
         assign(self, action_noise=action_noises.parse(self.action_noise))
         coerce(self, "replay_buffer_class", buffer_name)
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
@@ -215,6 +226,7 @@ class OffPolicyConfig(AlgorithmConfig):
         refused = {
             f"replay_buffer_class={self.replay_buffer_class!r}": self.replay_buffer_class != "ReplayBuffer",
             "priorities": self.priorities is not None,
+            "demonstrations": self.demonstrations is not None,
             "action_noise=ParameterNoise()": isinstance(self.action_noise, ParameterNoise),
         }
         if given := [setting for setting, is_given in refused.items() if is_given]:

@@ -63,6 +63,8 @@ from rejeu.schedules import Exponential, Linear, Schedule, at
 from rejeu.spaces import Leaf, check_discrete_action, nth_allowed
 from rejeu.validation import choice, coerce, flag, number, whole
 
+MARGIN = 0.8
+"""By how much a demonstrated action should be better than the others; that of arXiv 1704.03732."""
 HIDDEN_LAYERS = (64, 64)
 """Default widths of the network but on images, those of Stable-Baselines3."""
 
@@ -218,8 +220,28 @@ def epsilon_greedy_algorithm(
         return state.network(obs)[None]
 
     return Algorithm(
-        init, lambda state: state.network, explore, exploit, update, action_values=values, state_value=state_value
+        init,
+        lambda state: state.network,
+        explore,
+        exploit,
+        update,
+        action_values=values,
+        state_value=state_value,
+        imitation=lambda network, obs, action: margin_loss(forbid(network(obs), unmasked(obs)[1]), action),
     )
+
+
+def margin_loss(values: Array, action: Array) -> Array:
+    """Returns ``max_a (Q(s, a) + m(a)) - Q(s, a*)`` with a margin ``m`` that is 0 at ``a*``, ``(batch,)``.
+
+    So the demonstrated action ``a*`` becomes the best by at least the margin, and no value grows without limit (Hester et
+    al. 2018, arXiv 1704.03732, equation 2).
+
+    >>> margin_loss(jnp.array([[1.0, 3.0]]), jnp.array([1])).tolist(), margin_loss(jnp.zeros((1, 2)), jnp.array([0])).tolist()
+    ([0.0], [0.800000011920929])
+    """
+    margin = MARGIN * (jnp.arange(values.shape[1])[None] != action[:, None])
+    return jnp.max(values + margin, axis=-1) - taken(values, action)
 
 
 def metrics_of(loss: Array, q_value: Array, epsilon: Schedule, clock: Clock) -> Metrics:

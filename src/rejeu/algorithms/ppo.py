@@ -35,7 +35,15 @@ from jax import Array
 from rejeu import schedules
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import ActorCritic, checked, exploit, explore, explorer_of, state_value
+from rejeu.algorithms.actor_critic.network import (
+    ActorCritic,
+    checked,
+    exploit,
+    explore,
+    explorer_of,
+    imitation_of,
+    state_value,
+)
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     clip_and_descend,
@@ -150,7 +158,16 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
     explorer = explorer_of(config, kind)
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=state_value)
+    return Algorithm(
+        init,
+        lambda state: state.network,
+        explore,
+        exploit,
+        update,
+        explorer,
+        state_value=state_value,
+        imitation=imitation_of(kind),
+    )
 
 
 def metrics_of(

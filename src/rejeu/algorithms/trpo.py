@@ -32,7 +32,7 @@ from jax.scipy.sparse.linalg import cg
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of, is_value
+from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of, imitation_of, is_value
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     explained_variance,
@@ -178,7 +178,16 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return network.value(obs)
 
     explorer = explorer_of(config, kind)
-    return Algorithm(init, lambda state: state.network, explore, exploit, update, explorer, state_value=value)
+    return Algorithm(
+        init,
+        lambda state: state.network,
+        explore,
+        exploit,
+        update,
+        explorer,
+        state_value=value,
+        imitation=imitation_of(kind),
+    )
 
 
 def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:

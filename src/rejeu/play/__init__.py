@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import Agent
+from rejeu.demonstrations.recording import Recording
 from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env
 from rejeu.envs.rendering import make_rendering_env, natural_fps
@@ -23,7 +24,6 @@ from rejeu.envs.validation import id_of
 from rejeu.interrupt import Interrupt
 from rejeu.play.game import Act, Game, Player
 from rejeu.play.keys import KeyMap, full_name, keys_for
-from rejeu.play.recording import Recording
 from rejeu.play.window import Window
 from rejeu.validation import number, whole
 

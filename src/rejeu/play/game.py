@@ -10,10 +10,10 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from rejeu.demonstrations.recording import Recording
 from rejeu.envs.base import success_of
 from rejeu.envs.rendering import rgb_frame
 from rejeu.play.keys import CONTROLS
-from rejeu.play.recording import Recording
 
 Act = Callable[[Any, frozenset[str], int], Any]
 """Maps the observation, the held keys and the step of the episode (from 0) to an action, or None to wait."""

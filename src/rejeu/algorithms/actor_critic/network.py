@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -207,6 +208,11 @@ def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
 def exploit(actor: ActorCritic, obs: PyTree) -> Array:
     """Returns the likeliest actions."""
     return actor.policy(obs).mode()
+
+
+def imitation_of(kind: ActionKind) -> Callable[..., Array] | None:
+    """Returns ``imitation`` of :class:`rejeu.core.Algorithm`: minus the log-probability, None for Box actions."""
+    return None if kind.kind == "box" else lambda actor, obs, action: -actor.policy(obs).log_prob(action)
 
 
 def state_value(carry: PyTree, actor: ActorCritic, obs: PyTree, ended: Array) -> Array:

@@ -22,7 +22,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.ddpg.continuous import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
-from rejeu.algorithms.sac.discrete import exploit, explore
+from rejeu.algorithms.sac.discrete import exploit, explore, imitation
 from rejeu.core import (
     Algorithm,
     Clock,
@@ -64,7 +64,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         return next_state(state, config, (actor, actor_optimizer), (critic, critic_optimizer)), metrics
 
     values = lambda state, obs, action: state.critic(obs)[None]  # noqa: E731
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+    return Algorithm(
+        init, lambda state: state.actor, explore, exploit, update, action_values=values, imitation=imitation
+    )
 
 
 def td_target(target_actor: Network, target_critic: Network, batch: Transition) -> Array:

@@ -46,7 +46,7 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.distributions import forbid
+from rejeu.distributions import Categorical, forbid
 from rejeu.networks import Network, each
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, leaves
@@ -91,7 +91,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         )
 
     values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
-    algorithm = Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values)
+    algorithm = Algorithm(
+        init, lambda state: state.actor, explore, exploit, update, action_values=values, imitation=imitation
+    )
     return remembering(algorithm, shape, networks)
 
 
@@ -103,6 +105,11 @@ def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
 def exploit(actor: Network, obs: PyTree) -> Array:
     """Returns the most likely actions, ``int32 (batch,)``."""
     return jnp.argmax(logits(actor, obs), axis=-1).astype(jnp.int32)
+
+
+def imitation(actor: Network, obs: PyTree, action: Array) -> Array:
+    """Returns minus the log-probabilities of actions, ``(batch,)``."""
+    return -Categorical(logits(actor, obs)).log_prob(action)
 
 
 def logits(actor: Network, obs: PyTree) -> Array:

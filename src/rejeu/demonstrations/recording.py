@@ -31,26 +31,28 @@ class Recording:
     Args:
         folder: new or empty; created with the first episode.
         env: the environment that is played, from whose id the dataset is named.
-        fps: frames per second of the video.
+        fps: frames per second of the video; None writes none.
+        by: who plays, ``"human"`` or ``"expert"``; names the dataset.
 
     Raises:
         MissingExtra: if Minari or imageio-ffmpeg is not installed.
         FileExistsError: if the folder is not empty.
     """
 
-    def __init__(self, folder: str | Path, env: gym.Env, fps: float) -> None:
+    def __init__(self, folder: str | Path, env: gym.Env, fps: float | None, by: str = "human") -> None:
         try:
             import h5py  # noqa: F401 - Minari's files
             import minari
             from minari.data_collector.episode_buffer import EpisodeBuffer
         except ImportError:
             raise MissingExtra("recording", "minari[hdf5]", "play") from None
-        ffmpeg()
+        if fps is not None:
+            ffmpeg()
         self._minari, self._buffer_type = minari, EpisodeBuffer
         self.folder = Path(folder).absolute()
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{folder} exists and is not an empty folder; choose another one")
-        self.dataset_id = re.sub(r"[^\w/-]", "-", id_of(env)) + "/human-v0"
+        self.dataset_id = re.sub(r"[^\w/-]", "-", id_of(env)) + f"/{by}-v0"
         self.episodes = 0
         """Number of recorded episodes."""
         self._description = gym.Env[Any, Any]()
@@ -58,9 +60,10 @@ class Recording:
         self._description.spec = spec_of(env)
         self._description.observation_space, self._description.action_space = env.observation_space, env.action_space
         self._dataset: Any = None
-        self._video = VideoFile(self.folder / VIDEO_NAME, fps)
+        self._video = None if fps is None else VideoFile(self.folder / VIDEO_NAME, fps)
+        self._by = by
         self._buffer: Any = None
-        self._frame = np.zeros(0, np.uint8)
+        self._frame: Any = None
 
     def __str__(self) -> str:
         if not self.episodes:
@@ -70,18 +73,27 @@ class Recording:
             f"minari.load_dataset({self.dataset_id!r})"
         )
 
-    def begin(self, obs: Any, seed: int, frame: np.ndarray) -> None:
+    def begin(self, obs: Any, seed: int | None, frame: np.ndarray | None = None) -> None:
         """Starts an episode, and ends a running one as truncated."""
         self._end()
         self._buffer = self._buffer_type(seed=seed, observations=copy.deepcopy(obs))
         self._frame = frame
 
-    def step(self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, frame: np.ndarray) -> None:
+    def step(
+        self,
+        obs: Any,
+        action: Any,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+        frame: np.ndarray | None = None,
+    ) -> None:
         """Adds a step."""
-        if not len(self._buffer):
-            self._video.write(self._frame)
-        self._video.write(frame)
-        self._frame = frame
+        if self._video is not None and frame is not None:
+            if not len(self._buffer):
+                self._video.write(self._frame)
+            self._video.write(frame)
+            self._frame = frame
         self._buffer = self._buffer.add_step_data(
             {
                 "observation": copy.deepcopy(obs),
@@ -100,9 +112,10 @@ class Recording:
         try:
             self._end()
         except BaseException:
-            self._video.discard()
+            if self._video is not None:
+                self._video.discard()
             raise
-        if self._video.n_frames:
+        if self._video is not None and self._video.n_frames:
             self._video.close()
 
     def _end(self) -> None:
@@ -116,8 +129,9 @@ class Recording:
         else:
             self._dataset.update_dataset_from_buffer([buffer])
         self.episodes += 1
-        for _ in range(round(HOLD_SECONDS * self._video.fps)):
-            self._video.write(self._frame)
+        if self._video is not None:
+            for _ in range(round(HOLD_SECONDS * self._video.fps)):
+                self._video.write(self._frame)
 
     def _create(self, buffer: Any) -> Any:
         described = None if self._description.spec is None else self._description
@@ -130,8 +144,8 @@ class Recording:
                 eval_env=described,
                 observation_space=self._description.observation_space,
                 action_space=self._description.action_space,
-                algorithm_name="human",
-                description="Played by hand with rejeu play",
+                algorithm_name=self._by,
+                description="Played by hand with rejeu play" if self._by == "human" else "Played by an agent",
                 data_format="hdf5",
                 jpeg_encoding=False,  # lossless images
             )

@@ -1,0 +1,445 @@
+"""Demonstrations: episodes that a person or an expert played, and how an agent learns from them.
+
+They are read from and written to Minari datasets, such as ``rejeu play --record`` writes. An agent can imitate them
+(:func:`clone`), ask the expert what to do where it came itself (:func:`dagger`), learn from them without an environment
+(:func:`learn_offline`), and have a share of them in every batch while it trains (``demonstrations`` and
+``demonstration_share`` of the off-policy algorithms).
+
+Sources: Ross et al. 2011, "A Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning" (arXiv
+1011.0686), for DAgger; Ball et al. 2023, "Efficient Online Reinforcement Learning with Offline Data" (arXiv 2302.02948), for
+the share in every batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from rejeu import interrupt, spaces
+from rejeu.core import Algorithm, PyTree, averaged_fields
+from rejeu.envs.registry import make_env
+from rejeu.errors import MissingExtra
+from rejeu.loops.off_policy import update
+from rejeu.loops.run import clock_of
+from rejeu.reporting.formatting import counted
+from rejeu.validation import number, whole
+
+MOST_IN_ONE_CALL = 100
+"""Gradient steps in one call of a compiled function."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode of ``T`` steps."""
+
+    observations: Any
+    """As the environment gives them, each array with a leading axis of ``T + 1``."""
+    actions: Any
+    """In the range of the action space, ``(T, ...)``."""
+    rewards: np.ndarray
+    """``(T,)``."""
+    terminated: bool
+    """Whether it ended in a terminal state; else it was truncated."""
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Demonstrations:
+    """Episodes of an environment with these spaces."""
+
+    episodes: tuple[Episode, ...]
+    observation_space: gym.Space
+    action_space: gym.Space
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps of all episodes."""
+        return sum(map(len, self.episodes))
+
+    @property
+    def mean_return(self) -> float:
+        """Mean sum of rewards of an episode."""
+        return float(np.mean([episode.rewards.sum() for episode in self.episodes]))
+
+    def __repr__(self) -> str:
+        n = counted(len(self.episodes), "episode")
+        return f"<Demonstrations: {n}, {counted(self.n_steps, 'step')}, mean return {self.mean_return:,.2f}>"
+
+    def __add__(self, other: Demonstrations) -> Demonstrations:
+        return dataclasses.replace(self, episodes=self.episodes + other.episodes)
+
+
+def read(path: str | Path) -> Demonstrations:
+    """Returns the episodes of a Minari dataset.
+
+    Args:
+        path: the folder of a dataset (it holds ``data``), or a folder that holds one dataset, such as
+            ``rejeu play --record`` writes.
+
+    Raises:
+        FileNotFoundError: if there is no dataset.
+        ValueError: if there are several, or the dataset has no step or numbers that are not finite.
+        MissingExtra: if Minari is not installed.
+    """
+    try:
+        import minari
+    except ImportError:
+        raise MissingExtra("reading demonstrations", "minari[hdf5]", "play") from None
+    path = Path(path)
+    found = sorted({file.parent for file in path.rglob("metadata.json") if file.parent.name == "data"})
+    if not found:
+        raise FileNotFoundError(f"{path} holds no Minari dataset; record one: rejeu play ENV --record {path}")
+    if len(found) > 1:
+        names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
+        raise ValueError(f"{path} holds {len(found)} datasets ({names}); give the folder of one of them")
+    data = minari.MinariDataset(found[0])
+    episodes = tuple(
+        Episode(e.observations, e.actions, np.asarray(e.rewards, np.float32), bool(e.terminations[-1]))
+        for e in data.iterate_episodes()
+        if len(e.rewards)
+    )
+    if not episodes:
+        raise ValueError(f"{path} holds no step; play at least one episode")
+    if not all(np.isfinite(a).all() for e in episodes for a in jax.tree.leaves((e.actions, e.rewards))):
+        raise ValueError(f"{path} holds actions or rewards that are NaN or infinite; record it again")
+    return Demonstrations(episodes, data.observation_space, data.action_space)
+
+
+def record(
+    agent: Any, env: str | gym.Env, episodes: int, path: str | Path | None = None, seed: int | None = None
+) -> Demonstrations:
+    """Plays whole episodes with an agent, and returns them.
+
+    Args:
+        agent: anything with ``predict(obs, deterministic=True)``.
+        env: an id, or an environment.
+        episodes: number of episodes.
+        path: new or empty folder for a Minari dataset of them; None writes none.
+        seed: of the first episode; each further one adds 1. None draws one.
+
+    Raises:
+        FileExistsError: if the folder is not empty.
+        MissingExtra: if Minari is needed and not installed.
+    """
+    from rejeu.demonstrations.recording import Recording
+
+    made = make_env(env) if isinstance(env, str) else env
+    recording = None if path is None else Recording(path, made, None, "expert")
+    try:
+        seeds = [None if seed is None else seed + i for i in range(whole("episodes", episodes, least=1))]
+        played = [play(made, agent, lambda obs, own: own, one, recording) for one in seeds]
+    finally:
+        if recording is not None:
+            recording.close()
+        if made is not env:
+            made.close()
+    return Demonstrations(tuple(played), made.observation_space, made.action_space)
+
+
+def play(
+    env: gym.Env,
+    agent: Any,
+    label: Callable[[Any, Any], Any],
+    seed: int | None = None,
+    recording: Any = None,
+    most: int | None = None,
+) -> Episode:
+    """Returns an episode that an agent plays, of at most ``most`` steps, with ``label(obs, action)`` as its actions."""
+    obs, _ = env.reset(seed=seed)
+    observations, actions, rewards, terminated = [obs], [], [], False
+    if recording is not None:
+        recording.begin(obs, seed)
+    for step in itertools.count(1):
+        if (signal := interrupt.requested()) is not None:
+            raise interrupt.Stopped(signal)
+        action, _ = agent.predict(obs, deterministic=True)
+        actions.append(label(obs, action))
+        obs, reward, terminated, truncated, _ = env.step(action)
+        observations.append(obs)
+        rewards.append(float(reward))
+        truncated = truncated or step == most
+        if recording is not None:
+            recording.step(obs, action, float(reward), terminated, truncated)
+        if terminated or truncated:
+            break
+    stack = lambda parts: jax.tree.map(lambda *leaves: np.stack(leaves), *parts)  # noqa: E731
+    return Episode(stack(observations), stack(actions), np.asarray(rewards, np.float32), bool(terminated))
+
+
+def clone(
+    agent: Any,
+    demonstrations: Demonstrations,
+    updates: int = 2000,
+    *,
+    batch_size: int = 128,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+) -> float:
+    """Trains the policy of an agent to act as demonstrated (behavior cloning), and returns the loss of the last updates.
+
+    The loss of continuous actions is the squared error of the deterministic action in [-1, 1], of other actions minus their
+    log-probability. For DQN, QR-DQN and PQN, whose policy follows from values, it is ``max_a (Q(s, a) + m(a)) - Q(s, a*)`` for
+    the demonstrated ``a*``, where the margin ``m`` is 0.8 except at ``a*`` (Hester et al. 2018, arXiv 1704.03732, equation 2).
+    Critics learn nothing. Adam begins anew; the optimizers of the agent are not touched.
+
+    Args:
+        agent: any agent without a memory.
+        demonstrations: with its spaces.
+        updates: number of gradient steps.
+        batch_size: steps in each batch, drawn with replacement.
+        learning_rate: step size of Adam.
+        seed: of the batches.
+
+    Raises:
+        ValueError: if the spaces differ, or the agent has a memory.
+    """
+    check(agent, demonstrations)
+    algorithm = agent.learner.algorithm
+    if algorithm.recall is not None:
+        raise ValueError(
+            f"{agent.name} has a memory, and clone imitates single steps; use PPO or an algorithm without one"
+        )
+    updates, batch_size = whole("updates", updates, least=1), whole("batch_size", batch_size, least=1)
+    optimizer = optax.adam(number("learning_rate", learning_rate, above=0))
+    pairs = [arrays_of(agent, episode) for episode in demonstrations.episodes]
+    obs, action = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
+    state = seen(agent, obs, demonstrations.episodes)
+    weights, rest = eqx.partition(state, eqx.is_inexact_array)
+
+    def loss(weights: PyTree, batch: tuple[PyTree, Any]) -> Any:
+        actor = algorithm.actor(eqx.combine(weights, rest))
+        return jnp.mean(imitation_loss(algorithm, actor, *batch))
+
+    @jax.jit
+    def steps(weights: PyTree, moments: PyTree, batches: tuple[PyTree, Any]) -> tuple[PyTree, PyTree, Any]:
+        def step(carry: tuple[PyTree, PyTree], batch: tuple[PyTree, Any]) -> tuple[tuple[PyTree, PyTree], Any]:
+            value, gradients = jax.value_and_grad(loss)(carry[0], batch)
+            direction, moments = optimizer.update(gradients, carry[1])
+            return (optax.apply_updates(carry[0], direction), moments), value
+
+        carry, losses = jax.lax.scan(step, (weights, moments), batches)
+        return *carry, jnp.mean(losses)
+
+    rng, moments, value = np.random.default_rng(seed), optimizer.init(weights), 0.0
+    for n in chunks(updates):
+        index = rng.integers(len(action), size=(n, batch_size))
+        weights, moments, value = steps(weights, moments, jax.tree.map(lambda leaf: leaf[index], (obs, action)))  # noqa: B023
+        if interrupt.requested() is not None:
+            break
+    agent.run.state = agent.learner.pack(with_targets(eqx.combine(weights, rest)))
+    return float(value)
+
+
+def imitation_loss(algorithm: Algorithm, actor: PyTree, obs: PyTree, action: Any) -> Any:
+    """Returns the loss of an actor for demonstrated actions, ``(batch,)``; see :func:`clone`."""
+    if algorithm.imitation is not None:
+        return algorithm.imitation(actor, obs, action)
+    return jnp.sum(jnp.square(algorithm.exploit(actor, obs) - action), axis=-1)
+
+
+def dagger(
+    agent: Any,
+    expert: Callable[[Any], Any],
+    env: str | gym.Env,
+    demonstrations: Demonstrations | None = None,
+    *,
+    rounds: int = 10,
+    steps: int = 500,
+    updates: int = 1000,
+    seed: int = 0,
+) -> Demonstrations:
+    """Trains an agent to act as an expert in the states that it reaches itself (DAgger); returns all labeled episodes.
+
+    In each round the agent acts, the expert says what it would have done, and the agent is cloned from all rounds. So it
+    learns to come back from its own mistakes, which demonstrations do not show.
+
+    Args:
+        agent: any agent without a memory.
+        expert: returns the action for one observation, such as ``lambda obs: other.predict(obs)[0]``.
+        env: an id, or an environment.
+        demonstrations: what the agent is cloned from before the first round; without, the expert labels what an agent does
+            that knows nothing.
+        rounds: how often.
+        steps: least number of steps in each round; the last episode is completed.
+        updates: gradient steps in each round.
+        seed: of the environment and the batches.
+
+    Raises:
+        ValueError: if the spaces differ, or the agent has a memory.
+    """
+    made = make_env(env) if isinstance(env, str) else env
+    known = demonstrations
+    try:
+        if known is not None:
+            clone(agent, known, updates, seed=seed)
+        for i in range(whole("rounds", rounds, least=1)):
+            played: list[Episode] = []
+            while sum(map(len, played)) < steps:
+                start = seed + 1000 * (i + 1) + len(played)
+                played.append(play(made, agent, lambda obs, own: expert(obs), start))
+            new = Demonstrations(tuple(played), made.observation_space, made.action_space)
+            known = new if known is None else known + new
+            clone(agent, known, updates, seed=seed + i + 1)
+    finally:
+        if made is not env:
+            made.close()
+    assert known is not None
+    return known
+
+
+def learn_offline(agent: Any, demonstrations: Demonstrations, updates: int) -> dict[str, float]:
+    """Takes gradient steps of an algorithm on recorded episodes alone, and returns the metrics of the last of them.
+
+    Algorithms made for it are :class:`rejeu.TD3BC` and :class:`rejeu.IQL`; others overestimate actions that were never taken.
+    Hindsight replay and n-step returns work as in training. Ctrl-C ends it, and keeps what was learned.
+
+    Args:
+        agent: learns with its own settings; schedules follow the updates.
+        demonstrations: with its spaces.
+        updates: number of gradient steps.
+
+    Raises:
+        ValueError: if the spaces differ.
+    """
+    check(agent, demonstrations)
+    run, updates = agent.run, whole("updates", updates, least=1)
+    replay, done = agent.replay_of(demonstrations, run.env), 0
+    if agent.learner.observe is not None:
+        pairs = [arrays_of(agent, episode)[0] for episode in demonstrations.episodes]
+        obs = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
+        run.state = agent.learner.pack(seen(agent, obs, demonstrations.episodes))
+    for n in chunks(updates):
+        batches = [replay.draw(run.rng, (n, agent.config.batch_size), done / updates)]
+        update(run, agent.learner, [(batch, drawn) for batch, drawn in batches], clock_of(run, done / updates))
+        run.td_errors, done = [], done + n
+        if interrupt.requested() is not None:
+            break
+    run.monitor.read()
+    return {name: float(value) for name, value in (run.metrics or {}).items()}
+
+
+def chunks(updates: int) -> Iterable[int]:
+    """Yields how many updates each call takes.
+
+    >>> list(chunks(250))
+    [100, 100, 50]
+    """
+    for first in range(0, updates, MOST_IN_ONE_CALL):
+        yield min(MOST_IN_ONE_CALL, updates - first)
+
+
+def check(agent: Any, demonstrations: Demonstrations) -> None:
+    """Raises ``ValueError`` unless demonstrations have the spaces of an agent, the bounds of observations aside."""
+    for kind, own, theirs in (
+        ("observation", agent.observation_space, demonstrations.observation_space),
+        ("action", agent.action_space, demonstrations.action_space),
+    ):
+        if [(leaf.path, leaf.shape) for leaf in spaces.leaves(own)] != [
+            (leaf.path, leaf.shape) for leaf in spaces.leaves(theirs)
+        ] or type(own) is not type(theirs):
+            raise ValueError(
+                f"the demonstrations have the {kind} space {theirs}, and the agent {own}; record them in its environment"
+            )
+
+
+def arrays_of(agent: Any, episode: Episode) -> tuple[PyTree, np.ndarray]:
+    """Returns the observations of an episode that were acted on, and the actions in the algorithm's range."""
+    obs = batch_of(agent, episode.observations, slice(0, len(episode)))
+    return agent.with_masks(obs, None), spaces.unscale_action(agent.action_space, np.asarray(episode.actions))
+
+
+def batch_of(agent: Any, observations: Any, rows: slice) -> PyTree:
+    """Returns some observations of an episode as a batch."""
+    return spaces.as_batch(
+        jax.tree.map(lambda leaf: np.asarray(leaf)[rows], observations), agent.observation_space, agent.obs_leaves
+    )[0]
+
+
+def seen(agent: Any, obs: PyTree, episodes: Sequence[Episode]) -> PyTree:
+    """Returns the state of an agent after its statistics, if it has some, have seen demonstrations."""
+    state = agent.learner.state(agent.run.state)
+    if agent.learner.observe is None:
+        return state
+    returns = np.concatenate([running_return(episode.rewards, agent.config.gamma) for episode in episodes])
+    return agent.learner.algorithm.observe(state, obs, returns)
+
+
+def running_return(rewards: np.ndarray, gamma: float) -> np.ndarray:
+    """Returns ``sum_k gamma^k r_{t-k}`` of the rewards of an episode, ``float32 (T,)``.
+
+    >>> running_return(np.ones(3), 0.5).tolist()
+    [1.0, 1.5, 1.75]
+    """
+    sums = itertools.accumulate(rewards.tolist(), lambda before, reward: gamma * before + reward)
+    return np.fromiter(sums, np.float32, len(rewards))
+
+
+def with_targets(state: PyTree) -> PyTree:
+    """Returns a state whose target networks are copies of the networks that they follow."""
+    is_state = lambda node: isinstance(node, eqx.Module) and bool(averaged_fields(type(node)))  # noqa: E731
+
+    def copied(node: Any) -> Any:
+        if not is_state(node):
+            return node
+        names = averaged_fields(type(node))
+        return dataclasses.replace(node, **{name: getattr(node, name.removeprefix("target_")) for name in names})
+
+    return jax.tree.map(copied, state, is_leaf=is_state)
+
+
+def fill(replay: Any, agent: Any, demonstrations: Demonstrations) -> None:
+    """Adds the episodes to an empty replay buffer of one environment."""
+    for episode in demonstrations.episodes:
+        obs, action = arrays_of(agent, episode)
+        last = agent.with_masks(batch_of(agent, episode.observations, slice(len(episode), None)), None)
+        following = jax.tree.map(lambda a, b: np.concatenate([a[1:], b]), obs, last)
+        replay.begin(jax.tree.map(lambda leaf: leaf[:1], obs))
+        for i, reward in enumerate(episode.rewards):
+            ends = np.array([episode.terminated and i == len(episode) - 1])
+            after = jax.tree.map(lambda leaf: leaf[i : i + 1], following)  # noqa: B023
+            replay.add(action[i : i + 1], np.array([reward]), ends, after)
+
+
+class WithDemonstrations:
+    """A replay buffer a share of whose batches is drawn from demonstrations; everything else is that of ``own``.
+
+    Source: Ball et al. 2023 (arXiv 2302.02948), "symmetric sampling" with a share of one half.
+    """
+
+    def __init__(self, own: Any, demonstrations: Any, share: float) -> None:
+        self.own, self.demonstrations, self.share = own, demonstrations, share
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.own, name)
+
+    def __repr__(self) -> str:
+        n = self.demonstrations.size()
+        return f"<{self.own!r} with {self.share:.0%} of each batch from {n:,} steps of demonstrations>"
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> tuple[Any, Any]:
+        """Returns a batch; the demonstrations are its last rows."""
+        n = round(self.share * shape[-1])
+        parts = [
+            buffer.draw(rng, (*shape[:-1], size), progress)[0]
+            for buffer, size in ((self.own, shape[-1] - n), (self.demonstrations, n))
+            if size
+        ]
+        axis = len(shape) - 1
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=axis), *parts), None
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> Any:
+        """Returns the batch of :meth:`draw`."""
+        return self.draw(rng, shape, progress)[0]

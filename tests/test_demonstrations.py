@@ -1,0 +1,292 @@
+"""Demonstrations: recorded, read, imitated, and learned from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import gymnasium as gym
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu import demonstrations
+from rejeu.algorithms import iql
+from rejeu.callbacks import Checkpoint
+from rejeu.demonstrations import Demonstrations, Episode, clone, dagger, learn_offline, read, record
+from rejeu.networks import action_values
+from tests.environments import Reach
+from tests.sharing import shared_learners
+
+SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [16]}, "seed": 0}
+ACTIONS: dict[str, gym.Space] = {
+    "Box": gym.spaces.Box(-2.0, 6.0, (2,)),
+    "Discrete": gym.spaces.Discrete(3, start=-1),
+    "MultiDiscrete": gym.spaces.MultiDiscrete([2, 3]),
+    "MultiBinary": gym.spaces.MultiBinary(2),
+}
+
+
+class Target(gym.Env):
+    """Episodes of 5 steps, in which the best action depends on the observation alone."""
+
+    def __init__(self, kind: str = "Box") -> None:
+        self.observation_space, self.action_space = gym.spaces.Box(-1.0, 1.0, (2,)), ACTIONS[kind]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        self.obs = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.obs, {}
+
+    def best(self, obs: np.ndarray) -> Any:
+        space = self.action_space
+        if isinstance(space, gym.spaces.Box):
+            return (2.0 + 3.0 * obs).astype(np.float32)
+        if isinstance(space, gym.spaces.Discrete):
+            return int(np.digitize(obs[0], [-0.3, 0.3])) - 1
+        return (obs > 0).astype(space.dtype)
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        reward = -float(np.abs(np.asarray(action) - self.best(self.obs)).sum())
+        self.steps += 1
+        self.obs = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.obs, reward, False, self.steps == 5, {}
+
+
+class Expert:
+    """Plays the best action."""
+
+    def __init__(self, env: Target) -> None:
+        self.env = env
+
+    def predict(self, obs: np.ndarray, deterministic: bool = True) -> tuple[Any, None]:
+        return self.env.best(obs), None
+
+
+def shown(kind: str, episodes: int = 40) -> tuple[Target, Demonstrations]:
+    env = Target(kind)
+    return env, record(Expert(env), env, episodes, seed=1)
+
+
+IMITATORS = [
+    *((name, "Box") for name in ("PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "IQL")),
+    *((name, "Discrete") for name in ("PPO", "A2C", "TRPO", "SAC", "DDPG", "DQN", "QRDQN", "PQN")),
+    *((name, kind) for name in ("PPO",) for kind in ("MultiDiscrete", "MultiBinary")),
+]
+
+
+@pytest.mark.parametrize(("name", "kind"), IMITATORS)
+def test_every_agent_imitates(name: str, kind: str) -> None:
+    env, shown_to_it = shown(kind)
+    with shared_learners():
+        agent = getattr(rejeu, name)("MlpPolicy", env, **SMALL)
+    before = agent.evaluate(20, env=Target(kind), seed=0).mean_return
+    clone(agent, shown_to_it, 400, learning_rate=1e-2)
+    after = agent.evaluate(20, env=Target(kind), seed=0).mean_return
+    assert after > 0.35 * before, (before, after)  # both are negative
+
+
+def test_normalized_agents_imitate_by_their_own_statistics() -> None:
+    env, shown_to_it = shown("Box")
+    agent = rejeu.PPO("MlpPolicy", env, normalize=True, **SMALL)
+    clone(agent, shown_to_it, 400, learning_rate=1e-2)
+    seen = np.concatenate([episode.observations[:-1] for episode in shown_to_it.episodes])
+    np.testing.assert_allclose(agent.learner.state(agent.run.state).statistics.obs[0].mean, seen.mean(0), atol=1e-5)
+    assert agent.evaluate(20, env=Target(), seed=0).mean_return > -2.0
+
+
+def test_target_networks_follow_a_clone() -> None:
+    env, shown_to_it = shown("Box", 2)
+    agent = rejeu.TD3("MlpPolicy", env, **SMALL)
+    clone(agent, shown_to_it, 3)
+    state = agent.learner.state(agent.run.state)
+    assert eqx.tree_equal(state.actor, state.target_actor)
+
+
+def test_an_agent_with_a_memory_is_refused() -> None:
+    env, shown_to_it = shown("Box", 1)
+    with pytest.raises(ValueError, match="has a memory"):
+        clone(rejeu.RecurrentPPO("MlpPolicy", env, **SMALL), shown_to_it, 1)
+
+
+def test_other_spaces_are_refused() -> None:
+    env, _ = shown("Box", 1)
+    with pytest.raises(ValueError, match="action space"):
+        clone(rejeu.PPO("MlpPolicy", env, **SMALL), shown("Discrete", 1)[1], 1)
+
+
+class Corridor(gym.Env):
+    """Walk along y = 0. An expert that starts there never shows the way back."""
+
+    observation_space = gym.spaces.Box(-10.0, 10.0, (2,))
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.obs = np.zeros(2, np.float32)
+        return self.obs, {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        drift = 0.6 * np.sin(self.obs[0] * 7)
+        self.obs = np.array([self.obs[0] + 0.1, self.obs[1] + 0.5 * (action - 1) + drift], np.float32)
+        return self.obs, float(abs(self.obs[1]) < 1), False, bool(self.obs[0] > 5), {}
+
+
+def test_dagger_asks_the_expert_where_the_agent_came() -> None:
+    asked: list[np.ndarray] = []
+
+    def expert(obs: np.ndarray) -> int:
+        asked.append(obs)
+        return int(np.sign(-np.round(obs[1])) + 1)
+
+    agent = rejeu.PPO("MlpPolicy", Corridor(), **SMALL)
+    labeled = dagger(agent, expert, Corridor(), rounds=3, steps=100, updates=300)
+    assert len(asked) == labeled.n_steps >= 300
+    assert [int(a) for e in labeled.episodes for a in e.actions] == [int(np.sign(-np.round(o[1])) + 1) for o in asked]
+    assert agent.evaluate(5, env=Corridor()).mean_return > 40
+
+
+def test_a_dataset_is_read_as_it_was_recorded(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    env = Target()
+    recorded = record(Expert(env), env, 3, tmp_path / "shown", seed=0)
+    found = read(tmp_path / "shown")
+    assert found.observation_space == env.observation_space
+    assert len(found.episodes) == 3
+    for one, other in zip(recorded.episodes, found.episodes, strict=True):
+        np.testing.assert_array_equal(one.observations, other.observations)
+        np.testing.assert_array_equal(one.actions, other.actions)
+        np.testing.assert_array_equal(one.rewards, other.rewards)
+        assert one.terminated == other.terminated
+    with pytest.raises(FileExistsError):
+        record(Expert(env), env, 1, tmp_path / "shown")
+    with pytest.raises(FileNotFoundError, match="holds no Minari dataset"):
+        read(tmp_path / "nothing")
+
+
+def by_hand(n: int, terminated: bool, first: float = 0.0) -> Episode:
+    """An episode whose observations count its steps."""
+    obs = np.stack([first + np.arange(n + 1), np.zeros(n + 1)], axis=1).astype(np.float32)
+    return Episode(obs, np.full((n, 2), 2.0, np.float32), np.arange(n, dtype=np.float32), terminated)
+
+
+def test_a_replay_buffer_holds_the_steps() -> None:
+    env = Target()
+    agent = rejeu.SAC("MlpPolicy", env, gamma=0.5, **SMALL)
+    both = Demonstrations((by_hand(3, True), by_hand(2, False, 10.0)), env.observation_space, env.action_space)
+    replay = agent.replay_of(both, agent.run.env)
+    batch = replay.sample(np.random.default_rng(0), (200,))
+    x = batch.obs[:, 0]
+    assert set(x) == {0.0, 1.0, 2.0, 10.0, 11.0}
+    assert replay.size() == 5
+    np.testing.assert_array_equal(batch.next_obs[:, 0], x + 1)
+    np.testing.assert_array_equal(batch.reward, x % 10)
+    np.testing.assert_array_equal(batch.discount, np.where(x == 2, 0.0, 0.5))
+    np.testing.assert_array_equal(batch.action, 0)  # 2 is the middle of the range
+
+
+def test_every_batch_has_its_share(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    env = Reach()
+    shown_to_it = record(Anywhere(env), env, 3, tmp_path / "shown", seed=0)
+    agent = rejeu.SAC(
+        "MultiInputPolicy",
+        env,
+        demonstrations=tmp_path / "shown",
+        demonstration_share=0.25,
+        replay_buffer_class="HerReplayBuffer",
+        learning_starts=20,
+        batch_size=32,
+        **SMALL,
+    ).learn(30)
+    replay = agent.replay_buffer
+    assert isinstance(replay, demonstrations.WithDemonstrations)
+    assert "25% of each batch" in repr(replay)
+    batch = replay.sample(np.random.default_rng(0), (4, 32))
+    assert batch.reward.shape == (4, 32)
+    recorded = {float(x) for episode in shown_to_it.episodes for x in episode.observations["observation"].ravel()}
+    is_recorded = np.vectorize(lambda x: float(x) in recorded)(batch.obs["observation"][..., 0])
+    assert is_recorded[:, 24:].all()
+    assert not is_recorded[:, :24].any()
+    assert (batch.reward == 0).any(axis=1).all()  # of goals in hindsight
+
+
+def test_a_run_with_demonstrations_resumes_equal(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    env = gym.make("Pendulum-v1")
+    record(Anywhere(env), env, 1, tmp_path / "shown", seed=0)
+    settings: dict[str, Any] = {**SMALL, "demonstrations": tmp_path / "shown", "learning_starts": 20, "batch_size": 32}
+    with shared_learners():
+        whole = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings).learn(80)
+        stop = lambda agent, turn: turn.step < 50  # noqa: E731
+        rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings).learn(80, [Checkpoint(tmp_path / "run", every=1000), stop])
+        resumed = rejeu.SAC.resume(tmp_path / "run").learn()
+    assert eqx.tree_equal(whole.learner.state(whole.run.state), resumed.learner.state(resumed.run.state))
+
+
+class Anywhere:
+    """Plays random actions."""
+
+    def __init__(self, env: gym.Env) -> None:
+        self.space = env.action_space
+        self.space.seed(0)
+
+    def predict(self, obs: Any, deterministic: bool = True) -> tuple[Any, None]:
+        return self.space.sample(), None
+
+
+def test_demonstrations_do_not_combine_with_priorities() -> None:
+    with pytest.raises(ValueError, match="cannot be combined"):
+        rejeu.SAC("MlpPolicy", Target(), demonstrations="shown", priorities={})
+
+
+def test_offline_learning_improves_on_what_was_shown() -> None:
+    """Random actions are recorded; cloning them would keep their mean, but their rewards say which were better."""
+    env = Target()
+    mixed = record(Anywhere(env), env, 400, seed=0)
+    agent = rejeu.IQL("MlpPolicy", env, inverse_temperature=3.0, learning_rate=3e-3, gamma=0.0, **SMALL)
+    metrics = learn_offline(agent, mixed, 1500)
+    assert set(metrics) == {"critic_loss", "actor_loss", "value_loss", "q_value"}
+    assert agent.evaluate(20, env=Target(), seed=0).mean_return > 0.4 * mixed.mean_return
+
+
+def test_losses_of_iql() -> None:
+    """Equation 5 by hand."""
+    observed, recorded = jnp.zeros((2, 1)), jnp.array([3.0, -1.0])
+    loss, _ = iql.value_loss(lambda obs: jnp.array([[1.0], [1.0]]), observed, recorded, 0.9)  # type: ignore[arg-type]
+    assert float(loss) == pytest.approx((0.9 * 2**2 + 0.1 * 2**2) / 2)
+
+
+@pytest.mark.parametrize("inverse_temperature", [0.0, 2.0, 50.0])
+def test_good_actions_of_iql_weigh_more(inverse_temperature: float) -> None:
+    """The gradient of the policy's mean is that of equation 7, from the networks of before and the value of after."""
+    env = Target()
+    settings: dict[str, Any] = {"inverse_temperature": inverse_temperature, "expectile": 0.8, "optimizer": "sgd"}
+    agent = rejeu.IQL("MlpPolicy", env, learning_rate=1.0, policy_kwargs={"net_arch": []}, seed=0, **settings)
+    algorithm, before = agent.learner.algorithm, agent.learner.state(agent.run.state)
+    rng = np.random.default_rng(0)
+    obs, action, following = (rng.uniform(-1, 1, (5, 2)).astype(np.float32) for _ in range(3))
+    reward, discount = rng.normal(size=5).astype(np.float32), np.full(5, 0.9, np.float32)
+    batch = rejeu.Transition(obs, action, reward, following, discount)
+    after, metrics = algorithm.update(before, batch, rejeu.Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+
+    q = np.min(action_values(before.target_critics, obs, action), axis=0)
+    advantage = q - np.asarray(before.value(obs))[:, 0]
+    slope = -2 * np.abs(0.8 - (advantage < 0)) * advantage
+    moved = np.asarray(before.value.head.bias - after.value.head.bias)
+    np.testing.assert_allclose(moved, [slope.mean()], rtol=1e-4)
+
+    weight = np.minimum(np.exp(inverse_temperature * (q - np.asarray(after.value(obs))[:, 0])), 100.0)
+    output = np.asarray(before.actor.network(obs))
+    mean = np.tanh(output)
+    slope = -(weight[:, None] * (action - mean) * (1 - mean**2)).mean(0)  # of standard deviation 1
+    np.testing.assert_allclose(
+        before.actor.network.head.bias - after.actor.network.head.bias, slope, rtol=1e-4, atol=1e-7
+    )
+
+    target = reward + discount * np.asarray(after.value(following))[:, 0]
+    errors = np.asarray(action_values(before.critics, obs, action)) - target
+    assert float(metrics["critic_loss"]) == pytest.approx(float((errors**2).mean(axis=1).sum()), rel=1e-4)
