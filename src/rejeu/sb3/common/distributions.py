@@ -107,7 +107,7 @@ class DiagGaussianDistribution(Distribution):
     def proba_distribution(self, mean_actions: Any, log_std: Any) -> Self:
         """Sets the parameters, and returns itself."""
         mean, log_std = (jnp.asarray(np.asarray(part, np.float32)) for part in (mean_actions, log_std))
-        self.distribution = self.kind(mean, jnp.broadcast_to(log_std, mean.shape))
+        self.distribution = self.kind(*jnp.broadcast_arrays(mean, log_std))
         return self
 
 
