@@ -107,13 +107,14 @@ def test_both_halves_share_their_statistics():
     assert (np.abs(values - other) > 1e-3).any(), "the values of (s, a) do not depend on the s' beside them"
 
 
-def test_the_critics_gradient_equals_finite_differences_with_the_target_held():
+@pytest.mark.parametrize("which", range(N_CRITICS))
+def test_the_critics_gradient_equals_finite_differences_with_the_target_held(which):
     """Through the batch statistics of both halves, but not through the target, in the weights that reach them all."""
     _, state = make()
     batch, (next_action, cost) = random_batch(), given_next()
     differentiate = jax.jit(jax.grad(crossq.critics_loss, has_aux=True))
     gradient, (_, target, _) = differentiate(state.critics, batch, next_action, cost)
-    critic = jax.tree.map(np.float64, one_of(state.critics, 0))
+    critic = jax.tree.map(np.float64, one_of(state.critics, which))
     weight = critic.torso.layers[0].weight
 
     def loss():
@@ -130,7 +131,7 @@ def test_the_critics_gradient_equals_finite_differences_with_the_target_held():
             ends.append(loss())
         weight[index] = kept
         expected[index] = (ends[0] - ends[1]) / 2e-6
-    np.testing.assert_allclose(gradient.torso.layers[0].weight[0], expected, atol=1e-4)
+    np.testing.assert_allclose(gradient.torso.layers[0].weight[which], expected, atol=1e-4)
 
 
 @pytest.mark.usefixtures("strict_dtypes")
