@@ -113,7 +113,10 @@ class BaseReplayBuffer(ABC):
             goals: the new goals of some of them, or None.
         """
         ring, (step, obs) = self.ring, read
-        result = outcome(np, ring, ring.index, rows, self.n_steps, goals)
+        if self.n_steps == 1 and goals is None:  # all has been read
+            result = Outcome(step["reward"], 1, rows.kind)
+        else:
+            result = outcome(np, ring, ring.index, rows, self.n_steps, goals)
         _, next_obs = ring.read(ring.index(rows.env, rows.time + result.steps))
         if goals is not None:
             for leaves in (obs, next_obs):
