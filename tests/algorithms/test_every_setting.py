@@ -555,12 +555,27 @@ def ratios_and_values_are_clipped_to_their_range(case: Case) -> None:
     assert norm(value(near).values()) < 0.9 * norm(value(far).values())
 
 
+def normal_divergence(mean: Any, log_std: Any, other_mean: Any, other_log_std: Any) -> float:
+    """Returns the mean KL divergence of the second normal distribution from the first."""
+    variance, other = np.exp(2 * log_std), np.exp(2 * other_log_std)
+    each = other_log_std - log_std + (variance + (mean - other_mean) ** 2) / (2 * other) - 0.5
+    return float(np.mean(np.sum(np.broadcast_to(each, mean.shape), axis=-1)))
+
+
 @shows("target_kl")
 def the_divergence_is_bounded(case: Case) -> None:
     if case.kind == "TRPO":
         reached = [float(case.update(target_kl=kl).metrics["kl_divergence_loss"]) for kl in (1e-3, 1e-2)]
         assert 0.2e-3 < reached[0] < 1e-3
         assert 0.2e-2 < reached[1] < 1e-2
+        made = case.make()
+        state = case.state(made)
+        found = case.update(target_kl=0.5, state=state)
+        obs = case.batch(made, state).obs.reshape(-1, OBS_DIM)
+        old, new = ([np.float64(part) for part in s.network.policy(jnp.asarray(obs))[:2]] for s in (state, found.state))
+        there, back = normal_divergence(*old, *new), normal_divergence(*new, *old)
+        assert abs(there - back) > 0.02 * there
+        assert float(found.metrics["kl_divergence_loss"]) == pytest.approx(there, rel=1e-3)
         return
     settings = {"n_epochs": 5, "learning_rate": 0.3}
     steps = [float(case.update(target_kl=kl, **settings).metrics[GRADIENT_STEPS]) for kl in (None, 1e6, 1e-6)]
