@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import re
 import signal
 import tempfile
 from collections.abc import Iterator
@@ -40,9 +41,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # set by shells for backg
 QUICK_TO_COMPILE = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
-RESIDENT = Path("/proc/self/statm")
-MOST_MEMORY = 2**30
-"""Bytes of memory after which compiled functions are dropped. Larger files add up to another 600 MiB."""
+STATUS = Path("/proc/self/status")
+LARGE = 2**30
+"""Bytes of memory after which compiled functions are dropped."""
+MOST_MEMORY = 2**31
+"""Bytes of memory that one process of tests may take."""
 STEPS, EPISODES = 64, 25
 """Maximum number of training steps of an example. Restoring the best weights takes 20 finished episodes."""
 
@@ -129,14 +132,21 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Agent, "evaluate", evaluate_shortly)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def compiled_functions_are_dropped() -> Iterator[None]:
-    """Drops compiled functions after a file if they have grown beyond what one process of tests should take.
+def memory(field: str) -> int:
+    """Returns a size of this process in bytes: ``VmRSS`` is what it takes, ``VmHWM`` the most that it took. 0 if unknown."""
+    found = re.search(rf"^{field}:\s+(\d+) kB", STATUS.read_text() if STATUS.exists() else "", re.MULTILINE)
+    return int(found[1]) * 1024 if found else 0
+
+
+@pytest.fixture(autouse=True)
+def memory_is_limited() -> Iterator[None]:
+    """Drops compiled functions after a test if they have grown large, and fails the test that takes too much memory.
 
     They are compiled again from the cache on disk. The C library returns freed memory to the system only when asked.
     """
+    before = memory("VmHWM")
     yield
-    if RESIDENT.exists() and int(RESIDENT.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MOST_MEMORY:
+    if memory("VmRSS") > LARGE:
         from tests.sharing import forget_learners
 
         forget_learners()
@@ -144,3 +154,5 @@ def compiled_functions_are_dropped() -> Iterator[None]:
         gc.collect()
         with suppress(AttributeError, OSError):  # another C library than GNU's
             ctypes.CDLL(None).malloc_trim(0)
+    most = memory("VmHWM")
+    assert most <= MOST_MEMORY or before > MOST_MEMORY, f"the tests of this process took {most / 1e9:.1f} GB of memory"
