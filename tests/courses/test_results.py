@@ -1,9 +1,11 @@
 """What course 1 says about its results, on several seeds."""
 
+import json
 import sys
 
 import pytest
 
+from rejeu import courses
 from trials.provenance import ROOT, in_process
 
 FULL = "best weights, no noise"
@@ -14,6 +16,20 @@ def train(seed, folder):
     found = in_process(sys.executable, script, "--seeds", str(seed), "--out", str(folder / "course.json"))
     assert "error" not in found, found
     return found
+
+
+def test_the_shares_in_the_text_are_those_of_five_seeds():
+    found = json.loads((ROOT / "benchmarks" / "results" / "course.json").read_text(encoding="utf-8"))["runs"]
+    assert [run["seed"] for run in found] == [0, 1, 2, 3, 4]
+    text = " ".join(courses.sources()[0].read_text(encoding="utf-8").split())
+    for game, row, english, french in (
+        ("car", "greedy, new episodes", "the last weights succeeded in", "les derniers poids ont réussi dans"),
+        ("car", "the same, best weights", "the best ones in", "les meilleurs dans"),
+        ("lander", FULL, "the best weights landed in", "les meilleurs poids se sont posés dans"),
+    ):
+        shares = [round(100 * run[game][row]["success"]) for run in found]
+        assert f"{english} {min(shares)}% to {max(shares)}%" in text
+        assert f"{french} {min(shares)} % à {max(shares)} %" in text
 
 
 @pytest.mark.slow
