@@ -51,6 +51,22 @@ def test_pages_load_nothing_from_the_network(site):
                 assert (page.parent / target.split("?")[0].split("#")[0]).exists(), f"{page.name} has no {target}"
 
 
+@pytest.mark.exhaustive
+def test_the_footer_of_every_page_says_whose_it_is(site):
+    for page in site.glob("*.html"):
+        footer = re.search(r"Copyright.*", page.read_text(encoding="utf-8"))
+        assert footer, page.name
+        assert "2026, the rejeu authors" in footer[0], page.name
+
+
+def test_the_first_page_names_five_pages_to_read_first():
+    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert "The first five\npages below suffice" in text
+    first = re.findall(r"\((\w[\w-]*)\.md\)", text.split("pages below suffice")[1])[:5]
+    assert first == ["quickstart", "choosing", "own-environment", "training", "troubleshooting"]
+    assert all((ROOT / "docs" / f"{name}.md").exists() for name in first)
+
+
 def test_the_reference_has_every_public_name():
     pages = [page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.rst")]
     documented = set(re.findall(r"^\.\. auto\w+:: (rejeu\.[\w.]+)", "\n".join(pages), re.MULTILINE))

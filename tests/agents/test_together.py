@@ -104,6 +104,20 @@ def test_a_run_of_several_that_resumes_says_that_it_continues_alone(tmp_path: An
     assert rejeu.DQN.resume(tmp_path / "1").resumed.exact
 
 
+@pytest.mark.filterwarnings("ignore:.*one of 2 runs in one program:UserWarning")
+def test_a_run_of_several_that_resumes_is_the_uninterrupted_one_up_to_rounding(tmp_path: Any) -> None:
+    def interrupted(agent: Any) -> list[Any]:
+        return [Checkpoint(tmp_path / str(agent.seed), every=20), lambda agent, progress: progress.step < 40]
+
+    together = {"env": "jax/CartPole-v1", "total_timesteps": 120, "seeds": 2, **SMALL}
+    whole = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", **together)
+    rejeu.train_seeds(rejeu.DQN, "MlpPolicy", callback=interrupted, **together)
+    for agent in whole:
+        resumed = rejeu.DQN.resume(tmp_path / str(agent.seed))
+        assert resumed.num_timesteps == 40
+        assert_same_runs(agent, resumed.learn())
+
+
 @pytest.mark.parametrize(
     ("env", "settings", "message"),
     [
