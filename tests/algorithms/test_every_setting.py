@@ -279,7 +279,7 @@ def gradients_are_limited_and_then_given_to_the_optimizer(case: Case) -> None:
     policy = lambda name: case.kind == "TRPO" and not is_of_value(name)  # noqa: E731
     parts = lambda moved: {  # noqa: E731
         part: {name: m for name, m in moved.items() if name.startswith(part + ".") and not policy(name)}
-        for part in ("actor", "critics", "critic", "network")
+        for part in ("actor", "value", "critics", "critic", "network")
         if any(name.startswith(part + ".") for name in moved)
     }
     limited = parts(case.update(learning_rate=1.0, max_grad_norm=1e-2).moved)

@@ -179,9 +179,9 @@ UNFIT = [
     ("PPO", gym.spaces.Box(-1.0, 1.0, (), np.float32), "PPO needs Box actions of floats with an axis, got Box"),
     ("PPO", gym.spaces.Box(0, 3, (2,), np.int32), "PPO needs Box actions of floats .* use MultiDiscrete"),
     ("PPO", gym.spaces.Box(1.0, 1.0, (2,), np.float32), r"must satisfy low < high, got low=\[1.0, 1.0\]"),
-    ("PPO", gym.spaces.Dict({"a": gym.spaces.Discrete(2)}), "PPO needs a Box, .* got Dict.*ActionWrapper"),
-    ("PPO", gym.spaces.Tuple([gym.spaces.Discrete(2)]), "PPO needs a Box, .* got Tuple.*ActionWrapper"),
-    ("A2C", gym.spaces.Dict({"a": gym.spaces.Discrete(2)}), "A2C needs a Box, .* got Dict.*ActionWrapper"),
+    ("PPO", gym.spaces.Dict({"a": gym.spaces.Text(2)}), "PPO needs a Box, .* got Text.*ActionWrapper"),
+    ("PPO", gym.spaces.Tuple([gym.spaces.Text(2)]), "PPO needs a Box, .* got Text.*ActionWrapper"),
+    ("A2C", gym.spaces.Text(2), "A2C needs a Box, .* got Text.*ActionWrapper"),
 ]
 
 
