@@ -34,6 +34,7 @@ def test_it_draws_itself(env_id):
     pytest.importorskip("pygame")
     with gym.make(env_id, render_mode="rgb_array") as env, display_for_pygame():
         env.reset(seed=0)
+        env.action_space.seed(0)
         first = env.render()
         for _ in range(20):
             env.step(env.action_space.sample())
