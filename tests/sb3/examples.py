@@ -717,12 +717,11 @@ def trpo():
 
 @example("sb3-contrib")
 def masks():
+    from rejeu.sb3_contrib import MaskablePPO
     from rejeu.sb3_contrib.common.envs import InvalidActionEnvDiscrete
     from rejeu.sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_by_masks
     from rejeu.sb3_contrib.common.maskable.utils import get_action_masks
     from rejeu.sb3_contrib.common.wrappers import ActionMasker
-
-    from rejeu.sb3_contrib import MaskablePPO
 
     env = InvalidActionEnvDiscrete(dim=8, n_invalid_actions=4)
     model = MaskablePPO("MlpPolicy", env, gamma=0.4, seed=32, n_steps=32, batch_size=32).learn(64)

@@ -290,13 +290,12 @@ def test_the_checker_states_the_difference():
 
 
 def test_contrib_modules_and_masks():
+    from rejeu.sb3_contrib import MaskablePPO
     from rejeu.sb3_contrib.common.envs import InvalidActionEnvDiscrete
     from rejeu.sb3_contrib.common.maskable.evaluation import evaluate_policy
     from rejeu.sb3_contrib.common.maskable.utils import get_action_masks
     from rejeu.sb3_contrib.common.wrappers import ActionMasker, TimeFeatureWrapper
     from rejeu.sb3_contrib.ppo_recurrent import MlpLstmPolicy  # noqa: F401
-
-    from rejeu.sb3_contrib import MaskablePPO
 
     env = InvalidActionEnvDiscrete(dim=6, n_invalid_actions=5)
     model = MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=8, **SMALL)
@@ -395,10 +394,9 @@ def test_utilities():
 
 
 def test_trust_regions_and_random_search_are_at_their_paths():
+    from rejeu.sb3_contrib import ARS, TRPO
     from rejeu.sb3_contrib.ars import LinearPolicy
     from rejeu.sb3_contrib.trpo import MlpPolicy
-
-    from rejeu.sb3_contrib import ARS, TRPO
 
     assert TRPO(MlpPolicy, "CartPole-v1", n_steps=32, batch_size=32, seed=0).learn(64).num_timesteps == 64
     linear = ARS(LinearPolicy, "CartPole-v1", n_delta=1, seed=0).learn(100)

@@ -26,15 +26,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import (
-    ActorCritic,
-    checked,
-    exploit,
-    explore,
-    explorer_of,
-    imitation_of,
-    state_value,
-)
+from rejeu.algorithms.actor_critic.network import ActorCritic, algorithm_of, checked
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     clip_and_descend,
@@ -126,17 +118,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             metrics["std"] = jnp.mean(jnp.exp(network.log_std))
         return State(network, optimizer_state, state.n_updates + 1), metrics
 
-    explorer = explorer_of(config, kind)
-    return Algorithm(
-        init,
-        lambda state: state.network,
-        explore,
-        exploit,
-        update,
-        explorer,
-        state_value=state_value,
-        imitation=imitation_of(kind),
-    )
+    return algorithm_of(config, kind, init, update)
 
 
 def optimizer_of(config: Config) -> optax.GradientTransformation:

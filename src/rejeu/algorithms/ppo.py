@@ -35,15 +35,7 @@ from jax import Array
 from rejeu import schedules
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import (
-    ActorCritic,
-    checked,
-    exploit,
-    explore,
-    explorer_of,
-    imitation_of,
-    state_value,
-)
+from rejeu.algorithms.actor_critic.network import ActorCritic, algorithm_of, checked
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     clip_and_descend,
@@ -157,17 +149,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
-    explorer = explorer_of(config, kind)
-    return Algorithm(
-        init,
-        lambda state: state.network,
-        explore,
-        exploit,
-        update,
-        explorer,
-        state_value=state_value,
-        imitation=imitation_of(kind),
-    )
+    return algorithm_of(config, kind, init, update)
 
 
 def metrics_of(

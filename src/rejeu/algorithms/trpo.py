@@ -32,7 +32,7 @@ from jax.scipy.sparse.linalg import cg
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
-from rejeu.algorithms.actor_critic.network import ActorCritic, checked, explorer_of, imitation_of, is_value
+from rejeu.algorithms.actor_critic.network import ActorCritic, algorithm_of, checked, is_value
 from rejeu.algorithms.actor_critic.steps import (
     Samples,
     explained_variance,
@@ -137,12 +137,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network = ActorCritic(network_key, obs_leaves, kind, shape, config.use_sde)
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
-    def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return actor.policy(obs).sample(key)
-
-    def exploit(actor: ActorCritic, obs: PyTree) -> Array:
-        return actor.policy(obs).mode()
-
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
         network, taken = policy_step(state.network, data, config)
@@ -174,20 +168,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         n_updates = state.n_updates + 1 + n_steps
         return State(network, optimizer_state, state.key, n_updates, state.n_rollouts + 1), metrics
 
-    def value(carry: PyTree, network: ActorCritic, obs: PyTree, ended: Array) -> Array:
-        return network.value(obs)
-
-    explorer = explorer_of(config, kind)
-    return Algorithm(
-        init,
-        lambda state: state.network,
-        explore,
-        exploit,
-        update,
-        explorer,
-        state_value=value,
-        imitation=imitation_of(kind),
-    )
+    return algorithm_of(config, kind, init, update)
 
 
 def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:

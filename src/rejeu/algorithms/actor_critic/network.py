@@ -15,7 +15,7 @@ from jax import Array
 
 from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig, OnPolicyConfig, check_value_rate
 from rejeu.algorithms.config import network_inputs
-from rejeu.core import Clock, Explorer, PyTree, unmasked
+from rejeu.core import Algorithm, Clock, Explorer, PyTree, unmasked
 from rejeu.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal, forbid
 from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
 from rejeu.spaces import Leaf, check_action, members
@@ -210,11 +210,6 @@ def exploit(actor: ActorCritic, obs: PyTree) -> Array:
     return actor.policy(obs).mode()
 
 
-def imitation_of(kind: ActionKind) -> Callable[..., Array] | None:
-    """Returns ``imitation`` of :class:`rejeu.core.Algorithm`: minus the log-probability, None for Box actions."""
-    return None if kind.kind == "box" else lambda actor, obs, action: -actor.policy(obs).log_prob(action)
-
-
 def state_value(carry: PyTree, actor: ActorCritic, obs: PyTree, ended: Array) -> Array:
     """Returns the values of observations, ``(batch,)``."""
     return actor.value(obs)
@@ -285,6 +280,26 @@ def explorer_of(config: OnPolicyConfig, kind: ActionKind) -> Explorer | None:
     if kind.kind != "box":
         raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
     return sde_explorer(config.sde_sample_freq)
+
+
+def algorithm_of(
+    config: OnPolicyConfig, kind: ActionKind, init: Callable[[Array], Any], update: Callable[..., Any]
+) -> Algorithm:
+    """Returns the algorithm whose state has an :class:`ActorCritic` as ``network``, from how it begins and learns.
+
+    Demonstrated actions other than Box are imitated by their log-probabilities.
+    """
+    imitation = None if kind.kind == "box" else lambda actor, obs, action: -actor.policy(obs).log_prob(action)
+    return Algorithm(
+        init,
+        lambda state: state.network,
+        explore,
+        exploit,
+        update,
+        explorer_of(config, kind),
+        state_value=state_value,
+        imitation=imitation,
+    )
 
 
 def orthogonal(module: Any, key: Array, gain: float) -> Any:
