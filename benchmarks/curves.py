@@ -104,7 +104,7 @@ def plot(path: Path, published: list[dict[str, Any]]) -> None:
         panel.plot(data["steps"], values, color=style.DOT_COLOR, linewidth=0.8, alpha=0.7)
     panel.plot(data["steps"], returns.mean(axis=0), label=f"mean of {len(returns)} seeds", **style.LINE)
     for entry in published:
-        if (entry["algorithm"], entry["env"]) == (data["algorithm"], data["env"]):
+        if (entry["algorithm"], entry["env"], entry["steps"]) == (data["algorithm"], data["env"], data["steps"][-1]):
             label = f"published: {entry['by']}, {entry['return']:.0f}"
             panel.axhline(entry["return"], color=style.ACCENT_COLOR, linewidth=1.4, linestyle="--", label=label)
     panel.set(xlabel="environment steps", ylabel=f"return, last {WINDOW} episodes")

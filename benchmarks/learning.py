@@ -5,11 +5,14 @@
 Training is the same as with ``rejeu train``, but without periodic evaluations. The final weights are evaluated on 100
 new episodes. With ``--best``, the agent is also evaluated during training, as often as the preset specifies. The best
 weights of these evaluations are then evaluated on new episodes. The results are written to
-``benchmarks/results/learning/ENV-ALGO.json``, with the command, the versions and the hyperparameters. ``--shown`` leaves of
-the observations only some components, which makes Pendulum partially observable, and ``--set`` changes hyperparameters of the
-preset::
+``benchmarks/results/learning/ENV-ALGO.json``, with the command, the commit, the versions and the hyperparameters. ``--shown``
+leaves of the observations only some components, which makes Pendulum partially observable, and ``--set`` changes
+hyperparameters of the preset::
 
     python benchmarks/learning.py Pendulum-v1 SAC --shown 0 1 --set '{"policy_kwargs": {"lstm_hidden_size": 64}}' --name NAME
+
+With ``--zoo`` the hyperparameters are those of ``benchmarks/zoo.toml`` in the place of the preset's, and the results are in
+``benchmarks/results/learning/zoo``. The file is written after every seed; ``--continue`` keeps the seeds that it has.
 """
 
 from __future__ import annotations
@@ -18,10 +21,9 @@ import argparse
 import importlib.metadata
 import json
 import math
-import platform
-import shlex
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,12 @@ from rejeu.algorithms import config as configs
 from rejeu.callbacks import Evaluate
 from rejeu.envs import make_vector
 from rejeu.envs.make import VectorEnv
+from rejeu.io.records import convert
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from trials.provenance import machine, provenance
+
+ZOO = Path(__file__).parent / "zoo.toml"
 RESULTS = Path(__file__).parent / "results" / "learning"
 
 
@@ -118,33 +125,47 @@ def main() -> None:
         "--shown", type=int, nargs="+", help="components of the observation that are shown; default: all"
     )
     parser.add_argument("--name", help="of the result file")
+    parser.add_argument("--zoo", action="store_true", help="with the hyperparameters of RL Zoo in benchmarks/zoo.toml")
+    parser.add_argument("--continue", action="store_true", dest="goes_on", help="keep the seeds of the result file")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result file")
     arguments = parser.parse_args()
-    preset = presets.find(arguments.env_id, arguments.algorithm)
+    find = zoo if arguments.zoo else presets.find
+    preset = find(arguments.env_id, arguments.algorithm)
     if preset is None:
         parser.error(f"there is no preset of {arguments.algorithm} for {arguments.env_id}")
-    runs = []
-    for seed in arguments.seeds:
+    name = arguments.name or f"{arguments.env_id.replace('/', '-')}-{arguments.algorithm}"
+    path = arguments.out / ("zoo" if arguments.zoo else "") / f"{name}.json"
+    runs: list[dict] = []
+    if arguments.goes_on and path.exists():
+        runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for seed in sorted({*arguments.seeds} - {run["seed"] for run in runs}):
         runs.append(train_one(preset, seed, arguments))
         print(json.dumps(runs[-1]), flush=True)
-    result = {
-        "command": shlex.join(["python", "benchmarks/learning.py", *sys.argv[1:]]),
-        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
-        "versions": {
-            "rejeu": rejeu.__version__,
-            **{name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool")},
-        },
-        "hyperparameters": configs.to_json(
-            validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, settings_of(preset, arguments))
-        ),
+        path.write_text(json.dumps(described(preset, arguments, runs), indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(described(preset, arguments, runs)["summary"]), "->", path)
+
+
+def zoo(env_id: str, algorithm: str) -> presets.Preset | None:
+    """Returns the hyperparameters of RL Zoo as a preset, None if they are not in ``benchmarks/zoo.toml``."""
+    known = [convert(one, presets.Preset) for one in tomllib.loads(ZOO.read_text(encoding="utf-8"))["preset"]]
+    return next((one for one in known if (one.env_id, one.algorithm) == (env_id, algorithm)), None)
+
+
+def described(preset: presets.Preset, arguments: argparse.Namespace, runs: list[dict]) -> dict[str, Any]:
+    """Returns the runs with their origin and their summary."""
+    config = validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, settings_of(preset, arguments))
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool")}
+    return {
+        **provenance({str(arguments.out): "FOLDER"}),
+        "machine": machine(),
+        "versions": {"rejeu": rejeu.__version__, **versions},
+        "hyperparameters": configs.to_json(config),
         "n_envs": preset.n_envs,
+        "backend": arguments.backend or preset.backend,
         "runs": runs,
         "summary": {key: summary([run[key] for run in runs]) for key in ("mean_return", "success_rate", "seconds")},
     }
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    name = arguments.name or f"{arguments.env_id.replace('/', '-')}-{arguments.algorithm}"
-    path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(result["summary"]), "->", path.relative_to(Path(__file__).parent.parent))
 
 
 def summary(values: list) -> dict | None:

@@ -67,13 +67,11 @@ def load(name: str, folder: Path = DATA) -> Any:
 
 def measured() -> list[Result]:
     """Returns the results of all presets from ``benchmarks/results/learning``, with the unmodified preset first."""
-    found = [
-        result_of(json.loads(path.read_text(encoding="utf-8"))) for path in sorted((DATA / "learning").glob("*.json"))
-    ]
+    found = [result_of(load(path.name, path.parent)) for path in sorted((DATA / "learning").glob("*.json"))]
     return sorted(found, key=lambda result: (result.env_id, result.algorithm, result.setting))
 
 
-def result_of(data: dict[str, Any]) -> Result:
+def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_BY_SUCCESS) -> Result:
     """Returns the result in a file of ``benchmarks/learning.py`` or of ``rejeu train`` and ``evaluate``."""
     words = shlex.split(data["command"])
     runs = data["runs"]
@@ -86,7 +84,7 @@ def result_of(data: dict[str, Any]) -> Result:
         size = data["hyperparameters"]["policy_kwargs"].get("lstm_hidden_size")
         settings += [HIDDEN, "without memory" if size is None else f"memory of {size}"]
     settings += [f"sigma={v:g}" for k, v in json.loads(options.get("--env", "{}")).items() if k == "sigma"]
-    is_success = env_id in JUDGED_BY_SUCCESS
+    is_success = env_id in judged_by_success
     values = [run["success_rate" if is_success else "mean_return"] for run in runs]
     low, high = (min(values), max(values)) if is_success else data["summary"]["mean_return"]["interval"]
     minutes = options.get("--minutes")
@@ -137,6 +135,46 @@ def results(*algorithms: str) -> str:
                 )
             )
     header = ("environment", "trained for", "result", "published", "seeds", "time for each seed")
+    return table(header, rows)
+
+
+def learned(folder: str) -> str:
+    """Every result of a folder of ``benchmarks/results``, beside all that is published for its algorithm and environment."""
+    rows = []
+    for path in sorted((DATA / folder).glob("*.json")):
+        content = load(path.name, path.parent)
+        result = result_of(content, JUDGED_BY_SUCCESS if folder == "learning" else ())
+        others = []
+        for entry in load("published.json"):
+            steps = f"{entry['steps']:,} steps"
+            if (entry["algorithm"], entry["env"]) == (result.algorithm, result.env_id) and HIDDEN not in result.setting:
+                differs = [entry.get("version", ""), "" if steps == result.budget else steps]
+                notes = ", ".join(filter(None, [entry["by"], *differs]))
+                others.append(f"[{entry['return']:.1f}]({entry['source']}) ({notes})")
+        rows.append(
+            (
+                ", ".join(filter(None, (result.env_id, result.setting))),
+                result.algorithm,
+                result.budget.removesuffix(" steps"),
+                f"{result.measure} {result.figures}",
+                "; ".join(others),
+                str(result.seeds),
+                time_of(result),
+                content["commit"],
+                f"`{result.command.removeprefix('python benchmarks/')}`",
+            )
+        )
+    header = (
+        "environment",
+        "algorithm",
+        "steps",
+        "rejeu",
+        "published",
+        "seeds",
+        "time for each seed",
+        "commit",
+        "command",
+    )
     return table(header, rows)
 
 
@@ -385,6 +423,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "data": data,
     "results": results,
     "curve": curve,
+    "learned": learned,
     "hyperparameters": hyperparameters,
     "shared-hyperparameters": shared_hyperparameters,
     "supported": supported,

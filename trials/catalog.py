@@ -1,0 +1,543 @@
+"""Tries every environment of the packages that people use, and tabulates by family which work and why the others do not.
+
+    python trials/catalog.py run gymnasium --out FOLDER --minutes 10   # resumes; once for each group
+    python trials/catalog.py collect FOLDER                            # writes trials/results/catalog.json
+
+Packages conflict with each other, so each group runs in the virtual environment of the extras that its section in
+docs/environments.md names. Stages of an environment, each in two copies: it is made; two vectors with one seed give the same
+20 steps; 1,000 random steps (at most 15 seconds) are finite, and their observations inside the declared bounds; episodes end
+at the time limit at the latest and are reset; ``rejeu check`` finds no error. The first environment of each family with one
+kind of observations and actions is also trained for 500 steps by the default algorithm, saved and loaded, and resumed from a
+checkpoint; the resumed run must equal the uninterrupted one, bit for bit, where the state of the environment can be saved.
+Ids that an package has for one environment twice are tried once for all stages, and made and seeded under the other.
+
+Environments run in batches in a process of their own: a crash or a step that takes too long is a row of the results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from trials.provenance import provenance, write
+
+RESULT = Path(__file__).parent / "results" / "catalog.json"
+STEPS, SECONDS, SEEDED, TRAINED, CUT = 1_000, 15.0, 20, 500, 300
+BATCH, LONGEST = 30, 240
+"""Environments of one process, and seconds of one environment after which it counts as hung."""
+ENVIRONMENT = {
+    "JAX_PLATFORMS": "cpu",
+    "MUJOCO_GL": "disable",
+    "SDL_VIDEODRIVER": "dummy",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0",
+}
+CAUSES = {
+    r"took longer than": "hangs or takes longer than four minutes",
+    r"^crash": "crashes the process",
+    r"old version|DeprecatedEnv|mujoco.py": "an old version that can no longer be made; the newest one works",
+    r"action space|actions .* no algorithm": "the actions are of a kind that no algorithm takes",
+    r"Text|Sequence|Graph|fixed-size|observation .*space": "the observations are of a kind that no network takes",
+    r"MissingExtra|No module|DependencyNotInstalled": "needs a package that is not installed with the extra",
+}
+"""What errors mean, by a pattern of their text; those of no pattern are shown as they are."""
+
+
+class Group(NamedTuple):
+    """Environments that fit into one virtual environment."""
+
+    packages: tuple[str, ...]
+    """Whose versions are recorded."""
+    ids: Callable[[], dict[str, str]]
+    """Returns the family of each id."""
+    vector: Callable[[str], Any]
+    """Returns two of them."""
+    one: Callable[[str], Any] | None = None
+    """Returns a Gymnasium environment for ``rejeu check``; None if there is none."""
+
+
+def made(env_id: str, backend: str = "gymnasium", **kwargs: Any) -> Any:
+    import rejeu
+
+    return rejeu.make_vector(env_id, 2, backend, seed=0, **kwargs)  # type: ignore[arg-type]
+
+
+def registered(package: str, *modules: str, depth: int = 1) -> Callable[[], dict[str, str]]:
+    """Returns a function that lists what a package registers in Gymnasium; its family is a part of the module's name."""
+
+    def ids() -> dict[str, str]:
+        import gymnasium as gym
+
+        for module in (package, *modules):
+            imported = import_module(module)
+            with suppress(Exception):
+                gym.register_envs(imported)
+        found = {}
+        for env_id, spec in gym.registry.items():
+            origin = (
+                spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
+            )
+            parts = re.split(r"[.:]", origin)
+            if parts[0] == package:
+                found[env_id] = ".".join(parts[1 : 1 + depth]).removeprefix("envs.") or package
+        return found
+
+    return ids
+
+
+def gym_group(package: str, *modules: str, depth: int = 2, packages: tuple[str, ...] = ()) -> Group:
+    from rejeu.envs.registry import make_env
+
+    return Group((package.replace("_", "-"), *packages), registered(package, *modules, depth=depth), made, make_env)
+
+
+def envpool_ids() -> dict[str, str]:
+    import envpool
+    from envpool.registration import registry
+
+    return {env_id: registry.specs[env_id][0].removeprefix("envpool.") for env_id in envpool.list_all_envs()}
+
+
+def metaworld_ids() -> dict[str, str]:
+    metaworld = import_module("metaworld")
+    return dict.fromkeys(metaworld.ALL_V3_ENVIRONMENTS, "MT1")
+
+
+def metaworld_one(name: str) -> Any:
+    import gymnasium as gym
+
+    import_module("metaworld")
+    return gym.make("Meta-World/MT1", env_name=name, disable_env_checker=True)
+
+
+def atari_ids() -> dict[str, str]:
+    return {env_id: "AtariVectorEnv" for env_id in registered("ale_py")() if env_id.startswith("ALE/")}
+
+
+def atari_vector(env_id: str) -> Any:
+    from gymnasium.vector import AutoresetMode
+
+    import rejeu
+
+    name = re.sub(r"(?<!^)(?=[A-Z])", "_", env_id[4:-3]).lower()
+    make = import_module("ale_py.vector_env").AtariVectorEnv
+    return rejeu.make_vector(make(name, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP), seed=0)
+
+
+def pettingzoo_ids() -> dict[str, str]:
+    found = {}
+    for family in ("butterfly", "sisl", "mpe", "atari"):
+        with suppress(ImportError):
+            folder = Path(next(iter(import_module(f"pettingzoo.{family}").__path__)))
+            found |= {path.stem: family for path in sorted(folder.glob("*_v*.py"))}
+    return found
+
+
+def pettingzoo_vector(name: str) -> Any:
+    import rejeu
+
+    supersuit = import_module("supersuit")
+    env = import_module(f"pettingzoo.{pettingzoo_ids()[name]}.{name}").parallel_env()
+    env = supersuit.pettingzoo_env_to_vec_env_v1(supersuit.black_death_v3(env))
+    return rejeu.make_vector(supersuit.concat_vec_envs_v1(env, 1, base_class="gymnasium"), seed=0)
+
+
+def gymnax_ids() -> dict[str, str]:
+    return {name: name.rpartition("-")[2] for name in import_module("gymnax").registered_envs}
+
+
+def gymnax_vector(name: str) -> Any:
+    import rejeu
+    from rejeu.envs.functional.adapters import from_gymnax
+
+    return rejeu.make_vector(from_gymnax(*import_module("gymnax").make(name)), 2, seed=0)
+
+
+def brax_ids() -> dict[str, str]:
+    return dict.fromkeys(import_module("brax.envs")._envs, "brax")
+
+
+def brax_vector(name: str) -> Any:
+    import rejeu
+    from rejeu.envs.functional.adapters import from_brax
+
+    return rejeu.make_vector(from_brax(import_module("brax.envs").get_environment(name)), 2, seed=0)
+
+
+def groups() -> dict[str, Group]:
+    return {
+        "gymnasium": gym_group("gymnasium", depth=2, packages=("mujoco", "box2d")),
+        "robotics": gym_group("gymnasium_robotics", packages=("mujoco",)),
+        "highway": gym_group("highway_env"),
+        "minigrid": gym_group("minigrid"),
+        "envpool": Group(("envpool",), envpool_ids, lambda env_id: made(env_id, "envpool")),
+        "ale": gym_group("ale_py", depth=1),
+        "ale-vector": Group(("ale-py",), atari_ids, atari_vector),
+        "dm-control": gym_group("shimmy", depth=1, packages=("dm-control", "mujoco")),
+        "metaworld": Group(
+            ("metaworld", "mujoco"),
+            metaworld_ids,
+            lambda name: made("Meta-World/MT1", env_name=name),
+            metaworld_one,
+        ),
+        "panda": gym_group("panda_gym"),
+        "pettingzoo": Group(("pettingzoo", "supersuit"), pettingzoo_ids, pettingzoo_vector),
+        "gymnax": Group(("gymnax",), gymnax_ids, gymnax_vector),
+        "brax": Group(("brax", "mujoco"), brax_ids, brax_vector),
+    }
+
+
+class Case:
+    """The environment that is tried. Its stages are methods that return what is to be recorded; None for ``"ok"``."""
+
+    def __init__(self, group: Group, env_id: str, rows: list[dict[str, Any]]) -> None:
+        self.group, self.env_id = group, env_id
+        self.rows = rows
+        self.row: dict[str, Any] = {"id": env_id, "family": group.ids()[env_id]}
+
+    def stages(self) -> Iterator[Callable[[], str | None]]:
+        yield from (self.make, self.seed)
+        if not self.row.get("same_as"):
+            yield from (self.step, self.bounds, self.end)
+            if self.group.one is not None:
+                yield self.check
+            if self.is_new_kind():
+                yield from (self.train, self.save, self.resume)
+
+    def make(self) -> str | None:
+        from rejeu.spaces import action_scaler, leaves
+
+        self.vector = self.group.vector(self.env_id)
+        kinds = ", ".join(sorted({leaf.kind for leaf in leaves(self.vector.observation_space)}))
+        self.row["kind"] = f"{kinds} -> {type(self.vector.action_space).__name__}"
+        self.obs = self.vector.reset()
+        self.scale = action_scaler(self.vector.action_space)
+        self.row["same_as"] = self.twin()
+        return None
+
+    def twin(self) -> str | None:
+        """Returns the id that was tried already and is EnvPool's for the same environment."""
+        if self.vector.backend != "envpool":
+            return None
+        from envpool.registration import registry
+
+        same = [row["id"] for row in self.rows if registry.specs[row["id"]] == registry.specs[self.env_id]]
+        return same[0] if same else None
+
+    def is_new_kind(self) -> bool:
+        """Returns whether nothing of this kind was trained yet; one that failed is no reason not to try another."""
+        same = [row for row in self.rows if (row["family"], row.get("kind")) == (self.row["family"], self.row["kind"])]
+        return not any(row.get("resume") for row in same) and sum("train" in row for row in same) < 2
+
+    def actions(self, rng: Any) -> Any:
+        from rejeu.spaces import random_action
+
+        return self.scale(random_action(self.vector.action_space, self.vector.n_envs, rng))
+
+    def seed(self) -> str | None:
+        import jax
+        import numpy as np
+
+        def equal(one: Any, two: Any) -> bool:
+            pairs = zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True)
+            return all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs)
+
+        twin = self.group.vector(self.env_id)
+        rng = np.random.default_rng(0)
+        try:
+            if not equal(self.obs, twin.reset()):
+                return "resets differ"
+            for i in range(SEEDED):
+                action = self.actions(rng)
+                one, two = self.vector.step(action), twin.step(action)
+                if not equal(one[:4], two[:4]):
+                    return f"step {i + 1} differs"
+                if (done := one.terminated | one.truncated).any():
+                    self.vector.reset_done(done), twin.reset_done(done)
+            return None
+        finally:
+            twin.close()
+
+    def step(self) -> str | None:
+        import jax
+        import numpy as np
+
+        self.vector.reset()
+        rng, length = np.random.default_rng(1), np.zeros(self.vector.n_envs, int)
+        self.n_steps, self.n_terminated, self.n_truncated, self.longest, self.outside = 0, 0, 0, 0, ""
+        until = time.monotonic() + SECONDS
+        while self.n_steps < STEPS and time.monotonic() < until:
+            result = self.vector.step(self.actions(rng))
+            self.n_steps += self.vector.n_envs
+            length += 1
+            for part in (result.reward, *jax.tree.leaves(result.obs)):
+                if np.asarray(part).dtype.kind == "f" and not np.isfinite(part).all():
+                    raise ValueError(f"not finite in step {self.n_steps}")
+            self.outside = self.outside or outside(self.vector.observation_space, result.obs)
+            done = np.asarray(result.terminated | result.truncated)
+            self.longest = max(self.longest, int(length.max()))
+            self.n_terminated += int(np.sum(result.terminated))
+            self.n_truncated += int(np.sum(np.asarray(result.truncated) & ~np.asarray(result.terminated)))
+            if done.any():
+                length[done] = 0
+                fresh = self.vector.reset_done(done)
+                self.outside = self.outside or outside(self.vector.observation_space, fresh)
+        self.row |= {"steps": self.n_steps, "terminated": self.n_terminated, "truncated": self.n_truncated}
+        return None
+
+    def bounds(self) -> str | None:
+        return self.outside or None
+
+    def end(self) -> str | None:
+        limit = self.vector.max_episode_steps
+        if limit is not None and self.longest > limit:
+            raise ValueError(f"an episode of {self.longest} steps, and the limit is {limit}")
+        if self.n_terminated + self.n_truncated == 0:
+            return f"none in {self.n_steps} steps, limit {limit}"
+        return None
+
+    def check(self) -> str | None:
+        from rejeu.envs import checker
+
+        assert self.group.one is not None
+        env = self.group.one(self.env_id)
+        try:
+            errors = [finding.text for finding in checker.findings(env) if finding.level == "error"]
+        finally:
+            env.close()
+        return "; ".join(errors)[:300] or None
+
+    def agent(self) -> Any:
+        import rejeu
+        from rejeu.agents.registry import choose_algorithm
+        from rejeu.algorithms.config import OffPolicyConfig
+
+        vector = self.group.vector(self.env_id)
+        name = choose_algorithm(None, self.env_id, vector.action_space)
+        is_off_policy = isinstance(rejeu.AGENTS[name].algorithm.Config(), OffPolicyConfig)
+        settings: dict[str, Any] = {"buffer_size": 2_000} if is_off_policy else {"n_steps": 64}
+        nested = type(vector.observation_space).__name__ in ("Dict", "Tuple")
+        self.row["algorithm"] = name
+        return rejeu.AGENTS[name]("MultiInputPolicy" if nested else "MlpPolicy", vector, seed=0, **settings)
+
+    def train(self) -> str | None:
+        from tests.sharing import shared_learners
+
+        with shared_learners():
+            self.trained = self.agent().learn(TRAINED)
+        if self.trained.num_timesteps != TRAINED or not self.trained.n_updates:
+            raise ValueError(f"{self.trained.num_timesteps} steps with {self.trained.n_updates} updates")
+        return None
+
+    def save(self) -> str | None:
+        import jax
+        import numpy as np
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = self.trained.save(Path(folder) / "model")
+            loaded = type(self.trained).load(path or Path(folder) / "model")
+        pairs = [agent.predict(self.obs, deterministic=True)[0] for agent in (self.trained, loaded)]
+        if not all(map(np.array_equal, *map(jax.tree.leaves, pairs))):
+            raise ValueError("the loaded agent acts otherwise")
+        return None
+
+    def resume(self) -> str | None:
+        from rejeu.callbacks import Checkpoint
+        from tests.sharing import shared_learners
+        from trials.resume import facts, same
+
+        def stop(agent: Any, turn: Any) -> bool:
+            return turn.step < CUT
+
+        with tempfile.TemporaryDirectory() as folder, shared_learners():
+            broken = self.agent().learn(TRAINED, [stop, Checkpoint(folder, every=100)])
+            again = type(broken).resume(folder, self.group.vector(self.env_id))
+            exact = again.resumed.exact
+            if not same(facts(again), facts(broken)):
+                raise ValueError("the resumed run is not as it was")
+            again.learn()
+        if exact and not same(facts(again), facts(self.trained)):
+            raise ValueError("the resumed run ends otherwise than the uninterrupted one")
+        return None if exact else "from the start of new episodes"
+
+
+def outside(space: Any, obs: Any) -> str:
+    """Returns by how much a batch of observations is outside the bounds of its space, empty if it is not."""
+    import numpy as np
+
+    if hasattr(space, "spaces"):
+        keys = space.spaces.keys() if isinstance(space.spaces, dict) else range(len(space.spaces))
+        found = (outside(space.spaces[key], obs[key]) for key in keys)
+        return next(filter(None, found), "")
+    if type(space).__name__ == "Box":
+        low, high, values = (np.asarray(a, np.float64) for a in (space.low, space.high, obs))
+        beyond = np.maximum(low - values, values - high)
+        largest = float(np.nanmax(beyond, initial=0.0))
+        scale = float(np.abs(values).max(initial=1.0))
+        return f"by {largest:.2g}" if largest > 1e-6 * scale else ""
+    if type(space).__name__ == "Discrete":
+        return "" if ((obs >= space.start) & (obs < space.start + space.n)).all() else "no such value"
+    return ""
+
+
+def said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".replace("\n", " ")[:300]
+
+
+def try_one(group: Group, env_id: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Returns the row of one environment: each stage that was reached, and where and why the last one failed."""
+    began = time.perf_counter()
+    case = Case(group, env_id, rows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        stage: Callable[[], str | None]
+        try:
+            for stage in case.stages():
+                case.row[stage.__name__] = stage() or "ok"
+        except Exception as error:
+            case.row |= {"failed": stage.__name__, "error": said(error)}
+        with suppress(Exception):
+            case.vector.close()
+    case.row["seconds"] = round(time.perf_counter() - began, 1)
+    return {key: value for key, value in case.row.items() if value is not None}
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
+def append(path: Path, row: dict[str, Any]) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+    print(json.dumps(row), flush=True)
+
+
+def try_batch(name: str, path: Path, env_ids: list[str]) -> None:
+    """Tries some environments in this process, one after the other."""
+    group = groups()[name]
+    for env_id in env_ids:
+        append(path, try_one(group, env_id, read_rows(path)))
+
+
+def run(name: str, folder: Path, minutes: float, only: list[str]) -> None:
+    """Tries the environments of a group that have no row yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path, group = folder / f"{name}.jsonl", groups()[name]
+    families = group.ids()
+    done = {row["id"] for row in read_rows(path)}
+    todo = [env_id for env_id in only or families if env_id not in done]
+    until = time.monotonic() + 60 * minutes
+    while todo and time.monotonic() < until:
+        batch, n_before = todo[:BATCH], len(read_rows(path))
+        command = [sys.executable, __file__, "batch", name, "--out", str(folder), "--only", *batch]
+        with tempfile.TemporaryFile("w+") as errors:
+            child = subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}, stderr=errors)
+            n, since, is_late = n_before, time.monotonic(), False
+            while child.poll() is None:
+                time.sleep(0.2)
+                if (now := len(read_rows(path))) != n:
+                    n, since = now, time.monotonic()
+                if time.monotonic() - since > LONGEST or time.monotonic() > until + LONGEST:
+                    is_late = True
+                    child.kill()
+                    child.wait()
+            errors.seek(0)
+            last = (errors.read().strip().splitlines() or [""])[-1][:200]
+        todo = todo[len(read_rows(path)) - n_before :]
+        if child.returncode and todo and todo[0] in batch:
+            why = f"took longer than {LONGEST} s" if is_late else f"crash, exit status {child.returncode}: {last}"
+            row = {"id": todo[0], "family": families[todo[0]], "failed": "process", "error": why}
+            append(path, {**row, "seconds": round(time.monotonic() - since, 1)})
+            todo = todo[1:]
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = json.loads(text) if (text := read_text(folder / f"{name}.json")) else {}
+    names = {str(folder): "FOLDER"}
+    origin = {**provenance(names), "ids": len(families), "versions": {p: version(p) for p in group.packages}}
+    origin["cpu_minutes"] = round(before.get("cpu_minutes", 0.0) + (used.ru_utime + used.ru_stime) / 60, 1)
+    write(folder / f"{name}.json", origin)
+    print(f"{name}: {len(todo)} of {len(families)} left, {origin['cpu_minutes']} minutes of processor time")
+
+
+def read_text(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.exists() else ""
+
+
+def version(package: str) -> str | None:
+    with suppress(metadata.PackageNotFoundError):
+        return metadata.version(package)
+    return None
+
+
+def cause(row: dict[str, Any]) -> str:
+    """Returns why an environment failed, empty if it did not."""
+    if "failed" not in row:
+        return "" if row.get("check", "ok") == "ok" else f"check: {row['check']}"
+    text = row["error"]
+    return next(
+        (meaning for pattern, meaning in CAUSES.items() if re.search(pattern, text)), f"{row['failed']}: {text}"
+    )
+
+
+def collect(folder: Path) -> None:
+    """Writes the table of all groups: a line for each family, and the ids that failed or stood out by what was found."""
+    result: dict[str, Any] = {**provenance({str(folder): "FOLDER"}), "groups": {}, "families": [], "failures": []}
+    for path in sorted(folder.glob("*.jsonl")):
+        name, rows = path.stem, read_rows(path)
+        result["groups"][name] = json.loads(read_text(path.with_suffix(".json")))
+        by_family, by_cause = collections.defaultdict(list), collections.defaultdict(list)
+        for row in rows:
+            by_family[row["family"]].append(row)
+            if why := cause(row):
+                by_cause[row["family"], why].append(row["id"])
+        for family, of_family in sorted(by_family.items()):
+            resumed = [row["resume"] for row in of_family if "resume" in row]
+            result["families"].append({
+                "group": name, "family": family, "ids": len(of_family),
+                "work": sum(not cause(row) for row in of_family),
+                "same_episodes_by_seed": sum(row.get("seed") == "ok" for row in of_family),
+                "inside_bounds": sum(row.get("bounds", "ok") == "ok" and "seed" in row for row in of_family),
+                "trained": ", ".join(sorted({row["algorithm"] for row in of_family if row.get("train") == "ok"})),
+                "resumed_exactly": f"{resumed.count('ok')} of {len(resumed)}",
+                "seconds": round(sum(row["seconds"] for row in of_family)),
+            })  # fmt: skip
+        for (family, why), ids in sorted(by_cause.items()):
+            result["failures"].append({"group": name, "family": family, "cause": why, "number": len(ids), "ids": ids})
+    tried, work = (sum(row[key] for row in result["families"]) for key in ("ids", "work"))
+    result |= {"ids": tried, "work": work}
+    write(RESULT, result)
+    print(f"{work} of {tried} work")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=["run", "batch", "collect"])
+    parser.add_argument("group")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--only", nargs="*", default=[])
+    given = parser.parse_args()
+    if given.action == "collect":
+        collect(Path(given.group))
+    elif given.action == "run":
+        run(given.group, given.out, given.minutes, given.only)
+    else:
+        try_batch(given.group, given.out / f"{given.group}.jsonl", given.only)
+
+
+if __name__ == "__main__":
+    main()
