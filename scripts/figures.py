@@ -31,10 +31,11 @@ from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa
 from benchmarks.bench.text import table, times  # noqa: E402
 from rejeu import presets, validation  # noqa: E402
 from rejeu.agents import AGENTS  # noqa: E402
-from rejeu.algorithms import ppo  # noqa: E402
+from rejeu.algorithms import dqn, ppo  # noqa: E402
 from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
 from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
 from rejeu.algorithms.rollout_config import RolloutConfig  # noqa: E402
+from rejeu.algorithms.sac import continuous as sac  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
 from rejeu.presets import Result  # noqa: E402
 from scripts import sb3_parity  # noqa: E402
@@ -49,11 +50,15 @@ BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", r
 CURVE_WINDOW = 20
 """Episodes over which ``benchmarks/curves.py`` averages."""
 SHARED = (
-    (ppo.Config, "ppo.md#hyperparameters"),
-    (OffPolicyConfig, "../hyperparameters.md#off-policy-algorithms"),
-    (RolloutConfig, "../hyperparameters.md#on-policy-algorithms"),
+    (ppo.Config, "PPO", "ppo.md#hyperparameters"),
+    (sac.Config, "SAC", "sac.md#hyperparameters"),
+    (sac.EntropyConfig, "SAC", "sac.md#hyperparameters"),
+    (dqn.QLearningConfig, "DQN", "dqn.md#hyperparameters"),
+    (OffPolicyConfig, "all off-policy algorithms", "../hyperparameters.md#off-policy-algorithms"),
+    (OnPolicyConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),
+    (RolloutConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),
 )
-"""Configurations from which others are derived, and where their hyperparameters are explained."""
+"""Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
 JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
 HIDDEN = "velocities hidden"
@@ -192,20 +197,26 @@ def curve(algorithm: str) -> str:
 def hyperparameters(algorithm: str) -> str:
     """The hyperparameters of an algorithm with defaults and meanings, and the defaults of those that it shares with others."""
     config = AGENTS[algorithm].algorithm.Config
-    base, link = next((base, link) for base, link in SHARED if issubclass(config, base) and config is not base)
-    docs, known, defaults = (
-        validation.field_docs(config),
-        validation.field_docs(base),
-        validation.field_defaults(config),
-    )
-    shared = [name for name in docs if docs[name] == known.get(name)]
-    values = {name: shown(defaults[name]) for name in shared}
-    listed = ", ".join(f"`{name}={value}`" if value else f"`{name}`" for name, value in values.items())
-    where = "of PPO" if base is ppo.Config else f"of all {link.partition('#')[2].replace('-algorithms', ' algorithms')}"
-    rest = textwrap.fill(f"Those [{where}]({link}), with the defaults {listed}.", 135, break_on_hyphens=False)
-    names = [name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()) if name in docs]
-    own = [name for name in dict.fromkeys(names) if name not in shared]
+    docs, defaults = validation.field_docs(config), validation.field_defaults(config)
+    shared: dict[str, list[str]] = {}
+    known: set[str] = set()
+    for base, owner, link in SHARED:
+        if issubclass(config, base) and config is not base and owner != algorithm:
+            explained = validation.field_docs(base)
+            names = [name for name in docs if name not in known and docs[name] == explained.get(name)]
+            shared.setdefault(f"[of {owner}]({link})", []).extend(names)
+            known.update(names)
+    rest = "\n\n".join(defaults_of(where, names, defaults) for where, names in shared.items() if names)
+    declared = [name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()) if name in docs]
+    own = [name for name in dict.fromkeys(declared) if name not in known]
     return f"{meanings(own, docs, defaults)}\n\n{rest}" if own else rest
+
+
+def defaults_of(where: str, names: list[str], defaults: dict[str, Any]) -> str:
+    """A sentence with the defaults of hyperparameters that are explained elsewhere."""
+    values = {name: shown(defaults[name]) for name in names}
+    listed = ", ".join(f"`{name}={value}`" if value else f"`{name}`" for name, value in values.items())
+    return textwrap.fill(f"Those {where}, with the defaults {listed}.", 135, break_on_hyphens=False)
 
 
 def shared_hyperparameters(kind: str) -> str:
@@ -254,20 +265,16 @@ def supported(algorithm: str) -> str:
     readable = [name for name, space in observations.items() if can_make(agent, config, space, actions[possible[0]])]
     is_off_policy = "replay_buffer_class" in fields
     maskable = [name for name in possible if name in ("Discrete", "MultiDiscrete", "MultiBinary")]
-    rows = [
-        ("actions", ", ".join(possible)),
-        ("observations", ", ".join(readable)),
-        ("several environments", "yes"),
-        ("HER, prioritized replay, n-step returns", "yes" if is_off_policy else "no (on-policy)"),
-        ("action masks", ", ".join(maskable) if config.can_mask else "no"),
-        (
-            "memory (LSTM, GRU)",
-            "yes" if getattr(config, "can_remember", "cell" in vars(config.policy_kwargs)) else "no",
-        ),
-        ("normalization, schedules", "yes"),
-        ("custom modules as encoder, torso or head", "yes" if takes_modules(agent.algorithm.Config) else "no"),
-    ]
-    return table(("", "supported"), rows)
+    remembers = getattr(config, "can_remember", "cell" in vars(config.policy_kwargs))
+    cells = {
+        "actions": ", ".join(possible),
+        "observations": "all" if len(readable) == len(observations) else ", ".join(readable),
+        "HER, prioritized, n-step": "yes" if is_off_policy else "no",
+        "action masks": ", ".join(maskable) if config.can_mask and maskable else "no",
+        "memory": "yes" if remembers else "no",
+        "custom modules": "yes" if takes_modules(agent.algorithm.Config) else "no",
+    }
+    return table(tuple(cells), [tuple(cells.values())])
 
 
 def takes_modules(config_class: Any) -> bool:
@@ -291,15 +298,14 @@ def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_sp
 
 
 def training_times() -> str:
-    """The presets with their budgets and results, in the order of ``rejeu list``."""
+    """The presets with their budgets and times, in the order of ``rejeu list``."""
     found = {(result.env_id, result.algorithm): result for result in reversed(measured())}
     rows = []
     for preset in presets.ALL:
         result = found.get((preset.env_id, preset.algorithm))
-        budget = f"{preset.total_steps:,}"
-        measure = f"{result.measure} {result.figures}" if result else ""
-        rows.append((preset.env_id, preset.algorithm, budget, measure, time_of(result) if result else ""))
-    return table(("environment", "algorithm", "steps of the preset", "result", "time for each seed"), rows)
+        time = time_of(result) if result else ""
+        rows.append((preset.env_id, preset.algorithm, f"{preset.total_steps:,}", time))
+    return table(("environment", "algorithm", "steps", "time for each seed"), rows)
 
 
 def time_of(result: Result) -> str:
@@ -329,8 +335,8 @@ def parking() -> str:
     )
 
 
-def speed() -> str:
-    """Speed compared with Stable-Baselines3 and SBX, starting with equal environments."""
+def speed(length: str = "") -> str:
+    """Speed compared with Stable-Baselines3 and SBX, starting with equal environments; ``short`` leaves rows out."""
     samples = load("bench.json")["samples"]
 
     def row(text: str, case: str, name: str, peer_name: str = "") -> tuple[str, ...]:
@@ -356,6 +362,7 @@ def speed() -> str:
         row("PPO, 64 environments; rejeu on EnvPool", "rollouts", "PPO, 64 on envpool", "PPO, 64 on gymnasium"),
         parking_row("SAC with HER, parking-v0; rejeu on EnvPool, 8 environments", "EnvPool, 8 environments"),
     ]
+    rows = [rows[i] for i in (0, 1, 4, 5, 8)] if length == "short" else rows
     return table(("training steps per second", "vs. Stable-Baselines3", "vs. SBX"), rows)
 
 

@@ -1,6 +1,7 @@
 """Counts everything that is called on five paths through the package, and compares it with ``docs/design.md``.
 
     python scripts/paths.py
+    python scripts/paths.py --list     # prints the functions too, in the order in which they are called first
     python scripts/paths.py --write
 
 Real steps of each path run under a profiler. Each function of the package that is called counts with all its lines, and with
@@ -36,8 +37,6 @@ EXEMPT = ("core.py", "networks/", "spaces.py", "distributions.py", "prng.py")
 TABLE = re.compile(r"(<!-- paths -->\n)(.*?)(<!-- end of paths -->)", re.DOTALL)
 ROW = re.compile(r"^\| ([^|]+?) \| (\d+) \| ([\d,]+) \| (\d+) \| ([\d,]+) \|$", re.MULTILINE)
 """Path, files and lines, and the most of each."""
-LISTED = ("SAC", "PPO", "HER", "SAC on the device")
-"""Paths whose functions the page lists, in the order in which they are called first."""
 Called = dict[tuple[str, str], None]
 """Files and outermost names of functions, in the order of their first calls."""
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
@@ -192,14 +191,11 @@ def total(functions: dict[str, dict[str, int]]) -> tuple[int, int]:
 
 
 def block(found: dict[str, dict[str, dict[str, int]]], most: dict[str, tuple[int, int]]) -> str:
-    """Returns the part of the page about the paths: a table, and the functions of the paths that are listed."""
+    """Returns the table of the page about the paths."""
     lines = ["| path | files | lines | files, at most | lines, at most |", "|---|---|---|---|---|"]
     for name, functions in found.items():
         (n_files, n_lines), (files, of_lines) = total(functions), most[name]
         lines.append(f"| {name} | {n_files} | {n_lines:,} | {files} | {of_lines:,} |")
-    for name in LISTED:
-        lines += ["", f"{name}, in the order of the first calls:", ""]
-        lines += [f"- `{file}`: {', '.join(f'`{one}`' for one in names)}" for file, names in found[name].items()]
     return "\n".join(lines) + "\n"
 
 
@@ -213,6 +209,8 @@ def main() -> int:
         n_files, n_lines = total(functions)
         known_files, known_lines, most_files, most_lines = rows[name]
         print(f"{name:<18} {n_files} files, {n_lines} lines (page {known_files}, {known_lines})")
+        if "--list" in sys.argv:
+            print(*(f"    {file}: {', '.join(names)}" for file, names in functions.items()), sep="\n")
         if n_files > most_files or n_lines > most_lines:
             problems.append(f"{name}: {n_files} files and {n_lines} lines exceed {most_files} and {most_lines}")
         elif (n_files > known_files or n_lines > known_lines) and "--write" not in sys.argv:
