@@ -242,11 +242,20 @@ def shown(default: Any) -> str:
     return "" if dataclasses.is_dataclass(default) else repr(default)
 
 
-def supported(algorithm: str) -> str:
-    """The action and observation spaces for which an algorithm can be made, and the kinds of replay and policy."""
-    agent = AGENTS[algorithm]
+def supported() -> str:
+    """The action spaces for which each algorithm can be made, and the kinds of replay and policy that it has."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for page in sorted((ROOT / "docs" / "algorithms").glob("*.md")):
+        title = page.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        row = options_of(AGENTS[title.replace("-", "")])
+        rows.setdefault(row, []).append(f"[{title}](algorithms/{page.name})")
+    header = ("", "actions", "HER, prioritized, n-step", "masks", "memory", "modules")
+    return table(header, [(", ".join(names), *row) for row, names in sorted(rows.items())])
+
+
+def options_of(agent: Any) -> tuple[str, ...]:
+    """Returns the actions, replay, masks, memory and modules of an algorithm; raises if it does not take all observations."""
     config = agent.algorithm.Config()
-    fields = validation.field_names(type(config))
     box = spaces.Box(-1, 1, (2,))
     actions = {
         "Box": box,
@@ -254,27 +263,21 @@ def supported(algorithm: str) -> str:
         "Discrete": spaces.Discrete(3),
         "MultiDiscrete": spaces.MultiDiscrete([2, 3]),
         "MultiBinary": spaces.MultiBinary(3),
-    }
-    observations = {
-        **actions,
-        "images": spaces.Box(0, 255, (36, 36, 3), np.uint8),
         "Dict and Tuple": spaces.Dict({"a": spaces.Tuple([box, spaces.Discrete(2)]), "b": box}),
     }
-    actions["Dict and Tuple"] = spaces.Dict({"a": spaces.Tuple([box, spaces.Discrete(2)]), "b": box})
+    observations = {**actions, "images": spaces.Box(0, 255, (36, 36, 3), np.uint8)}
     possible = [name for name, space in actions.items() if can_make(agent, config, box, space)]
-    readable = [name for name, space in observations.items() if can_make(agent, config, space, actions[possible[0]])]
-    is_off_policy = "replay_buffer_class" in fields
+    for name, space in observations.items():
+        if not can_make(agent, config, space, actions[possible[0]]):
+            raise ValueError(
+                f"{agent.__name__} does not take observations of the kind {name}; correct docs/choosing.md"
+            )
     maskable = [name for name in possible if name in ("Discrete", "MultiDiscrete", "MultiBinary")]
     remembers = getattr(config, "can_remember", "cell" in vars(config.policy_kwargs))
-    cells = {
-        "actions": ", ".join(possible),
-        "observations": "all" if len(readable) == len(observations) else ", ".join(readable),
-        "HER, prioritized, n-step": "yes" if is_off_policy else "no",
-        "action masks": ", ".join(maskable) if config.can_mask and maskable else "no",
-        "memory": "yes" if remembers else "no",
-        "custom modules": "yes" if takes_modules(agent.algorithm.Config) else "no",
-    }
-    return table(tuple(cells), [tuple(cells.values())])
+    has_replay = "replay_buffer_class" in validation.field_names(type(config))
+    masks = "" if not (config.can_mask and maskable) else "Discrete" if maskable == ["Discrete"] else "yes"
+    yes = (masks, "yes" * remembers, "yes" * takes_modules(agent.algorithm.Config))
+    return (", ".join(possible), "yes" * has_replay, *yes)
 
 
 def takes_modules(config_class: Any) -> bool:
@@ -298,14 +301,15 @@ def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_sp
 
 
 def training_times() -> str:
-    """The presets with their budgets and times, in the order of ``rejeu list``."""
+    """The preset of each environment that takes the least time, in the order of ``rejeu list``."""
     found = {(result.env_id, result.algorithm): result for result in reversed(measured())}
-    rows = []
+    rows: dict[str, tuple[float, tuple[str, ...]]] = {}
     for preset in presets.ALL:
         result = found.get((preset.env_id, preset.algorithm))
-        time = time_of(result) if result else ""
-        rows.append((preset.env_id, preset.algorithm, f"{preset.total_steps:,}", time))
-    return table(("environment", "algorithm", "steps", "time for each seed"), rows)
+        if result and result.seconds[1] < rows.get(preset.env_id, (float("inf"),))[0]:
+            row = (preset.env_id, preset.algorithm, f"{preset.total_steps:,}", time_of(result))
+            rows[preset.env_id] = result.seconds[1], row
+    return table(("environment", "algorithm", "steps", "time for each seed"), [row for _, row in rows.values()])
 
 
 def time_of(result: Result) -> str:
