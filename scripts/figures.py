@@ -121,26 +121,14 @@ def published(result: Result) -> str:
     return ""
 
 
-def results(*algorithms: str) -> str:
-    """The results of some algorithms, one row for each environment and setting."""
+def results(algorithm: str) -> str:
+    """The results of an algorithm, one row for each environment and setting; ``docs/results.md`` has more of each."""
     rows = []
     for result in measured():
-        if result.algorithm in algorithms and result.env_id != "rejeu/Ball-v0":
-            env = result.env_id + (f" ({result.algorithm})" if len(algorithms) > 1 else "")
-            setting = f", {result.setting}" if result.setting else ""
-            figures = f"{result.measure} {result.figures}"
-            rows.append(
-                (
-                    env + setting,
-                    result.budget,
-                    figures,
-                    published(result),
-                    str(result.seeds),
-                    time_of(result),
-                )
-            )
-    header = ("environment", "trained for", "result", "published", "seeds", "time for each seed")
-    return table(header, rows)
+        if result.algorithm == algorithm and result.env_id != "rejeu/Ball-v0":
+            name = ", ".join(filter(None, (result.env_id, result.setting, result.budget)))
+            rows.append((name, f"{result.measure} {result.figures}", published(result)))
+    return table(("environment", "result", "published"), rows)
 
 
 def learned(folder: str) -> str:
