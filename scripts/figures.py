@@ -110,25 +110,9 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
     )
 
 
-def published(result: Result) -> str:
-    """Returns the published return for the algorithm, environment and number of steps of a result, with its source."""
-    for entry in load("published.json"):
-        same = (entry["algorithm"], entry["env"], f"{entry['steps']:,} steps")
-        is_whole = result.measure == "mean return" and HIDDEN not in result.setting
-        if same == (result.algorithm, result.env_id, result.budget) and is_whole:
-            version = f" ({entry['version']})" if "version" in entry else ""
-            return f"[{entry['return']:.1f}]({entry['source']}){version}"
-    return ""
-
-
-def results(algorithm: str) -> str:
-    """The results of an algorithm, one row for each environment and setting; ``docs/results.md`` has more of each."""
-    rows = []
-    for result in measured():
-        if result.algorithm == algorithm and result.env_id != "rejeu/Ball-v0":
-            name = ", ".join(filter(None, (result.env_id, result.setting, result.budget)))
-            rows.append((name, f"{result.measure} {result.figures}", published(result)))
-    return table(("environment", "result", "published"), rows)
+def code(text: str) -> str:
+    """Formats a text as code, if there is any."""
+    return f"`{text}`" * bool(text)
 
 
 def learned(folder: str) -> str:
@@ -154,7 +138,7 @@ def learned(folder: str) -> str:
                 str(result.seeds),
                 time_of(result),
                 content["commit"],
-                f"`{result.command.removeprefix('python benchmarks/')}`",
+                code(re.sub(r"^python benchmarks/learning\.py \S+ \S+ ?", "", result.command)),
             )
         )
     header = (
@@ -166,7 +150,7 @@ def learned(folder: str) -> str:
         "seeds",
         "time for each seed",
         "commit",
-        "command",
+        "options",
     )
     return table(header, rows)
 
@@ -420,7 +404,6 @@ def cell(value: Any) -> str:
 
 BLOCKS: dict[str, Callable[..., str]] = {
     "data": data,
-    "results": results,
     "curve": curve,
     "learned": learned,
     "hyperparameters": hyperparameters,
