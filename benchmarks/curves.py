@@ -25,6 +25,7 @@ from rejeu.envs import make_vector
 from rejeu.reporting.plots import drawing as style
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import learning
 from trials.provenance import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,31 +36,6 @@ ENVIRONMENTS = {
     **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ", "PPO"), "Pendulum-v1"),
     **dict.fromkeys(("DQN", "QRDQN", "A2C", "PQN"), "CartPole-v1"),
     "RecurrentPPO": "rejeu/CartPoleNoVelocity-v0",
-}
-WITHOUT_PRESET = {
-    # The tuned values of RL Zoo for QR-DQN on CartPole-v1.
-    "QRDQN": presets.Preset(
-        env_id="CartPole-v1",
-        algorithm="QRDQN",
-        hyperparameters={
-            "learning_rate": 2.3e-3,
-            "batch_size": 64,
-            "buffer_size": 100_000,
-            "learning_starts": 1_000,
-            "target_update_interval": 10,
-            "train_freq": 256,
-            "gradient_steps": 128,
-            "exploration_fraction": 0.16,
-            "exploration_final_eps": 0.04,
-            "n_quantiles": 10,
-            "policy_kwargs": {"net_arch": [256, 256]},
-        },
-        source="RL Zoo",
-        n_envs=1,
-        total_steps=50_000,
-        evaluate_every=5_000,
-        evaluate_episodes=20,
-    )
 }
 
 
@@ -72,8 +48,8 @@ def curve(steps: np.ndarray, returns: np.ndarray, grid: np.ndarray) -> list[floa
 def record(name: str) -> None:
     """Trains an algorithm on all seeds and writes its curves."""
     env_id = ENVIRONMENTS[name]
-    preset = WITHOUT_PRESET.get(name) or presets.find(env_id, name)
-    assert preset is not None, f"there is no preset of {name} for {env_id}"
+    preset = presets.find(env_id, name) or learning.zoo(env_id, name)
+    assert preset is not None, f"there are no settings of {name} for {env_id}"
     grid = np.linspace(0, preset.total_steps, POINTS + 1)[1:].astype(int)
     curves = []
     for seed in SEEDS:

@@ -49,16 +49,9 @@ def result_of(measurement, turn, variant):
             "success_rate": 0.1,
             "seconds_by_part": {part: share * seconds for part, share in PARTS.items()},
         }
-    if measurement.case == "replay":
-        return {"seconds_per_batch": {str(size): seconds for size in plan.SIZES}}
     if measurement.case == "memory":
         return {"nbytes": 96_000_000, "resident": 97_000_000, "necessary": 85_000_000, "n": 1_000_000}
-    if measurement.case == "startup":
-        return {
-            "seconds": {"python": 0.01, "import": 1e4 * seconds, "first update, cold": 5.0, "first update, warm": 3.0}
-        }
-    kinds = ("save model", "load model", "save buffer", "load buffer")
-    return {"seconds": dict.fromkeys(kinds, seconds), "bytes": {"model": 3_000_000, "buffer": 9_000_000}}
+    return {"seconds": {"python": 0.01, "import": 1e4 * seconds, "first update, cold": 5.0, "first update, warm": 3.0}}
 
 
 def sample(measurement, turn, variant):
@@ -121,9 +114,6 @@ def test_the_page_has_medians_spreads_ratios_of_rounds_and_limits(results, tmp_p
     on_pool = row_of(text, "16", "EnvPool")
     assert on_pool[2:5] == ["6,667 (5,000 to 10,000)", "333 (333 to 500), 1 thread", "20.0 of 60.0"]
     assert on_pool[-4:] == ["50", "10", "40", "33 %"]
-    assert row_of(text, "1,000,000") == [
-        "1,000,000", "150 (100 to 200)", "3,000 (2,000 to 3,000)", "20.0", "150 (100 to 200)",
-    ]  # fmt: skip
     assert row_of(text, "parking-v0: Dict of 3 times 6", "rejeu")[2:5] == ["85", "96", "1.13"]
     assert row_of(text, "rejeu, EnvPool, 16 environments")[2] == "20.0"
     assert "A Processor, 2 cores, 8 GiB of memory" in text

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-NOT_REQUIRED = ("atheris", "psutil", "sb3_contrib", "sbx", "stable_baselines3", "torch")
+NOT_REQUIRED = ("psutil", "sb3_contrib", "sbx", "stable_baselines3", "torch")
 """Packages that some of them need, and the tests do not."""
 CODE = f"""
 import importlib, pathlib, sys

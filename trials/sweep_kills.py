@@ -2,7 +2,6 @@
 
     python trials/sweep_kills.py --kills 30 --only sweep ray
     python trials/sweep_kills.py --kills 20 --only seeds tune pbt --out trials/results/experiment_kills.json
-    python trials/sweep_kills.py --kills 20 --only together --out trials/results/together_kills.json
 
 A sweep has eight runs: SAC on Pendulum, DQN and PPO on CartPole. ``--seeds`` has four of DQN on CartPole. A study has
 three trials of PPO on CartPole and compares its winner with the default on five seeds. A population has four members of
@@ -10,9 +9,6 @@ SAC on Pendulum and three rounds. An undisturbed one is trained once, two runs a
 until there were as many kills as asked for, those on Ray on a cluster of a head and two nodes on this machine. Every
 kill is a SIGKILL at a random moment: of a run; of the command that began them, after which ``rejeu resume`` continues;
 of a Ray worker, or of everything that belongs to a node, in whose place a new one begins.
-
-``together`` is four seeds of SAC in one program. Killed, each continues alone, and sums are rounded otherwise there. So its
-models are compared with those of an undisturbed ``rejeu resume`` from the same checkpoints.
 
 Before each kill of a run the training time since its newest checkpoint is noted, which is what it loses. The others let
 their runs stop with a checkpoint. All arrays of the final models are compared bit for bit, and at the end no process
@@ -26,7 +22,6 @@ import contextlib
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -72,10 +67,6 @@ COMMANDS = {
     "ray": ["sweep", "{plan}"],
     "seeds": [
         *["train", "CartPole-v1", "--algo", "DQN", "--seeds", "4", "--seed", "0", "--steps", "{steps}"],
-        *["--evaluate-every", "1000000", "--no-report", "--no-video", *QUIET, *SMALL],
-    ],
-    "together": [
-        *["train", "jax/Pendulum-v1", "--algo", "SAC", "--seeds", "4", "--seed", "0", "--steps", "{steps}"],
         *["--evaluate-every", "1000000", "--no-report", "--no-video", *QUIET, *SMALL],
     ],
     "tune": [
@@ -210,32 +201,6 @@ def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
     )
 
 
-def begin_together(
-    words: list[str], folder: Path, log: Path, options: list[str], rng: random.Random
-) -> tuple[subprocess.Popen[bytes], dict[str, Any]]:
-    """Kills several seeds in one program after their first checkpoints.
-
-    Returns the command that continues them, and the models of an undisturbed one that continued a copy of the folder.
-    """
-    program = start([*words, "--out", str(folder)], log)
-    while program.poll() is None and not all_have_checkpoints(folder):
-        time.sleep(0.1)
-    time.sleep(rng.uniform(0.0, 5.0))
-    kill(program.pid)
-    program.wait()
-    copy = folder.with_name(f"{folder.name}-copy")
-    shutil.copytree(folder, copy)
-    if start(["resume", str(copy), *options], log).wait() != 0:
-        raise SystemExit(log.read_text(encoding="utf-8"))
-    return start(["resume", str(folder), *options], log), models(copy)
-
-
-def all_have_checkpoints(folder: Path) -> bool:
-    """Returns whether each run has a checkpoint after its first step."""
-    found = [[*run.glob("checkpoints/run_*[1-9]*.safetensors")] for run in folder.glob("seed_*")]
-    return bool(found) and all(found)
-
-
 def trial(
     kind: str,
     words: list[str],
@@ -257,11 +222,7 @@ def trial(
     while counts.total() < kills:
         rounds += 1
         folder, log = root / f"{kind}-{rounds}", root / "printed.log"
-        if kind == "together":
-            sweep, undisturbed = begin_together(words, folder, log, options, rng)
-            counts["program"] += 1
-        else:
-            sweep = start([*words, "--out", str(folder), *at_once], log)
+        sweep = start([*words, "--out", str(folder), *at_once], log)
         while sweep.poll() is None:
             time.sleep(rng.uniform(*pause))
             done = disturb(sweep, folder, cluster, rng) if counts.total() < kills else None
@@ -317,7 +278,7 @@ def main() -> None:
         for kind in arguments.only:
             words = [word.format(**values) for word in COMMANDS[kind]]
             began, undisturbed = time.monotonic(), root / f"{kind}-undisturbed"
-            at_once = {"seeds": ["--jobs", "2"], "together": []}.get(kind, ["--workers", "2"])
+            at_once = ["--jobs" if kind == "seeds" else "--workers", "2"]
             command = start([*words, "--out", str(undisturbed), *at_once], root / "printed.log")
             if command.wait() != 0:
                 raise SystemExit((root / "printed.log").read_text(encoding="utf-8"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-CASES = ("limits", "parking", "steps", "rollouts", "replay", "memory", "startup", "files")
+CASES = ("limits", "parking", "steps", "rollouts", "memory", "startup")
 LIBRARIES = ("rejeu", "sb3", "sbx")
 ONE, ALL = "1 thread", "all threads"
 VARIANTS: dict[str, dict[str, str]] = {
@@ -54,7 +54,6 @@ LANDER = "LunarLanderContinuous-v3"
 ROLLOUT = 2048
 N_ENVS = (1, 4, 16, 64)
 BACKENDS = ("gymnasium", "envpool")
-SIZES = (1_000, 10_000, 100_000, 1_000_000)
 
 
 @dataclass(frozen=True)
@@ -93,15 +92,10 @@ def everything(quick: bool = False) -> list[Measurement]:
         *parking(quick),
         *steps(seconds),
         *rollouts(seconds),
-        *replay(quick),
         *memory(quick),
         *(
             Measurement("startup", "processes", library, "startup", {"library": library}, rounds=2)
             for library in LIBRARIES
-        ),
-        *(
-            Measurement("files", "SAC", library, "files", {"library": library, "n": 1_000 if quick else 100_000})
-            for library in ("rejeu", "sb3")
         ),
     ]
     if not quick:
@@ -202,14 +196,6 @@ def rollouts(seconds: float) -> list[Measurement]:
                 name = f"{algorithm}, {n} on gymnasium"
                 found.append(Measurement("rollouts", name, library, "rollouts", arguments, (ONE, ALL)))
     return found
-
-
-def replay(quick: bool) -> list[Measurement]:
-    shared = {"sizes": SIZES[:2] if quick else SIZES, "seconds": 0.05 if quick else 0.4}
-    return [
-        Measurement("replay", what, library, "replay", {"library": library, "what": what, **shared})
-        for what, library in (("hindsight", "rejeu"), ("hindsight", "sb3"), ("priority", "rejeu"))
-    ]
 
 
 def memory(quick: bool) -> list[Measurement]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.bench import machine, plan
-from benchmarks.bench.sections import files, memory, parking, per_step, replay, rollouts, startup
+from benchmarks.bench.sections import memory, parking, per_step, rollouts, startup
 from benchmarks.bench.summary import Sample, best, disturbed, drift, peak, step_seconds
 from benchmarks.bench.text import NAMES, number, table, with_spread
 
@@ -21,10 +21,8 @@ def write(results: Mapping[str, Any], page: Path) -> None:
         parking(samples),
         per_step(samples),
         rollouts(samples),
-        replay(samples),
         memory(samples),
         startup(samples),
-        files(samples),
         machine_limits(samples),
         conditions(results),
     ]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from benchmarks.bench import plan
 from benchmarks.bench.summary import (
     ByRound,
     Limit,
     Sample,
-    Spread,
     best,
     by_round,
     gap,
@@ -205,32 +204,6 @@ def rate_text(seconds: ByRound) -> str:
     return with_spread({turn: 1.0 / value for turn, value in seconds.items()})
 
 
-def replay(samples: Sequence[Sample]) -> str:
-    lines: dict[str, dict[int, ByRound]] = {}
-    for library, what in (("rejeu", "hindsight"), ("sb3", "hindsight"), ("rejeu", "priority")):
-        for row in best(samples, "replay", what, library):
-            for size, seconds in row["result"]["seconds_per_batch"].items():
-                lines.setdefault(f"{library}, {what}", {}).setdefault(int(size), {})[row["round"]] = seconds
-    if not lines:
-        return ""
-    sizes = sorted({size for by in lines.values() for size in by})
-    cells: Callable[[str, int], str] = lambda line, size: with_spread(lines.get(line, {}).get(size, {}), 1e6)  # noqa: E731
-    rows = []
-    for size in sizes:
-        own, peer = (lines.get(f"{library}, hindsight", {}).get(size, {}) for library in ("rejeu", "sb3"))
-        row = (cells("rejeu, hindsight", size), cells("sb3, hindsight", size), times(ratio(peer, own)))
-        rows.append((f"{size:,}", *row, cells("rejeu, priority", size)))
-    header = ("transitions", "rejeu, HER", "Stable-Baselines3, HER", "ratio", "rejeu, prioritized")
-    return f"""## Sampling batches
-
-Microseconds per batch of 256 from a full buffer with episodes of 100 steps. HER: parking's observations, strategy
-`future`, `n_sampled_goal=4`, highway-env's `compute_reward`; NumPy arrays in rejeu, tensors in Stable-Baselines3.
-Prioritized replay: Pendulum's observations, sampling and updating the priorities of the previous batch; Stable-Baselines3
-does not have it.
-
-{table(header, rows)}"""
-
-
 def memory(samples: Sequence[Sample]) -> str:
     rows = []
     for kind, text in (("parking", "parking-v0: Dict of 3 times 6"), ("pendulum", "Pendulum-v1: Box of 3")):
@@ -290,29 +263,3 @@ Seconds of whole processes. SBX has a compilation cache too, which it does not e
 not compile.
 
 {table(("", *(NAMES[library] for library in found)), rows)}"""
-
-
-def files(samples: Sequence[Sample]) -> str:
-    found = {library: best(samples, "files", "SAC", library) for library in ("rejeu", "sb3")}
-    if not all(found.values()):
-        found = {library: rows for library, rows in found.items() if rows}
-    if not found:
-        return ""
-    rows = []
-    for name in ("save model", "load model", "save buffer", "load buffer"):
-        numbers = {library: by_round(of, lambda s, n=name: s["result"]["seconds"][n]) for library, of in found.items()}
-        both = times(ratio(numbers["sb3"], numbers["rejeu"])) if len(numbers) == 2 else ""
-        rows.append((f"{name}, ms", *(with_spread(by, 1e3) for by in numbers.values()), both))
-    for name in ("model", "buffer"):
-        sizes = {
-            library: spread(by_round(of, lambda s, n=name: s["result"]["bytes"][n])).median
-            for library, of in found.items()
-        }
-        both = times(Spread(*[sizes["sb3"] / sizes["rejeu"]] * 3)) if len(sizes) == 2 else ""
-        rows.append((f"{name}, MB", *(number(size / 1e6) for size in sizes.values()), both))
-    return f"""## Files
-
-A SAC model (256-256) for parking's observations, and a full buffer of 100,000 transitions. Model files of both libraries
-contain networks, target networks and optimizers.
-
-{table(("", *(NAMES[library] for library in found), "ratio"), rows)}"""

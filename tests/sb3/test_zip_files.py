@@ -228,7 +228,7 @@ def test_hyperparameters_are_those_of_the_file_and_can_be_replaced():
 
 
 def test_hostile_files_end_soon_in_little_memory_and_run_nothing(tmp_path):
-    """A sample; ``trials/sb3_hostile.py`` tries more."""
+    """A sample of them."""
     ran = tmp_path / "ran"
     for name, content in islice(hostile_zips(PPO, 240, seed=0, ran=ran), None, None, 7):
         path = write(tmp_path, content)
