@@ -3,13 +3,13 @@
     python trials/catalog.py run gymnasium --out FOLDER --minutes 10   # resumes; once for each group
     python trials/catalog.py collect FOLDER                            # writes trials/results/catalog.json
 
-Packages conflict with each other, so each group runs in the virtual environment of the extras that its section in
-docs/environments.md names. Stages of an environment, each in two copies: it is made; two vectors with one seed give the same
-20 steps; 1,000 random steps (at most 15 seconds) are finite, and their observations inside the declared bounds; episodes end
-at the time limit at the latest and are reset; ``rejeu check`` finds no error. The first environment of each family with one
-kind of observations and actions is also trained for 500 steps by the default algorithm, saved and loaded, and resumed from a
-checkpoint; the resumed run must equal the uninterrupted one, bit for bit, where the state of the environment can be saved.
-Ids that an package has for one environment twice are tried once for all stages, and made and seeded under the other.
+Packages conflict with each other, so groups run in virtual environments of their own; docs/environments.md says which fit
+together. Each environment is tried in two copies: it is made; two vectors with one seed give the same 20 steps; 1,000 random
+steps of each copy are finite, and inside the declared bounds; episodes end at the time limit at the latest and are reset.
+These steps take 15 seconds at most, and one second where the same kind of observations and actions in the same family was
+tried. The first ten of a family pass ``rejeu check``. One of each kind in a family is also trained for 500 steps by the
+default algorithm, saved and loaded, and resumed from a checkpoint; the resumed run must equal the uninterrupted one, bit for
+bit, where the state of the environment can be saved. A second id of EnvPool for the same environment is only made.
 
 Environments run in batches in a process of their own: a crash or a step that takes too long is a row of the results.
 """
@@ -22,6 +22,7 @@ import json
 import os
 import re
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -38,8 +39,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "catalog.json"
-STEPS, SECONDS, SEEDED, TRAINED, CUT = 1_000, 15.0, 20, 500, 300
-BATCH, LONGEST = 30, 240
+STEPS, SECONDS, KNOWN_SECONDS, SEEDED, CHECKED, TRAINED, CUT = 1_000, 15.0, 1.0, 20, 10, 500, 300
+BATCH, LONGEST = 40, 300
 """Environments of one process, and seconds of one environment after which it counts as hung."""
 ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
@@ -48,11 +49,12 @@ ENVIRONMENT = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0",
 }
 CAUSES = {
-    r"took longer than": "hangs or takes longer than four minutes",
+    r"took longer than": "hangs or takes longer than five minutes",
     r"^crash": "crashes the process",
     r"old version|DeprecatedEnv|mujoco.py": "an old version that can no longer be made; the newest one works",
     r"action space|actions .* no algorithm": "the actions are of a kind that no algorithm takes",
     r"Text|Sequence|Graph|fixed-size|observation .*space": "the observations are of a kind that no network takes",
+    r"Qt 5": "needs the libraries of Qt 5 on the system (apt install qtbase5-dev)",
     r"MissingExtra|No module|DependencyNotInstalled": "needs a package that is not installed with the extra",
 }
 """What errors mean, by a pattern of their text; those of no pattern are shown as they are."""
@@ -77,128 +79,113 @@ def made(env_id: str, backend: str = "gymnasium", **kwargs: Any) -> Any:
     return rejeu.make_vector(env_id, 2, backend, seed=0, **kwargs)  # type: ignore[arg-type]
 
 
-def registered(package: str, *modules: str, depth: int = 1) -> Callable[[], dict[str, str]]:
-    """Returns a function that lists what a package registers in Gymnasium; its family is a part of the module's name."""
+def vector_of(env: Any) -> Any:
+    import rejeu
 
-    def ids() -> dict[str, str]:
-        import gymnasium as gym
-
-        for module in (package, *modules):
-            imported = import_module(module)
-            with suppress(Exception):
-                gym.register_envs(imported)
-        found = {}
-        for env_id, spec in gym.registry.items():
-            origin = (
-                spec.entry_point if isinstance(spec.entry_point, str) else getattr(spec.entry_point, "__module__", "")
-            )
-            parts = re.split(r"[.:]", origin)
-            if parts[0] == package:
-                found[env_id] = ".".join(parts[1 : 1 + depth]).removeprefix("envs.") or package
-        return found
-
-    return ids
+    return rejeu.make_vector(env, 2, seed=0)
 
 
-def gym_group(package: str, *modules: str, depth: int = 2, packages: tuple[str, ...] = ()) -> Group:
+def registered(package: str) -> dict[str, str]:
+    """Returns what a package registers in Gymnasium, with the module as family."""
+    import gymnasium as gym
+
+    with suppress(Exception):
+        gym.register_envs(import_module(package))
+    found = {}
+    for env_id, spec in gym.registry.items():
+        entry = getattr(spec.entry_point, "func", spec.entry_point)
+        origin = entry if isinstance(entry, str) else getattr(entry, "__module__", "")
+        parts = [part for part in re.split(r"[.:]", origin) if part != "envs"]
+        if parts[0] == package:
+            found[env_id] = parts[1] if len(parts) > 2 else package
+    return found
+
+
+def gymnasium_group(package: str, *also: str) -> Group:
     from rejeu.envs.registry import make_env
 
-    return Group((package.replace("_", "-"), *packages), registered(package, *modules, depth=depth), made, make_env)
+    return Group((package.replace("_", "-"), *also), lambda: registered(package), made, make_env)
 
 
 def envpool_ids() -> dict[str, str]:
-    import envpool
-    from envpool.registration import registry
-
+    envpool, registry = import_module("envpool"), import_module("envpool.registration").registry
     return {env_id: registry.specs[env_id][0].removeprefix("envpool.") for env_id in envpool.list_all_envs()}
 
 
-def metaworld_ids() -> dict[str, str]:
-    metaworld = import_module("metaworld")
-    return dict.fromkeys(metaworld.ALL_V3_ENVIRONMENTS, "MT1")
-
-
-def metaworld_one(name: str) -> Any:
-    import gymnasium as gym
-
-    import_module("metaworld")
-    return gym.make("Meta-World/MT1", env_name=name, disable_env_checker=True)
-
-
-def atari_ids() -> dict[str, str]:
-    return {env_id: "AtariVectorEnv" for env_id in registered("ale_py")() if env_id.startswith("ALE/")}
+def atari_ids(package: str) -> dict[str, str]:
+    """Returns the present ids of all games, and the older ones of Pong."""
+    return {env_id: "ale" for env_id in registered(package) if env_id.startswith(("ALE/", "Pong"))}
 
 
 def atari_vector(env_id: str) -> Any:
     from gymnasium.vector import AutoresetMode
 
-    import rejeu
-
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", env_id[4:-3]).lower()
     make = import_module("ale_py.vector_env").AtariVectorEnv
-    return rejeu.make_vector(make(name, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP), seed=0)
+    return vector_of(make(name, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP))
 
 
 def pettingzoo_ids() -> dict[str, str]:
     found = {}
-    for family in ("butterfly", "sisl", "mpe", "atari"):
+    for package in ("pettingzoo.butterfly", "pettingzoo.sisl", "mpe2"):
         with suppress(ImportError):
-            folder = Path(next(iter(import_module(f"pettingzoo.{family}").__path__)))
-            found |= {path.stem: family for path in sorted(folder.glob("*_v*.py"))}
+            folder = Path(next(iter(import_module(package).__path__)))
+            found |= {path.stem: package for path in sorted(folder.glob("*_v*.py"))}
     return found
 
 
 def pettingzoo_vector(name: str) -> Any:
-    import rejeu
-
-    supersuit = import_module("supersuit")
-    env = import_module(f"pettingzoo.{pettingzoo_ids()[name]}.{name}").parallel_env()
-    env = supersuit.pettingzoo_env_to_vec_env_v1(supersuit.black_death_v3(env))
-    return rejeu.make_vector(supersuit.concat_vec_envs_v1(env, 1, base_class="gymnasium"), seed=0)
+    supersuit, module = import_module("supersuit"), import_module(f"{pettingzoo_ids()[name]}.{name}")
+    env = supersuit.pettingzoo_env_to_vec_env_v1(supersuit.black_death_v3(module.parallel_env()))
+    return vector_of(supersuit.concat_vec_envs_v1(env, 1, base_class="gymnasium"))
 
 
-def gymnax_ids() -> dict[str, str]:
-    return {name: name.rpartition("-")[2] for name in import_module("gymnax").registered_envs}
+def metaworld(name: str) -> Any:
+    import gymnasium as gym
+
+    return gym.make("Meta-World/MT1", env_name=name, disable_env_checker=True)
 
 
-def gymnax_vector(name: str) -> Any:
-    import rejeu
-    from rejeu.envs.functional.adapters import from_gymnax
+def from_jax(package: str, name: str) -> Any:
+    from rejeu.envs.functional import adapters
 
-    return rejeu.make_vector(from_gymnax(*import_module("gymnax").make(name)), 2, seed=0)
-
-
-def brax_ids() -> dict[str, str]:
-    return dict.fromkeys(import_module("brax.envs")._envs, "brax")
-
-
-def brax_vector(name: str) -> Any:
-    import rejeu
-    from rejeu.envs.functional.adapters import from_brax
-
-    return rejeu.make_vector(from_brax(import_module("brax.envs").get_environment(name)), 2, seed=0)
+    if package == "brax":
+        return vector_of(adapters.from_brax(import_module("brax.envs").get_environment(name)))
+    return vector_of(adapters.from_gymnax(*import_module("gymnax").make(name)))
 
 
 def groups() -> dict[str, Group]:
     return {
-        "gymnasium": gym_group("gymnasium", depth=2, packages=("mujoco", "box2d")),
-        "robotics": gym_group("gymnasium_robotics", packages=("mujoco",)),
-        "highway": gym_group("highway_env"),
-        "minigrid": gym_group("minigrid"),
+        "gymnasium": gymnasium_group("gymnasium", "mujoco"),
+        "robotics": gymnasium_group("gymnasium_robotics", "mujoco"),
+        "highway": gymnasium_group("highway_env"),
+        "minigrid": gymnasium_group("minigrid"),
+        "ale": gymnasium_group("ale_py")._replace(ids=lambda: atari_ids("ale_py")),
+        "dm-control": gymnasium_group("shimmy", "dm-control", "mujoco"),
+        "panda": gymnasium_group("panda_gym", "pybullet"),
         "envpool": Group(("envpool",), envpool_ids, lambda env_id: made(env_id, "envpool")),
-        "ale": gym_group("ale_py", depth=1),
-        "ale-vector": Group(("ale-py",), atari_ids, atari_vector),
-        "dm-control": gym_group("shimmy", depth=1, packages=("dm-control", "mujoco")),
+        "ale-vector": Group(
+            ("ale-py",),
+            lambda: {env_id: "AtariVectorEnv" for env_id in atari_ids("ale_py") if env_id.startswith("ALE/")},
+            atari_vector,
+        ),
         "metaworld": Group(
             ("metaworld", "mujoco"),
-            metaworld_ids,
+            lambda: dict.fromkeys(import_module("metaworld").ALL_V3_ENVIRONMENTS, "metaworld"),
             lambda name: made("Meta-World/MT1", env_name=name),
-            metaworld_one,
+            metaworld,
         ),
-        "panda": gym_group("panda_gym"),
-        "pettingzoo": Group(("pettingzoo", "supersuit"), pettingzoo_ids, pettingzoo_vector),
-        "gymnax": Group(("gymnax",), gymnax_ids, gymnax_vector),
-        "brax": Group(("brax", "mujoco"), brax_ids, brax_vector),
+        "pettingzoo": Group(("pettingzoo", "mpe2", "supersuit"), pettingzoo_ids, pettingzoo_vector),
+        "gymnax": Group(
+            ("gymnax",),
+            lambda: dict.fromkeys(import_module("gymnax").registered_envs, "gymnax"),
+            lambda name: from_jax("gymnax", name),
+        ),
+        "brax": Group(
+            ("brax", "mujoco"),
+            lambda: dict.fromkeys(import_module("brax.envs")._envs, "brax"),
+            lambda name: from_jax("brax", name),
+        ),
     }
 
 
@@ -209,12 +196,13 @@ class Case:
         self.group, self.env_id = group, env_id
         self.rows = rows
         self.row: dict[str, Any] = {"id": env_id, "family": group.ids()[env_id]}
+        self.of_family = [row for row in rows if row["family"] == self.row["family"]]
 
     def stages(self) -> Iterator[Callable[[], str | None]]:
-        yield from (self.make, self.seed)
+        yield self.make
         if not self.row.get("same_as"):
-            yield from (self.step, self.bounds, self.end)
-            if self.group.one is not None:
+            yield from (self.seed, self.step, self.bounds, self.end)
+            if self.group.one is not None and sum("check" in row for row in self.of_family) < CHECKED:
                 yield self.check
             if self.is_new_kind():
                 yield from (self.train, self.save, self.resume)
@@ -234,14 +222,13 @@ class Case:
         """Returns the id that was tried already and is EnvPool's for the same environment."""
         if self.vector.backend != "envpool":
             return None
-        from envpool.registration import registry
-
-        same = [row["id"] for row in self.rows if registry.specs[row["id"]] == registry.specs[self.env_id]]
+        specs = import_module("envpool.registration").registry.specs
+        same = [row["id"] for row in self.rows if specs[row["id"]] == specs[self.env_id]]
         return same[0] if same else None
 
     def is_new_kind(self) -> bool:
         """Returns whether nothing of this kind was trained yet; one that failed is no reason not to try another."""
-        same = [row for row in self.rows if (row["family"], row.get("kind")) == (self.row["family"], self.row["kind"])]
+        same = [row for row in self.of_family if row.get("kind") == self.row["kind"]]
         return not any(row.get("resume") for row in same) and sum("train" in row for row in same) < 2
 
     def actions(self, rng: Any) -> Any:
@@ -280,8 +267,8 @@ class Case:
         self.vector.reset()
         rng, length = np.random.default_rng(1), np.zeros(self.vector.n_envs, int)
         self.n_steps, self.n_terminated, self.n_truncated, self.longest, self.outside = 0, 0, 0, 0, ""
-        until = time.monotonic() + SECONDS
-        while self.n_steps < STEPS and time.monotonic() < until:
+        until = time.monotonic() + (SECONDS if self.is_new_kind() else KNOWN_SECONDS)
+        while self.n_steps < STEPS * self.vector.n_envs and time.monotonic() < until:
             result = self.vector.step(self.actions(rng))
             self.n_steps += self.vector.n_envs
             length += 1
@@ -330,7 +317,9 @@ class Case:
         vector = self.group.vector(self.env_id)
         name = choose_algorithm(None, self.env_id, vector.action_space)
         is_off_policy = isinstance(rejeu.AGENTS[name].algorithm.Config(), OffPolicyConfig)
-        settings: dict[str, Any] = {"buffer_size": 2_000} if is_off_policy else {"n_steps": 64}
+        settings: dict[str, Any] = (
+            {"buffer_size": 2_000, "batch_size": 32, "train_freq": 4} if is_off_policy else {"n_steps": 64}
+        )
         nested = type(vector.observation_space).__name__ in ("Dict", "Tuple")
         self.row["algorithm"] = name
         return rejeu.AGENTS[name]("MultiInputPolicy" if nested else "MlpPolicy", vector, seed=0, **settings)
@@ -446,7 +435,7 @@ def run(name: str, folder: Path, minutes: float, only: list[str]) -> None:
         batch, n_before = todo[:BATCH], len(read_rows(path))
         command = [sys.executable, __file__, "batch", name, "--out", str(folder), "--only", *batch]
         with tempfile.TemporaryFile("w+") as errors:
-            child = subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}, stderr=errors)
+            child = subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}, stderr=errors, start_new_session=True)
             n, since, is_late = n_before, time.monotonic(), False
             while child.poll() is None:
                 time.sleep(0.2)
@@ -454,7 +443,7 @@ def run(name: str, folder: Path, minutes: float, only: list[str]) -> None:
                     n, since = now, time.monotonic()
                 if time.monotonic() - since > LONGEST or time.monotonic() > until + LONGEST:
                     is_late = True
-                    child.kill()
+                    os.killpg(child.pid, signal.SIGKILL)  # with the programs that environments started
                     child.wait()
             errors.seek(0)
             last = (errors.read().strip().splitlines() or [""])[-1][:200]
