@@ -13,6 +13,7 @@ hyperparameters of the preset::
 
 With ``--zoo`` the hyperparameters are those of ``benchmarks/zoo.toml`` in the place of the preset's, and the results are in
 ``benchmarks/results/learning/zoo``. The file is written after every seed; ``--continue`` keeps the seeds that it has.
+``--preset PPO`` takes the settings of that algorithm, where the algorithm itself has none for the environment.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
 
     env = environments(preset.n_envs, seed)
     nested = "Dict" in type(env.observation_space).__name__
-    agent = rejeu.AGENTS[preset.algorithm](
+    agent = rejeu.AGENTS[arguments.algorithm](
         "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **settings_of(preset, arguments)
     )
     callback = None
@@ -113,6 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env_id")
     parser.add_argument("algorithm")
+    parser.add_argument("--preset", metavar="ALGORITHM", help="whose settings are used; default: the algorithm's own")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int)
     parser.add_argument("--minutes", type=float, help="train so long instead, everything from making the agent counted")
@@ -130,9 +132,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result file")
     arguments = parser.parse_args()
     find = zoo if arguments.zoo else presets.find
-    preset = find(arguments.env_id, arguments.algorithm)
+    of = arguments.preset or arguments.algorithm
+    preset = find(arguments.env_id, of)
     if preset is None:
-        parser.error(f"there is no preset of {arguments.algorithm} for {arguments.env_id}")
+        parser.error(f"there is no preset of {of} for {arguments.env_id}")
     name = arguments.name or f"{arguments.env_id.replace('/', '-')}-{arguments.algorithm}"
     path = arguments.out / ("zoo" if arguments.zoo else "") / f"{name}.json"
     runs: list[dict] = []
@@ -154,7 +157,7 @@ def zoo(env_id: str, algorithm: str) -> presets.Preset | None:
 
 def described(preset: presets.Preset, arguments: argparse.Namespace, runs: list[dict]) -> dict[str, Any]:
     """Returns the runs with their origin and their summary."""
-    config = validation.build(rejeu.AGENTS[preset.algorithm].algorithm.Config, settings_of(preset, arguments))
+    config = validation.build(rejeu.AGENTS[arguments.algorithm].algorithm.Config, settings_of(preset, arguments))
     versions = {name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool")}
     return {
         **provenance({str(arguments.out): "FOLDER"}),

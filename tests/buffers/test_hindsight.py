@@ -255,7 +255,7 @@ def test_a_strategy_is_given_by_string_or_enum(strategy):
         ({"n_sampled_goal": -1}, "n_sampled_goal=-1 must be a whole number of at least 0"),
         ({"n_sampled_goal": 1.5}, "n_sampled_goal=1.5 must be a whole number"),
         ({"n_sampled_goal": True}, "n_sampled_goal=True must be a whole number"),
-        ({"copy_info_dict": True}, "copy_info_dict=True is not supported"),
+        ({"copy_info_dict": 2}, "copy_info_dict=2 must be True or False"),
     ],
 )
 def test_impossible_settings_are_refused(settings, words):

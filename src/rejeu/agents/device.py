@@ -156,6 +156,8 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
         return f"the replay buffer {type(buffer).__name__} is your own"
     if strategy is not None and takes_generator(strategy):
         return "goal_selection_strategy is a function of NumPy's generator; write it as a function (steps) -> times"
+    if config.hindsight is not None and config.hindsight.copy_info_dict:
+        return "copy_info_dict computes rewards from infos, which exist on the host only"
     if config.priorities is not None and most_updates(config, buffer.ring.n_envs) is None:
         return "priorities with gradient_steps=-1 after whole episodes exist on the host only"
     if config.frame_stack is not None:

@@ -161,8 +161,9 @@ class OffPolicyAgent(Agent):
         kind: Any = config.replay_buffer_class
         kind = BUFFERS[kind] if isinstance(kind, str) else kind
         if config.hindsight is not None:
-            goals = self._goals(env)
-            return kind(ring, config.gamma, config.hindsight, goals, config.n_steps, tree, each_reward)
+            made = kind(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, tree, each_reward)
+            made.last_infos = lambda: env.info
+            return made
         settings: Any = config.replay_buffer_kwargs or ()
         if config.has_memory:
             shape = config.policy_kwargs
@@ -176,7 +177,7 @@ class OffPolicyAgent(Agent):
         replay = self.run.replay
         for buffer in (getattr(replay, "own", replay), getattr(replay, "demonstrations", None)):
             if isinstance(buffer, HerReplayBuffer):
-                buffer.goals = self._goals(env)
+                buffer.goals, buffer.last_infos = self._goals(env), lambda: env.info
 
     @staticmethod
     def _goals(env: VectorEnv) -> GoalFunctions:

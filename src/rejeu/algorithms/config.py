@@ -157,7 +157,8 @@ class OffPolicyConfig(AlgorithmConfig):
     """Update every ``train_freq`` environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
     environments together."""
     gradient_steps: int = 1
-    """Gradient steps per update; -1 takes as many as there were environment steps since the last update."""
+    """Gradient steps per update; 0 takes none, which only collects experience; -1 takes as many as there were environment
+    steps since the last update."""
     action_noise: Any = None
     """Noise added to the actions of the training policy: a standard deviation for actions in [-1, 1] such as 0.1,
     ``"ou(0.2)"``, an object such as ``NormalActionNoise(mean, sigma)``, or one of your own. None for no noise."""
@@ -201,7 +202,7 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "learning_starts", whole, least=0)
         coerce(self, "tau", number, above=0, most=1)
         coerce(self, "train_freq", train_freq)
-        coerce(self, "gradient_steps", gradient_steps)
+        coerce(self, "gradient_steps", whole, least=-1)
         coerce(self, "overlap", flag)
         coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
         coerce(self, "demonstration_share", number, least=0, most=1)
@@ -371,13 +372,6 @@ def buffer_settings(key: str, value: Any, buffer: str | type) -> Any:
             f"{key}={value!r} does not apply to {buffer}; did you forget replay_buffer_class=HerReplayBuffer?"
         )
     return None
-
-
-def gradient_steps(key: str, value: Any) -> int:
-    """Returns a number of gradient steps: at least 1, or -1 for as many as environment steps."""
-    if value == 0:
-        raise ValueError(f"{key}=0 would never learn; use 1 or more, or -1 for as many as environment steps")
-    return whole(key, value, least=-1)
 
 
 def train_freq(key: str, value: Any) -> int | tuple[int, Literal["step", "episode"]]:

@@ -164,7 +164,8 @@ class HindsightConfig:
     """``future``, ``final``, ``episode`` or ``random``, a ``GoalSelectionStrategy``, or a strategy of your own: a function
     ``(steps) -> times``, or its registered name (see ``rejeu.buffers.hindsight.GoalStrategy``)."""
     copy_info_dict: bool = False
-    """Accepted for Stable-Baselines3's sake; rejeu computes rewards without info, so only False is possible."""
+    """Give ``compute_reward`` the info of each step, row by row, instead of an empty one. Files of the buffer and checkpoints
+    do not contain infos: after loading, those of earlier steps are empty."""
 
     def __post_init__(self) -> None:
         if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
@@ -179,8 +180,8 @@ class HindsightConfig:
                 "name of a function of yours is enough if it was registered before (register_goal_strategy)"
             )
         object.__setattr__(self, "goal_selection_strategy", strategy)
-        if self.copy_info_dict:
-            raise ValueError("copy_info_dict=True is not supported: rewards are computed from the two goals alone")
+        if not isinstance(self.copy_info_dict, bool):
+            raise ValueError(f"copy_info_dict={self.copy_info_dict!r} must be True or False")
 
 
 def counters(config: HindsightConfig | None) -> tuple[str, ...]:
@@ -226,6 +227,25 @@ class HerReplayBuffer(BaseReplayBuffer):
         paths = [leaf.path for leaf in ring.obs_leaves]
         self.achieved = paths.index("achieved_goal")
         self.desired = paths.index("desired_goal")
+        self.infos: Any = np.full(ring.rows * ring.n_envs, None) if config.copy_info_dict else None
+        """The info of each step, with ``copy_info_dict``."""
+        self.last_infos: Callable[[], Any] = tuple
+        """Returns the infos of the step that is added, one for each environment; set by the agent."""
+
+    def add(
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        next_obs: Any,
+        envs: np.ndarray | None = None,
+    ) -> None:
+        """Records one step of each environment; see :meth:`Ring.add`."""
+        if self.infos is not None:
+            which, last = self.ring.all_envs if envs is None else envs, self.last_infos()
+            for position, env in zip(self.ring.index(which, self.ring.head[which]), which, strict=True):
+                self.infos[position] = dict(last[env]) if isinstance(last, list) else {}
+        super().add(action, reward, terminated, next_obs, envs)
 
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
@@ -240,7 +260,12 @@ class HerReplayBuffer(BaseReplayBuffer):
         which = relabeled_positions(shape, self.config.n_sampled_goal)
         index = self.goal_index(rng, rows.env[which], rows.time[which], read[0][which])
         goal = ring.read_leaf(self.achieved, index)
-        goals = NewGoals(which, goal, self.achieved, self.goals.reward, self.goals.terminated)
+        reward = self.goals.reward
+        if self.infos is not None:
+            times = rows.time[which, None] + np.arange(self.n_steps)
+            infos = [info or {} for info in self.infos[ring.index(rows.env[which, None], times)].ravel()]
+            reward = partial(reward, infos=infos)
+        goals = NewGoals(which, goal, self.achieved, reward, self.goals.terminated)
         return self.batch(shape, rows, read, weight, goals), drawn
 
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:

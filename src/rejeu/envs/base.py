@@ -89,6 +89,8 @@ class VectorEnv(ABC):
     """Name of the outermost wrapper around the whole vector, if there is one."""
     vec_normalize: Any = None
     """The wrapper that normalizes what the vector returns by running statistics, if there is one."""
+    info: Any = None
+    """What the last step said besides, as :attr:`Step.info`."""
     _obs: Any
     """The observations returned last."""
 
@@ -124,13 +126,17 @@ class VectorEnv(ABC):
         >>> (step.obs == obs).all(axis=1).tolist(), (step.reward == 0.0).tolist()
         ([False, True], [False, True])
         """
-        if active is None:
-            return self._step_all(action)
+        if active is not None:
+            self._check_active(active)
+        step = self._step_all(action) if active is None or active.all() else self._step_some(action, active)
+        self.info = step.info
+        return step
+
+    def _check_active(self, active: np.ndarray) -> None:
         if not isinstance(active, np.ndarray) or active.dtype != bool or active.shape != (self.n_envs,):
             raise ValueError(f"active={active!r} must be a bool array of shape ({self.n_envs},), or None for all")
         if not active.any():
             raise ValueError("active leaves out every environment, so there is nothing to step")
-        return self._step_all(action) if active.all() else self._step_some(action, active)
 
     @abstractmethod
     def _step_all(self, action: np.ndarray) -> Step:

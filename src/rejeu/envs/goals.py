@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +17,8 @@ PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
 class GoalFunctions(NamedTuple):
     """The reward and termination functions of a goal environment: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
 
-    reward: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    """Returns the rewards."""
+    reward: Callable[..., np.ndarray]
+    """Returns the rewards; takes ``infos``, one dict for each row, as a third argument."""
     terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     """Returns which steps are terminal. If this is None, relabeled steps keep their termination flags."""
 
@@ -55,11 +55,12 @@ def attribute(env: Any, name: str) -> Any:
         return None
 
 
-def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Returns ``function(achieved, desired, info)`` as a function of batches of goals.
+def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.ndarray]:
+    """Returns ``function(achieved, desired, info)`` as a function of batches of goals, and of their infos if they are given.
 
     The first call with at least two rows evaluates ``function`` once with the whole batch and once for each of the
-    first eight rows. If the results agree, it is treated as vectorized from then on. Otherwise it is called row by row.
+    first eight rows. If the results agree, it is treated as vectorized from then on. Otherwise, and with infos, it is called
+    row by row.
 
     Raises:
         BadEnvironmentError: by the returned function, if ``function`` returns neither a number nor an array of one for a
@@ -67,8 +68,9 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
     """
     vectorized: bool | None = None
 
-    def by_row(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
-        rows = [one_number(function(a, d, {})) for a, d in zip(achieved, desired, strict=True)]
+    def by_row(achieved: np.ndarray, desired: np.ndarray, infos: Sequence[Any] | None = None) -> np.ndarray:
+        each = [{}] * len(achieved) if infos is None else infos
+        rows = [one_number(function(a, d, info)) for a, d, info in zip(achieved, desired, each, strict=True)]
         if any(row is None or np.shape(row) != () for row in rows):
             wrong = next(row for row in rows if row is None or np.shape(row) != ())
             name = getattr(function, "__name__", "the function of goals")
@@ -77,8 +79,10 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[[np.ndarr
             )
         return np.array(rows, dtype)
 
-    def call(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    def call(achieved: np.ndarray, desired: np.ndarray, infos: Sequence[Any] | None = None) -> np.ndarray:
         nonlocal vectorized
+        if infos is not None:
+            return by_row(achieved, desired, infos)
         if vectorized:
             return np.asarray(function(achieved, desired, {})).astype(dtype, copy=False)
         if vectorized is None and len(achieved) > 1:

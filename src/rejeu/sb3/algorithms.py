@@ -13,6 +13,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
@@ -22,9 +23,10 @@ import jax
 import numpy as np
 
 from rejeu import agents, schedules, validation
-from rejeu.agents import Agent
+from rejeu.agents import Agent, model_files
 from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.agents.off_policy import OffPolicyAgent
+from rejeu.algorithms import config as configs
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.envs.masks import split
@@ -36,8 +38,10 @@ from rejeu.sb3 import policy as policies
 from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.noise import VectorizedActionNoise
+from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first
 from rejeu.sb3.common.torch_layers import encoder_of, register_again
 from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
+from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.policy import BasePolicy
 from rejeu.sb3.zip_files import load_zip
 
@@ -85,17 +89,30 @@ NEUTRAL: dict[str, tuple[Any, ...]] = {
     "enable_critic_lstm": (True,),
 }
 """Settings that some algorithms do not have, with the values that they would have there."""
-OPTIMIZERS = {
-    "Adam": "adam",
-    "AdamW": "adamw",
-    "NAdam": "nadam",
-    "RAdam": "radam",
-    "RMSprop": "rmsprop",
-    "RMSpropTFLike": "rmsprop",
-    "SGD": "sgd",
+OPTIMIZERS: dict[str, dict[str, Any]] = {
+    "Adam": {"name": "adam"},
+    "AdamW": {"name": "adamw"},
+    "NAdam": {"name": "nadam"},
+    "RAdam": {"name": "radam"},
+    "RMSprop": {"name": "rmsprop", "decay": 0.99, "eps": 1e-8, "eps_in_sqrt": False},
+    "RMSpropTFLike": {"name": "rmsprop", "decay": 0.99, "eps": 1e-8, "initial_scale": 1.0},
+    "SGD": {"name": "sgd"},
 }
-"""Optimizers by the names of PyTorch's classes."""
+"""Optimizers by the names of PyTorch's classes, with the settings by which they differ from Optax's."""
 OFF_POLICY = ("learning_rate", "buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq")
+SHAPING = {
+    "action_masks",
+    "dueling",
+    "ent_coef",
+    "n_critics",
+    "n_quantiles",
+    "normalize",
+    "optimizer",
+    "policy_kwargs",
+    "rnd",
+}
+SHAPING |= {"use_rms_prop", "use_sde"}
+"""Hyperparameters that the arrays of a file depend on."""
 POSITIONAL = {
     "PPO": ("learning_rate", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range"),
     "A2C": ("learning_rate", "n_steps", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
@@ -109,17 +126,17 @@ def unsupported(name: str, value: Any, what: str = "has no effect") -> None:
 
 
 def optimizer_of(kind: Any, settings: Mapping[str, Any]) -> Any:
-    """Returns the setting ``optimizer`` for a class of PyTorch's or of Optax, and its arguments."""
-    name = OPTIMIZERS.get(getattr(kind, "__name__", ""))
-    if name is None:
+    """Returns the setting ``optimizer`` for a class of PyTorch's, its name, or one of Optax, and its arguments."""
+    known = OPTIMIZERS.get(kind if isinstance(kind, str) else getattr(kind, "__name__", ""))
+    if known is None:
         return kind if kind is not None else {"name": "adam", **settings} if settings else None
     renamed = {"alpha": "decay"}
     given = {renamed.get(key, key): value for key, value in settings.items() if key not in ("lr", "betas", "centered")}
     if "betas" in settings:
         given["b1"], given["b2"] = settings["betas"]
     if given.pop("amsgrad", False):
-        name = "amsgrad"
-    return {"name": name, **given} if given else name
+        given["name"] = "amsgrad"
+    return {**known, **given} if len(known | given) > 1 else known["name"]
 
 
 def layers_of(net_arch: Any) -> Any:
@@ -133,6 +150,10 @@ def layers_of(net_arch: Any) -> Any:
         others = ("qf",) if "qf" in net_arch else ("vf",)
         return {key: list(net_arch.get(key, ())) for key in ("pi", *others)}
     return list(net_arch)
+
+
+class Refused(ValueError, AssertionError):
+    """A setting or a space that an algorithm does not take: scripts catch either error."""
 
 
 class Original(Agent):
@@ -170,10 +191,16 @@ class Original(Agent):
             env = TimeLimitTerminates(gym.make(env) if isinstance(env, str) else env)
             settings["replay_buffer_kwargs"] = {**replay, "handle_timeout_termination": True}
         name = policy.replace("LstmPolicy", "Policy") if isinstance(policy, str) else policy
+        if self.name == "A2C" and settings.get("use_rms_prop", True) and settings.get("optimizer") is None:
+            rule = {"optimizer_class": "RMSprop", "optimizer_kwargs": {"eps": settings.get("rms_prop_eps", 1e-5)}}
+            settings["policy_kwargs"] = rule | (settings.get("policy_kwargs") or {})
         if self.name == "ARS":  # whose policy is linear without hidden layers
             widths, name = ([], "MlpPolicy") if name == "LinearPolicy" else ([64, 64], name)
             settings["policy_kwargs"] = {"net_arch": widths, **(settings.get("policy_kwargs") or {})}
-        super().__init__(name, env, **settings)
+        try:
+            super().__init__(name, env, **settings)
+        except ValueError as error:
+            raise (Refused(*error.args) if type(error) is ValueError else error) from None
         self.device = utils.Device(self.device)
         if made is not None:
             made.model, made.observation_space, made.action_space = self, self.observation_space, self.action_space
@@ -242,8 +269,6 @@ class Original(Agent):
                 False,
                 "is not followed for vector environments: wrap theirs in TimeLimitTerminates",
             )
-        if given.pop("copy_info_dict", False):
-            unsupported("copy_info_dict", True, "is not followed: rewards are computed from the goals alone")
         given.pop("optimize_memory_usage", None)
         if "replay_buffer_kwargs" in settings:
             settings["replay_buffer_kwargs"] = given or None
@@ -401,6 +426,18 @@ class Original(Agent):
         shown.pos, shown.full = core.length, core.full
         return shown
 
+    def make_envs(self, env: Any, *args: Any, **kwargs: Any) -> Any:
+        """Returns vector environments; of those that :meth:`get_env` returned, the images as they were given before."""
+        mine = self.__dict__.get("observation_space")
+        if isinstance(env, VecTransposeImage) and mine is not None and env.venv.observation_space == mine:
+            env = env.venv
+        return super().make_envs(env, *args, **kwargs)  # type: ignore[safe-super]
+
+    def get_env(self) -> Any:
+        """Returns the training environments; images with the channels last are shown with the channels first."""
+        env = super().get_env()
+        return env if env is None or not has_channels_last(env.observation_space) else VecTransposeImage(env)
+
     def make_buffer(self, env: Any) -> Any:
         """Returns a new buffer; one for ``VecNormalize`` stores what was not normalized, and scales what is drawn."""
         scales = self._asks_for_originals(env)
@@ -550,12 +587,28 @@ class Original(Agent):
     def save(self, path: Any, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> Any:
         """Writes the model to exactly this path, or to a file object; ``.zip`` is added to a path without a suffix.
 
-        The file is rejeu's, whatever its suffix: arrays and JSON. ``exclude`` and ``include`` are accepted with a warning,
-        because a file holds what was learned and the hyperparameters, and nothing else.
+        The file is rejeu's, whatever its suffix: arrays and JSON.
+
+        Args:
+            path: of the file, or a file object.
+            exclude: hyperparameters of which the file gets the default. Those that the networks depend on are kept, and names
+                that are in no file, such as ``verbose``, are ignored.
+            include: further attributes, such as ``verbose`` or some of your own, with values that JSON has; in spite of
+                ``exclude``.
+
+        Raises:
+            TypeError: if JSON has no such value; ``save_replay_buffer`` writes the replay buffer.
         """
-        if exclude or include:
-            unsupported("exclude" if exclude else "include", [*(exclude or include or ())])
-        return written(super().save, path, ".zip")
+        kept = {*(include or ())}
+        return written(partial(self._write, {*(exclude or ())} - kept, kept), path, ".zip")
+
+    def _write(self, exclude: set[str], include: set[str], path: Path) -> Path:
+        """Writes a file without some hyperparameters and with further attributes."""
+        header, defaults = model_files.header(self), configs.to_json(type(self.config)())
+        header["config"] |= {key: defaults[key] for key in exclude & defaults.keys() - SHAPING}
+        header["attributes"] = {key: getattr(self, key) for key in sorted(include - defaults.keys())}
+        self.last_saved = checkpoint.write(path, "agent", self.get_parameters(), header)
+        return self.last_saved
 
     def save_replay_buffer(self, path: Any) -> Any:
         """Writes the replay buffer to exactly this path, or to a file object; ``.pkl`` is added to a path without a suffix."""
@@ -608,9 +661,14 @@ class Original(Agent):
             if zipfile.is_zipfile(found):
                 agent = load_zip(found, env, kind=cls, **cls.converted(changes))
             else:
-                shape = checkpoint.read_header(found, "agent").get("config", {}).get("policy_kwargs")
+                header = checkpoint.read_header(found, "agent")
+                shape = header.get("config", {}).get("policy_kwargs")
                 register_again(shape.get("encoder") if isinstance(shape, dict) else None)
                 agent = load_agent(cls, found, env, changes)
+                attributes = header.get("attributes")
+                for name, value in attributes.items() if isinstance(attributes, dict) else ():
+                    if not hasattr(agent, name) or (name == "verbose" and name not in changes and value in (0, 1, 2)):
+                        setattr(agent, name, value)
         agent.device = utils.Device(agent.device)
         return agent
 
@@ -687,6 +745,12 @@ def as_callback(callback: Any) -> Callback:
         return callback
     is_own = [*inspect.signature(callback).parameters][:1] == ["agent"]
     return callback if is_own else base_callback.ConvertCallback(callback)
+
+
+def has_channels_last(space: gym.Space) -> bool:
+    """Returns whether observations are, or contain, images with the channels last."""
+    parts: Any = space.spaces.values() if isinstance(space, gym.spaces.Dict) else [space]
+    return any(is_image_space(part) and not is_image_space_channels_first(part) for part in parts)
 
 
 def _like(space: gym.spaces.Box, observation: Any) -> np.ndarray:

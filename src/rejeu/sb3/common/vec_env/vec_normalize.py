@@ -29,6 +29,7 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     by_key,
     unwrap_vec_wrapper,
 )
+from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 
 __all__ = ["VecNormalize", "sync_envs_normalization", "unwrap_vec_normalize"]
 
@@ -297,6 +298,9 @@ def sync_envs_normalization(env: VecEnv, eval_env: VecEnv) -> None:
         ValueError: if ``eval_env`` is not wrapped in the same way.
     """
     while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecTransposeImage) and not isinstance(eval_env, VecTransposeImage):
+            env = env.venv  # of ``get_env``
+            continue
         if not isinstance(eval_env, VecEnvWrapper) or isinstance(env, VecNormalize) != isinstance(
             eval_env, VecNormalize
         ):

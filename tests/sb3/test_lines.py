@@ -1,0 +1,371 @@
+"""What scripts for Stable-Baselines3 do, line by line, and the tests that show each of them."""
+
+from __future__ import annotations
+
+import ast
+import io
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rejeu import sb3
+from rejeu.algorithms import optimizers
+from rejeu.sb3.common import envs, logger as loggers
+from rejeu.sb3.common.atari_wrappers import AtariWrapper
+from rejeu.sb3.common.buffers import DictReplayBuffer, DictRolloutBuffer, HerReplayBuffer, ReplayBuffer
+from rejeu.sb3.common.callbacks import LogEveryNTimesteps
+from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
+from rejeu.sb3.common.preprocessing import (
+    get_action_dim,
+    get_flattened_obs_dim,
+    get_obs_shape,
+    is_image_space,
+    preprocess_obs,
+)
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
+
+SMALL = {"policy_kwargs": {"net_arch": [8]}}
+
+
+class Weighing(envs.BitFlippingEnv):
+    """Its rewards depend on the info of the step too."""
+
+    def __init__(self) -> None:
+        super().__init__(n_bits=4, continuous=True)
+
+    def reset(self, **kwargs):
+        self.count = 0
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        obs, _, terminated, truncated, info = super().step(action)
+        self.count += 1
+        info["weight"] = float(self.count)
+        reward = self.compute_reward(obs["achieved_goal"], obs["desired_goal"], info)
+        return obs, float(reward), terminated, truncated, info
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        weight = info["weight"] if info else 1.0
+        return weight * (super().compute_reward(achieved_goal, desired_goal, info) - 0.5)
+
+
+@pytest.mark.parametrize("n_steps", [1, 2])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_rewards_of_new_goals_are_computed_from_the_infos_of_their_steps(n_steps, n_envs, tmp_path):
+    model = sb3.SAC(
+        "MultiInputPolicy",
+        make_vec_env(Weighing, n_envs=n_envs),
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"copy_info_dict": True, "n_sampled_goal": 4},
+        learning_starts=100,
+        n_steps=n_steps,
+        gamma=1.0,
+        seed=0,
+        **SMALL,
+    ).learn(60)
+    batch = model.run.replay.draw(np.random.default_rng(0), (64,))[0]
+    weights = np.asarray(batch.reward) * -2  # -1.5 times the weight where a goal was missed, else -0.5 times
+    if n_steps == 1:
+        reached = (batch.next_obs["achieved_goal"] == batch.next_obs["desired_goal"]).all(axis=1)
+        weights = np.where(reached, weights, weights / 3)
+        assert {*weights.tolist()} <= {1.0, 2.0, 3.0, 4.0}
+        assert len({*weights.tolist()}) > 2
+    assert (weights > 0).all()
+    loaded = sb3.SAC.load(model.save(tmp_path / "model"))
+    assert loaded.config.replay_buffer_kwargs.copy_info_dict
+
+
+def test_the_default_optimizer_of_a2c_is_the_rmsprop_of_pytorch():
+    made = [sb3.A2C("MlpPolicy", "CartPole-v1", **settings) for settings in ({}, {"use_rms_prop": False})]
+    rule = optimizers.make(made[0].config.optimizer)
+    gradient = np.array([0.3, -2.0], np.float32)
+    direction, state = rule.update(gradient, rule.init(gradient))
+    square = 0.01 * gradient**2
+    np.testing.assert_allclose(direction, gradient / (np.sqrt(square) + 1e-5), rtol=1e-5)
+    square = 0.99 * square + 0.01 * gradient**2
+    np.testing.assert_allclose(rule.update(gradient, state)[0], gradient / (np.sqrt(square) + 1e-5), rtol=1e-5)
+    assert made[1].config.optimizer is None
+
+    class RMSpropTFLike:
+        """Stands for the original's class of that name."""
+
+    settings = {"optimizer_class": RMSpropTFLike, "optimizer_kwargs": {"eps": 1e-5, "alpha": 0.9}}
+    like = optimizers.make(sb3.A2C("MlpPolicy", "CartPole-v1", policy_kwargs=settings).config.optimizer)
+    direction, _ = like.update(gradient, like.init(gradient))
+    np.testing.assert_allclose(direction, gradient / np.sqrt(0.9 + 0.1 * gradient**2 + 1e-5), rtol=1e-5)
+
+
+def test_nothing_is_learned_without_gradient_steps():
+    settings = {"learning_starts": 4, "batch_size": 4, "seed": 0, **SMALL}
+    still = sb3.SAC("MlpPolicy", "Pendulum-v1", gradient_steps=0, **settings)
+    before = still.get_parameters()
+    assert still.learn(12)._n_updates == 0
+    assert all((array == before[name]).all() for name, array in still.get_parameters().items())
+
+
+def test_files_leave_out_and_contain_what_save_is_told(tmp_path):
+    model = sb3.PPO("MlpPolicy", "CartPole-v1", verbose=2, gamma=0.5, ent_coef=0.1, **SMALL)
+    model.note = {"trained by": "me", "scores": [1, 2.5]}
+    file = io.BytesIO()
+    model.save(file, exclude=["gamma", "verbose", "policy_kwargs", "unknown"], include=["note"])
+    loaded = sb3.PPO.load(file)
+    assert (loaded.gamma, loaded.ent_coef, loaded.verbose, loaded.note) == (0.99, 0.1, 0, model.note)
+    model.save(tmp_path / "model", exclude=["verbose"], include=["verbose"])
+    assert sb3.PPO.load(tmp_path / "model").verbose == 2
+    assert sb3.PPO.load(tmp_path / "model", verbose=0).verbose == 0
+    with pytest.raises(TypeError):
+        model.save(tmp_path / "other", include=["rollout_buffer"])
+    assert not (tmp_path / "other.zip").exists()
+
+
+def test_images_that_are_scaled_already_need_normalize_images_false():
+    env = VecNormalize(DummyVecEnv([lambda: envs.FakeImageEnv(screen_height=36, screen_width=36, channel_first=True)]))
+    shape = {"features_extractor_kwargs": {"features_dim": 8}, "normalize_images": False}
+    model = sb3.A2C("CnnPolicy", env, n_steps=8, policy_kwargs=shape).learn(8)
+    assert any(array.ndim == 4 for array in model.get_parameters().values())
+    with pytest.raises(AssertionError, match="uint8"):
+        sb3.A2C("CnnPolicy", env, n_steps=8)
+
+
+def test_the_environments_of_an_agent_show_images_with_the_channels_first():
+    model = sb3.A2C("CnnPolicy", envs.FakeImageEnv(screen_height=36, screen_width=40), n_steps=8).learn(8)
+    env = model.get_env()
+    assert is_vecenv_wrapped(env, VecTransposeImage)
+    obs = env.reset()
+    assert obs.shape == (1, 1, 36, 40)
+    actions = [model.predict(one, deterministic=True)[0] for one in (obs, np.moveaxis(obs, 1, -1))]
+    assert actions[0] == actions[1]
+    model.set_env(env)
+    assert model.learn(8).num_timesteps == 8
+
+
+def test_a_refused_setting_is_an_assertion_error_and_a_value_error():
+    with pytest.raises(AssertionError, match="clip_range_vf"):
+        sb3.PPO("MlpPolicy", "CartPole-v1", clip_range_vf=-0.2)
+    with pytest.raises(ValueError, match="DQN"):
+        sb3.DQN("MlpPolicy", "Pendulum-v1")
+
+
+class Named(VecEnvWrapper):
+    """A wrapper with an attribute."""
+
+    level = "inner"
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def test_an_attribute_of_two_inner_wrappers_is_ambiguous():
+    inner = Named(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
+    assert VecNormalize(inner).level == "inner"
+    with pytest.raises(AttributeError, match="ambiguous: Named and Named"):
+        _ = VecNormalize(Named(inner)).level
+
+
+def test_actor_and_critic_share_their_extractor_or_not():
+    env = envs.FakeImageEnv(screen_height=36, screen_width=36)
+    sizes = []
+    for shares in (True, False):
+        shape = {"share_features_extractor": shares, "features_extractor_kwargs": {"features_dim": 8}}
+        model = sb3.PPO("CnnPolicy", env, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=shape).learn(8)
+        sizes.append(sum(array.ndim == 4 for array in model.get_parameters().values()))
+    assert sizes[1] == 2 * sizes[0]
+    with pytest.warns(UserWarning, match="share_features_extractor"):
+        sb3.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"share_features_extractor": True})
+
+
+def test_squashed_actions_stay_in_their_bounds():
+    shape = {"squash_output": True, "net_arch": [8], "log_std_init": 3.0}
+    model = sb3.PPO("MlpPolicy", "Pendulum-v1", use_sde=True, n_steps=16, batch_size=16, policy_kwargs=shape, seed=0)
+    actions = model.learn(16).policy.get_distribution(np.ones((256, 3), np.float32)).sample()
+    assert 1.9 < np.abs(actions).max() <= 2.0  # of Pendulum
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_replay_buffers_by_hand(nested):
+    box = spaces.Box(-1, 1, (2,), np.float32)
+    space = spaces.Dict({"a": box, "b": spaces.Discrete(3)}) if nested else box
+    kind = DictReplayBuffer if nested else ReplayBuffer
+    buffer = kind(10, space, box, device="auto", n_envs=2, optimize_memory_usage=False, handle_timeout_termination=True)
+    show = lambda i: {"a": np.full((2, 2), i / 10), "b": np.full((2,), i % 3)} if nested else np.full((2, 2), i / 10)  # noqa: E731
+    for i in range(7):
+        infos = [{"TimeLimit.truncated": i == 3}, {}]
+        buffer.add(show(i), show(i + 1), np.full((2, 2), 0.5), np.array([i, -i]), np.full(2, i == 3), infos)
+    assert (buffer.buffer_size, buffer.size(), buffer.pos, buffer.full) == (5, 5, 2, True)
+    batch = buffer.sample(200)
+    first, following = (part["a"] if nested else part for part in (batch.observations, batch.next_observations))
+    np.testing.assert_allclose(following - first, 0.1, atol=1e-6)
+    np.testing.assert_allclose(np.abs(batch.rewards[:, 0]), 10 * first[:, 0], atol=1e-5)
+    ends = np.isclose(first[:, 0], 0.3)
+    assert ends.any()
+    assert (
+        batch.dones[:, 0] == (ends & (batch.rewards[:, 0] < 0))
+    ).all()  # the first environment's end was a time limit
+    assert batch.actions.dtype == np.float32
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), norm_obs=False)
+    env.ret_rms.var = np.array(4.0)
+    np.testing.assert_allclose(np.abs(buffer.sample(50, env=env).rewards).max(), 3.0, atol=1.0)
+
+
+def test_rollouts_of_dicts_are_drawn_in_minibatches():
+    box = spaces.Box(-1, 1, (2,), np.float32)
+    buffer = DictRolloutBuffer(4, spaces.Dict({"a": box}), spaces.Discrete(3), gae_lambda=0.9, gamma=0.5, n_envs=2)
+    for i in range(4):
+        buffer.add(
+            {"a": np.full((2, 2), i / 10)}, np.array([i % 3] * 2), np.ones(2), np.zeros(2), np.zeros(2), np.zeros(2)
+        )
+    buffer.compute_returns_and_advantage(np.zeros(2), np.ones(2))
+    parts = [*buffer.get(4)]
+    assert [part.observations["a"].shape for part in parts] == [(4, 2)] * 2
+    # With values of 0 an advantage is the sum of the rewards that follow, discounted by gamma lambda = 0.45.
+    expected = {round(sum(0.45**k for k in range(4 - i)), 5) for i in range(4)}
+    assert {round(float(one), 5) for part in parts for one in part.advantages} == expected
+
+
+def test_attributes_of_agents():
+    model = sb3.DQN("MlpPolicy", "CartPole-v1", learning_rate=1e-3, batch_size=16, learning_starts=8, **SMALL)
+    assert (model.gamma, model.learning_rate, model.batch_size, model.lr_schedule(0.5)) == (0.99, 1e-3, 16, 1e-3)
+    model.learn(16)
+    assert (model.num_timesteps, model._n_updates, model._last_obs.shape) == (16, 2, (1, 4))
+    assert model.exploration_rate == pytest.approx(0.05)
+    assert (str(model.device), model.policy.observation_space) == ("auto", model.observation_space)
+    assert model.q_net(model.policy.obs_to_tensor(np.zeros(4, np.float32))[0]).shape == (1, 2)
+    assert sb3.PPO("MlpPolicy", "CartPole-v1").clip_range(1.0) == 0.2
+
+
+def test_tqc_explores_by_state_dependent_noise_and_td3_has_none_as_in_the_original():
+    model = sb3.TQC("MlpPolicy", "Pendulum-v1", use_sde=True, sde_sample_freq=4, learning_starts=8, seed=0, **SMALL)
+    model.learn(16)
+    assert any(name.endswith("log_std") for name in model.get_parameters())
+    with pytest.raises(TypeError, match="use_sde"):
+        sb3.TD3("MlpPolicy", "Pendulum-v1", use_sde=True)
+
+
+def test_a_row_is_logged_every_so_many_steps(tmp_path):
+    model = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=8, **SMALL)
+    model.set_logger(loggers.configure(str(tmp_path), ["csv", "json"]))
+    model.learn(40, callback=LogEveryNTimesteps(10), log_interval=None)
+    rows = loggers.read_csv(tmp_path / "progress.csv")
+    assert [int(row["time/total_timesteps"]) for row in rows] == [10, 20, 30, 40]
+    assert float(rows[-1]["time/fps"]) > 0
+    assert model.logger.output_formats[1].names == ("json",)
+    model.logger.close()
+
+
+class Console(gym.Env):
+    """Has what Atari wrappers ask a game: lives, the meanings of actions, frames."""
+
+    action_space = spaces.Discrete(3)
+    observation_space = spaces.Box(0, 255, (210, 160, 3), np.uint8)
+
+    class ale:  # noqa: N801
+        left = 3
+
+        @classmethod
+        def lives(cls):
+            return cls.left
+
+    def get_action_meanings(self):
+        return ["NOOP", "FIRE", "RIGHT"]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.ale.left = 0, 3
+        return np.zeros((210, 160, 3), np.uint8), {}
+
+    def step(self, action):
+        self.t += 1
+        self.ale.left = 3 - self.t // 50
+        return np.full((210, 160, 3), self.t, np.uint8), 7.0, self.ale.left == 0, False, {}
+
+
+def test_atari_wrappers_by_a_game_that_is_none():
+    pytest.importorskip("cv2")
+    env = AtariWrapper(Console(), noop_max=3, screen_size=42)
+    obs, _ = env.reset(seed=0)
+    assert obs.shape == (42, 42, 1)
+    assert env.unwrapped.t in range(
+        4 * 2 + 1, 4 * 2 + 4
+    )  # one to three steps of nothing, then two actions of four frames
+    before = env.unwrapped.t
+    obs, reward, terminated, _, _ = env.step(2)
+    assert (env.unwrapped.t - before, reward, terminated) == (4, 1.0, False)
+    assert obs.max() == env.unwrapped.t  # the brightest of the last two frames
+    while not terminated:
+        terminated = env.step(2)[2]
+    assert env.unwrapped.ale.lives() == 2  # an episode ends with a life
+    vector = make_atari_env(Console, n_envs=2, wrapper_kwargs={"screen_size": 42})
+    assert vector.reset().shape == (2, 42, 42, 1)
+
+
+def test_observations_are_prepared_by_their_spaces():
+    assert preprocess_obs(np.array([1]), spaces.Discrete(3)).tolist() == [[0, 1, 0]]
+    assert preprocess_obs(np.array([[1, 0]]), spaces.MultiDiscrete([2, 3])).tolist() == [[0, 1, 1, 0, 0]]
+    image = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+    assert float(preprocess_obs(np.full((1, 36, 36, 3), 255, np.uint8), image).max()) == 1.0
+    assert get_obs_shape(spaces.Dict({"a": spaces.Discrete(3), "b": image})) == {"a": (1,), "b": (36, 36, 3)}
+    assert (get_action_dim(spaces.MultiBinary(4)), get_flattened_obs_dim(spaces.MultiDiscrete([2, 3]))) == (4, 5)
+    assert is_image_space(image)
+    assert not is_image_space(spaces.Box(0, 1, (36, 36, 3)))
+
+
+LINES = {
+    "policy_kwargs: features_extractor_class, features_extractor_kwargs": "test_a_features_extractor_is_used_saved_and_loaded",
+    "policy_kwargs: the built-in extractors": "test_the_width_of_convolutions_and_images_that_are_scaled_already",
+    "policy_kwargs: n_critics, optimizer_class, dicts in net_arch": "test_policy_kwargs_of_the_original_are_translated",
+    "policy_kwargs: normalize_images": "test_images_that_are_scaled_already_need_normalize_images_false",
+    "policy_kwargs: share_features_extractor": "test_actor_and_critic_share_their_extractor_or_not",
+    "policy_kwargs: use_expln": "test_expln_continues_the_exponential_smoothly",
+    "policy_kwargs: squash_output": "test_squashed_actions_stay_in_their_bounds",
+    "policy classes of one's own": "test_a_policy_class_of_ones_own_sets_the_layers",
+    "buffers: ReplayBuffer, DictReplayBuffer": "test_replay_buffers_by_hand",
+    "buffers: NStepReplayBuffer": "test_n_step_returns_stop_where_episodes_end",
+    "buffers: RolloutBuffer": "test_rollout_buffer_computes_advantages_by_the_recursion",
+    "buffers: DictRolloutBuffer": "test_rollouts_of_dicts_are_drawn_in_minibatches",
+    "buffers: HerReplayBuffer": "test_hindsight_by_hand_gives_goals_that_were_reached",
+    "buffers: copy_info_dict": "test_rewards_of_new_goals_are_computed_from_the_infos_of_their_steps",
+    "buffers: handle_timeout_termination": "test_time_limits_are_terminal_without_handle_timeout_termination",
+    "model.policy": "test_policy_parts_agree_with_the_agent",
+    "model.policy: get_distribution, evaluate_actions": "test_box_distributions_are_in_the_environments_units",
+    "attributes": "test_attributes_of_agents",
+    "attributes: those that can be set": "test_hyperparameters_are_attributes_that_can_be_set",
+    "attributes: replay_buffer": "test_the_replay_buffer_of_an_agent_is_shown_extended_and_replaced",
+    "functions of the remaining progress": "test_every_function_given_as_a_schedule_takes_the_remaining_progress",
+    "functions of the remaining progress in files": "test_files_contain_functions_given_as_schedules_as_tables",
+    "neutral values of arguments": "test_neutral_arguments_are_accepted_and_those_not_followed_warn",
+    "use_sde for SAC": "test_sac_explores_by_state_dependent_noise",
+    "use_sde for TQC": "test_tqc_explores_by_state_dependent_noise_and_td3_has_none_as_in_the_original",
+    "compute_reward with an array of one": "test_compute_reward_may_return_an_array_of_one_for_one_goal",
+    "batch_size above the buffer's content": "test_a_batch_may_be_larger_than_the_buffer",
+    "save: include, exclude": "test_files_leave_out_and_contain_what_save_is_told",
+    "save: names of files, file objects; custom_objects": "test_files_have_exactly_the_given_name_or_are_file_objects",
+    "callbacks: LogEveryNTimesteps": "test_a_row_is_logged_every_so_many_steps",
+    "callbacks: functions of locals and globals": "test_functions_as_callbacks_take_locals_and_globals",
+    "logger": "test_logger_formats",
+    "env_checker": "test_the_checker_states_the_difference",
+    "envs": "test_environments_pass_the_checker_without_warnings",
+    "atari_wrappers, make_atari_env": "test_atari_wrappers_by_a_game_that_is_none",
+    "preprocessing": "test_observations_are_prepared_by_their_spaces",
+    "save_util": "test_files_by_path_or_open",
+    "type_aliases, distributions, torch_layers, utils: names": "test_names_stand_where_stable_baselines3_has_them",
+    "distributions": "test_state_dependent_noise_has_the_variance_of_its_matrix",
+    "torch_layers": "test_create_mlp_makes_layers",
+    "utils": "test_utilities",
+    "VectorizedActionNoise": "test_neutral_arguments_are_accepted_and_those_not_followed_warn",
+    "VecNormalize with HER": "test_a_replay_buffer_behind_vec_normalize_keeps_original_values_and_draws_scaled_ones",
+    "StackedObservations": "test_stacks_of_observations_by_hand",
+}
+"""What scripts do, by the test that shows it."""
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_what_scripts_do_has_a_test(line):
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(Path(__file__).parent.glob("test_*.py"))]
+    assert LINES[line] in {node.name for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef)}
