@@ -136,7 +136,6 @@ def learned(folder: str) -> str:
                 f"{result.measure} {result.figures}",
                 "; ".join(others),
                 str(result.seeds),
-                time_of(result),
                 content["commit"],
                 code(re.sub(r"^python benchmarks/learning\.py \S+ \S+ ?", "", result.command)),
             )
@@ -148,7 +147,6 @@ def learned(folder: str) -> str:
         "rejeu",
         "published",
         "seeds",
-        "time for each seed",
         "commit",
         "options",
     )
