@@ -91,31 +91,23 @@ def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: s
     assert agents[1].learn(20, reset_num_timesteps=False).num_timesteps == 70
 
 
-def test_a_run_of_several_that_resumes_says_that_it_continues_alone(tmp_path: Any) -> None:
-    callback = lambda agent: Checkpoint(tmp_path / str(agent.seed), every=30)  # noqa: E731
-    agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 60, seeds=2, callback=callback, **SMALL)
-    with pytest.warns(UserWarning, match="one of 2 runs in one program"):
-        resumed = rejeu.DQN.resume(tmp_path / "1")
-    assert resumed.resumed is not None
-    assert not resumed.resumed.exact
-    for name, value in agents[1].get_parameters().items():
-        np.testing.assert_array_equal(value, resumed.get_parameters()[name])
-    resumed.learn(10, Checkpoint(tmp_path / "1", every=5))
-    assert rejeu.DQN.resume(tmp_path / "1").resumed.exact
-
-
-@pytest.mark.filterwarnings("ignore:.*one of 2 runs in one program:UserWarning")
-def test_a_run_of_several_that_resumes_is_the_uninterrupted_one_up_to_rounding(tmp_path: Any) -> None:
+def test_a_run_of_several_that_resumes_continues_alone_and_is_the_uninterrupted_one_up_to_rounding(
+    tmp_path: Any,
+) -> None:
     def interrupted(agent: Any) -> list[Any]:
         return [Checkpoint(tmp_path / str(agent.seed), every=20), lambda agent, progress: progress.step < 40]
 
     together = {"env": "jax/CartPole-v1", "total_timesteps": 120, "seeds": 2, **SMALL}
     whole = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", **together)
-    rejeu.train_seeds(rejeu.DQN, "MlpPolicy", callback=interrupted, **together)
-    for agent in whole:
-        resumed = rejeu.DQN.resume(tmp_path / str(agent.seed))
-        assert resumed.num_timesteps == 40
-        assert_same_runs(agent, resumed.learn())
+    stopped = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", callback=interrupted, **together)
+    for agent, before in zip(whole, stopped, strict=True):
+        with pytest.warns(UserWarning, match="one of 2 runs in one program"):
+            resumed = rejeu.DQN.resume(tmp_path / str(agent.seed))
+        assert (resumed.num_timesteps, resumed.resumed.exact) == (40, False)
+        for name, value in before.get_parameters().items():
+            np.testing.assert_array_equal(value, resumed.get_parameters()[name])
+        assert_same_runs(agent, resumed.learn(callback=Checkpoint(tmp_path / str(agent.seed), every=20)))
+    assert rejeu.DQN.resume(tmp_path / "1").resumed.exact  # of a run that continued alone
 
 
 @pytest.mark.parametrize(

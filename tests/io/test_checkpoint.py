@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -286,6 +284,7 @@ def fails_with(number):
         (errno.EROFS, OSError, "Read-only file system; give a path on a disk that can be written"),
         (errno.ENOENT, FileNotFoundError, "its folder was removed while the file was written"),
         (errno.EIO, OSError, "give a path on another disk"),
+        (errno.EFBIG, OSError, "File too large; raise the limit on the size of files"),
         (None, KeyboardInterrupt, "^$"),
     ],
 )
@@ -306,31 +305,6 @@ def test_a_write_that_fails_says_why_and_leaves_the_old_file_and_nothing_else(
     assert getattr(caught.value, "errno", None) == number
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="limits of this kind are POSIX's")
-def test_a_disk_that_fills_up_is_an_error_that_says_so(tmp_path):
-    """A real failure in the middle of an array: the system lets no file grow beyond 20,000 bytes."""
-    script = """
-import resource, signal, sys
-import numpy as np
-from rejeu.io import checkpoint
-path = sys.argv[1]
-checkpoint.write(path, "rows", {"a": np.arange(10)}, {})
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-try:
-    checkpoint.write(path, "rows", {"a": np.zeros(100_000)}, {})
-except OSError as error:
-    print(error)
-print(checkpoint.read(path, "rows")[1]["a"].sum())
-"""
-    result = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path / "file")], capture_output=True, text=True, check=True
-    )
-    assert "could not be written: File too large; raise the limit on the size of files" in result.stdout
-    assert result.stdout.splitlines()[-1] == "45"
-    assert [p.name for p in tmp_path.iterdir()] == ["file.safetensors"]
 
 
 def test_the_file_is_on_disk_before_it_takes_the_old_ones_place_and_its_name_after(trained, tmp_path, monkeypatch):
@@ -365,21 +339,6 @@ def test_what_a_killed_process_left_behind_goes_with_the_next_write(tmp_path):
     os.utime(new)
     checkpoint.write(tmp_path / "a", "rows", {}, {})
     assert {p.name for p in tmp_path.iterdir()} == {"a.safetensors", new.name, *others}
-
-
-def test_a_process_that_is_killed_while_it_writes_leaves_the_old_file(tmp_path):
-    script = """
-import os, sys
-import numpy as np
-from rejeu.io import atomic, checkpoint
-path = checkpoint.write(sys.argv[1], "rows", {"a": np.arange(10)}, {})
-atomic.os.fsync = lambda file: os._exit(9)
-checkpoint.write(path, "rows", {"a": np.zeros(1000)}, {})
-"""
-    result = subprocess.run([sys.executable, "-c", script, str(tmp_path / "file")], check=False)
-    assert result.returncode == 9
-    assert checkpoint.read(tmp_path / "file", "rows")[1]["a"].sum() == 45
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_path_that_is_a_folder_or_no_file_is_refused(trained, tmp_path):

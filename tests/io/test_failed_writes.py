@@ -145,17 +145,6 @@ def test_training_continues_while_the_disk_is_full_and_nothing_is_lost_after_it(
     assert all(np.array_equal(one[key], two[key]) for key in one)
 
 
-def test_a_disk_that_stays_full_is_reported_at_the_end(tmp_path, disk):
-    callbacks = [full_between(disk, 25), Checkpoint(tmp_path, every=10)]
-    with pytest.warns(UserWarning, match="No space left") as record:
-        agent = small_sac(BALL).learn(60, callbacks)
-    assert agent.num_timesteps == 60
-    assert warned(record)[-1] == f"not written (No space left on device): checkpoints in {tmp_path}"
-    assert not agent.failed_writes.complete
-    disk.full = False
-    assert rejeu.SAC.resume(tmp_path).num_timesteps == 20
-
-
 def test_a_checkpoint_that_failed_is_tried_again_after_a_minute(tmp_path, disk, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(rejeu.callbacks.checkpoint.time, "monotonic", lambda: now[0])

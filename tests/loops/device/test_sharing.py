@@ -15,13 +15,8 @@ from tests.loops.device.two_devices import CASES
 TWO = "--xla_force_host_platform_device_count=2"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[] if name == "rollouts on the device" else pytest.mark.exhaustive)
-        for name in (*CASES, "placement")
-    ],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", [*CASES, "placement"])
 def test_runs_on_two_devices_equal_single_ones(name: str) -> None:
     environ = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {TWO}"}
     words = [sys.executable, "-m", "tests.loops.device.two_devices", name]
