@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
 import envpool
@@ -45,6 +46,8 @@ class Replayed(NamedTuple):
     """Whether to put it there at every step: where rounding grows with time."""
     apart: Any = None
     """Of an observation, whether the two are known to differ there."""
+    apart_by: float = 2e-5
+    """Largest difference of an element of an observation."""
 
 
 def put_cart_pole(env, obs):
@@ -76,6 +79,13 @@ def put_parking(env, obs):
 def put_fetch(env, obs):
     """The arm always starts alike."""
     env.goal = obs["desired_goal"].astype(np.float64)
+
+
+def mujoco_version():
+    try:
+        return tuple(map(int, version("mujoco").split(".")[:2]))
+    except PackageNotFoundError:
+        return 0, 0
 
 
 def balance(obs, t, rng):
@@ -130,6 +140,8 @@ def reach(obs, t, rng):
 
 
 FALLS, LIMIT = (True, False, None), (False, True, None)
+FETCH = 2e-5 if mujoco_version() < (3, 7) else 2e-2
+"""EnvPool holds an older MuJoCo. Since 3.7 the arm is pulled a little differently, by up to 15 mm."""
 REPLAYED = {
     "CartPole-v1": Replayed(put_cart_pole, balance, {FALLS, LIMIT}, every_step=True),
     "Pendulum-v1": Replayed(put_pendulum, torque, {LIMIT}, every_step=True, apart=at_top_speed),
@@ -137,7 +149,7 @@ REPLAYED = {
     "MountainCarContinuous-v0": Replayed(put_mountain_car, push, {FALLS, LIMIT}, every_step=True),
     "Acrobot-v1": Replayed(put_acrobot, pump, {FALLS, LIMIT}, every_step=True),
     "parking-v0": Replayed(put_parking, drive, {(True, False, 0.0), (True, False, 1.0), (False, True, 0.0)}, n_envs=64),
-    "FetchReach-v4": Replayed(put_fetch, reach, {(False, True, 0.0), (False, True, 1.0)}, n_envs=8),
+    "FetchReach-v4": Replayed(put_fetch, reach, {(False, True, 0.0), (False, True, 1.0)}, n_envs=8, apart_by=FETCH),
 }
 COMPARED = *REPLAYED, *LANDERS
 
@@ -234,7 +246,11 @@ def test_episodes_of_envpool_replayed_in_gymnasium_go_the_same_way(env_id):
             step = gymnasium.step(action[None])
             other_obs, other_reward, *other_flags = outcome(gymnasium, step, 0)
             if replayed.apart is None or not replayed.apart(obs):
-                jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=0, atol=2e-5), obs, other_obs)
+                jax.tree.map(
+                    lambda one, two: np.testing.assert_allclose(one, two, rtol=0, atol=replayed.apart_by),
+                    obs,
+                    other_obs,
+                )
             np.testing.assert_allclose(reward, other_reward, rtol=0, atol=1e-5)
             assert str(flags) == str(other_flags), (env_id, t)  # as text, for NaN is unequal to itself
 

@@ -128,17 +128,16 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         raise ValueError(unknown_environment(env_id))
     try:
         return gym.make(env_id, disable_env_checker=True, **kwargs)
-    except (gym.error.DeprecatedEnv, ImportError) as error:
+    except (gym.error.DeprecatedEnv, gym.error.DependencyNotInstalled, ImportError) as error:
+        need = next((p for name, p in NEEDS.items() if name in str(error)), None)
+        missing = need is not None and importlib.util.find_spec(need.module) is None
+        if need and missing and isinstance(error, gym.error.DependencyNotInstalled):
+            raise MissingExtra(f"the environment {env_id}", need.package, need.extra) from None
         if newer := newer_version(env_id):
             raise ValueError(
                 f"{env_id} is an old version that cannot be made any more ({error}); use {newer}"
             ) from None
         raise
-    except gym.error.DependencyNotInstalled as error:
-        need = next((p for name, p in NEEDS.items() if name in str(error)), None)
-        if need is None:
-            raise
-        raise MissingExtra(f"the environment {env_id}", need.package, need.extra) from None
 
 
 def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
