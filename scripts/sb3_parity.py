@@ -181,7 +181,11 @@ def suite() -> str:
         numbers = [str(row["kinds"].get(kind, "")) for kind in kinds]
         cells = [row["file"].removesuffix(".py"), str(there), str(row["passed"]), *numbers, row.get("commit", "")[:7]]
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([f"{content['date']}, `{content['command']}`", "", *lines])
+    passed, n_tests = content["total"]["passed"], content["total"]["passed"] + content["total"]["failed"]
+    without = n_tests - content["total"]["kinds"].get("tensor", 0)
+    share = f"{passed} of {n_tests} tests pass; without those that need tensors of PyTorch, {passed} of {without}"
+    share += f" ({passed / without:.1%})."
+    return "\n".join([share, "", f"{content['date']}, `{content['command']}`", "", *lines])
 
 
 def same_scripts() -> str:

@@ -40,7 +40,7 @@ RESULTS = Path(__file__).parent / "results" / "sb3_suite.json"
 SOURCES = Path(__file__).resolve().parents[1] / "src"
 RENAMED = ((r"\bstable_baselines3\b", "rejeu.sb3"), (r"\bsb3_contrib\b", "rejeu.sb3_contrib"))
 KINDS = (
-    ("package", r"No module named '(?!rejeu)|NamespaceNotFound|DependencyNotInstalled|NameNotFound"),
+    ("package", r"No module named '(?!rejeu)|NamespaceNotFound|DependencyNotInstalled|NameNotFound|DeprecatedEnv"),
     ("time", r"Timeout"),
     ("message", r"Regex pattern did not match|Pattern:|DID NOT WARN.*\n(?:.*\n)*?.*Emitted warnings: \[\w*Warning\("),
     ("absent", r"DID NOT (RAISE|WARN)"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import rejeu
 from rejeu.algorithms import rnd
 from rejeu.algorithms.config import RndConfig
+from rejeu.callbacks import Checkpoint
 from rejeu.core import Algorithm, Clock, Rollout, Transition
 from rejeu.spaces import leaves
 from tests.every_agent import KINDS
@@ -148,6 +150,18 @@ def check(make, tmp_path):
     if not agent.learner.algorithm.recall:
         numpy_policy = rejeu.load_policy(tmp_path / "model")
         np.testing.assert_allclose(numpy_policy.predict(obs)[0], one, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["DQN", "PPO"])
+def test_a_run_that_is_cut_off_goes_on_as_if_it_had_not_been(name, tmp_path):
+    settings = OFF if name == "DQN" else ON
+    make = lambda: rejeu.AGENTS[name]("MlpPolicy", gym.make("CartPole-v1"), rnd=0.5, **settings)  # noqa: E731
+    whole = make().learn(120)
+    make().learn(120, [lambda agent, turn: turn.step < 61, Checkpoint(tmp_path, every=1000)])
+    again = rejeu.AGENTS[name].resume(tmp_path, gym.make("CartPole-v1"))
+    assert again.resumed.exact
+    assert_same_parameters(whole, again.learn())
+    assert {"predictor", "target", "moments"} <= {key.split(".")[0] for key in again.get_parameters()}
 
 
 @pytest.mark.parametrize("name", ["DQN", "PPO"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -13,11 +14,12 @@ from gymnasium import spaces
 
 from rejeu import sb3
 from rejeu.algorithms import optimizers
-from rejeu.sb3.common import envs, logger as loggers
+from rejeu.sb3.common import base_class, distributions, envs, logger as loggers, save_util, torch_layers, utils
 from rejeu.sb3.common.atari_wrappers import AtariWrapper
 from rejeu.sb3.common.buffers import DictReplayBuffer, DictRolloutBuffer, HerReplayBuffer, ReplayBuffer
 from rejeu.sb3.common.callbacks import LogEveryNTimesteps
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
+from rejeu.sb3.common.monitor import ResultsWriter, load_results
 from rejeu.sb3.common.preprocessing import (
     get_action_dim,
     get_flattened_obs_dim,
@@ -314,6 +316,38 @@ def test_observations_are_prepared_by_their_spaces():
     assert (get_action_dim(spaces.MultiBinary(4)), get_flattened_obs_dim(spaces.MultiDiscrete([2, 3]))) == (4, 5)
     assert is_image_space(image)
     assert not is_image_space(spaces.Box(0, 1, (36, 36, 3)))
+
+
+def test_small_functions(tmp_path):
+    assert base_class.maybe_make_env("CartPole-v1").spec.id == "CartPole-v1"
+    assert torch_layers.get_actor_critic_arch([8, 4]) == ([8, 4], [8, 4])
+    assert torch_layers.get_actor_critic_arch({"pi": [8], "qf": [4]}) == ([8], [4])
+    holder = SimpleNamespace(inner=SimpleNamespace(value=1))
+    save_util.recursive_setattr(holder, "inner.value", 2)
+    assert (save_util.recursive_getattr(holder, "inner.value"), holder.inner.value) == (2, 2)
+    assert (save_util.is_json_serializable([1.5, None]), save_util.is_json_serializable(holder)) == (True, False)
+    assert distributions.sum_independent_dims(np.ones((2, 3))).tolist() == [3.0, 3.0]
+    row = loggers.filter_excluded_keys({"a": 1, "b": 2}, {"a": ("csv",)}, "csv")
+    assert row == {"b": 2}
+    writer = ResultsWriter(tmp_path / "x", {"t_start": 0.0, "env_id": "E"}, ("won",))
+    writer.write_row({"r": 1.0, "l": 2, "t": 0.5, "won": 1})
+    writer.close()
+    assert load_results(tmp_path)["won"].tolist() == [1]
+    logger = utils.configure_logger(1, tmp_path, "run")
+    assert (Path(logger.dir).name, type(logger.output_formats[0])) == ("run_1", loggers.HumanOutputFormat)
+    logger.close()
+
+
+def test_masks_forbid_choices_and_bits():
+    choice = distributions.CategoricalDistribution(3).proba_distribution(np.zeros((1, 3)))
+    choice.apply_masking([[True, False, True]])
+    np.testing.assert_allclose(np.exp(choice.log_prob(np.array([0]))), 0.5, rtol=1e-6)
+    assert np.exp(choice.log_prob(np.array([1]))) == 0
+    choice.apply_masking(None)
+    np.testing.assert_allclose(np.exp(choice.log_prob(np.array([1]))), 1 / 3, rtol=1e-6)
+    bits = distributions.BernoulliDistribution(3).proba_distribution(np.zeros((1, 3)))
+    bits.apply_masking([[True, True, False, True, True, False]])  # 0 and 1 of each bit
+    assert {tuple(bits.sample()[0].tolist()) for _ in range(20)} == {(0, 1, 0), (1, 1, 0)}
 
 
 LINES = {

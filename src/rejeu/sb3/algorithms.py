@@ -559,25 +559,15 @@ class Original(Agent):
         if not self.has_own_logger:
             folder = tb_log_name or self.name
             only = {*self.log} <= {"tensorboard"}
-            self.logger = self._default_logger(folder, reset_num_timesteps) if only else logging.Logger()
+            arguments = (self.verbose, self.tensorboard_log, folder, reset_num_timesteps)
+            logger: Any = utils.configure_logger(*arguments) if only else logging.Logger()
+            self.logger = logger
+            if only and not logger.output_formats:  # statistics that nothing shows need not be computed
+                logger.outputs = []
         self.exploration_rate_set = None
         callbacks = [as_callback(one) for one in given]
         flags = (reset_num_timesteps, progress_bar)
         return super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
-
-    def _default_logger(self, name: str, is_new: bool) -> loggers.Logger:
-        """Returns the logger of ``verbose`` and ``tensorboard_log``; a run that continues keeps its folder."""
-        kinds = ["stdout"] * (self.verbose >= 1)
-        folder = os.getenv("SB3_LOGDIR")
-        if self.tensorboard_log is not None:
-            root = Path(self.tensorboard_log)
-            k = utils.get_latest_run_id(root, name) + is_new
-            folder, kinds = str(root / f"{name}_{max(k, 1)}"), [*kinds, "tensorboard"]
-        formats = [loggers.make_output_format(kind, folder or ".") for kind in kinds]
-        logger = loggers.Logger(folder, formats)
-        if not formats:  # statistics that nothing shows need not be computed
-            logger.outputs = []
-        return logger
 
     def set_logger(self, logger: Any) -> None:
         """Replaces the logger for all further training."""

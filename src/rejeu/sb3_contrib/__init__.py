@@ -174,8 +174,9 @@ MODULES: dict[str, dict[str, Any]] = {
     },
     "common.maskable.distributions": {
         f"Maskable{name}": getattr(distributions, name)
-        for name in ("BernoulliDistribution", "CategoricalDistribution", "MultiCategoricalDistribution")
-    },
+        for name in ("BernoulliDistribution", "CategoricalDistribution", "MultiCategoricalDistribution", "Distribution")
+    }
+    | {"make_masked_proba_distribution": distributions.make_proba_distribution},
     "common.recurrent": {},
     "common.recurrent.policies": {
         "RecurrentActorCriticPolicy": ActorCriticPolicy,

@@ -1,8 +1,18 @@
 """The base classes of the algorithms."""
 
+from typing import Any
+
 from rejeu.agents import Agent as BaseAlgorithm, OffPolicyAgent, OnPolicyAgent
+from rejeu.envs.registry import make_env
 from rejeu.sb3 import define
 
-__all__ = ["BaseAlgorithm"]
+__all__ = ["BaseAlgorithm", "maybe_make_env"]
+
+
+def maybe_make_env(env: Any, verbose: int = 0) -> Any:
+    """Returns an environment as it is, and one of an id."""
+    return make_env(env, render_mode="rgb_array") if isinstance(env, str) else env
+
+
 define("rejeu.sb3.common.on_policy_algorithm", {"OnPolicyAlgorithm": OnPolicyAgent})
 define("rejeu.sb3.common.off_policy_algorithm", {"OffPolicyAlgorithm": OffPolicyAgent})

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.algorithms.actor_critic.network import sde_std
-from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal
+from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, forbid
 from rejeu.sb3.common.preprocessing import get_action_dim
 from rejeu.sb3.common.torch_layers import create_mlp
 from rejeu.sb3.common.utils import Tensor
@@ -31,6 +31,7 @@ __all__ = [
     "TanhBijector",
     "kl_divergence",
     "make_proba_distribution",
+    "sum_independent_dims",
 ]
 
 
@@ -86,8 +87,8 @@ class Distribution:
         return self.mode() if deterministic else self.sample()
 
 
-class DiagGaussianDistribution(Distribution):
-    """Independent normal distributions.
+class GaussianDistribution(Distribution):
+    """Independent normal distributions, squashed or not.
 
     Args:
         action_dim: number of components.
@@ -102,7 +103,7 @@ class DiagGaussianDistribution(Distribution):
     def proba_distribution_net(self, latent_dim: int, log_std_init: float = 0.0) -> tuple[eqx.Module, np.ndarray]:
         """Returns a linear layer for the means, and logarithms of standard deviations."""
         shape = (latent_dim, self.action_dim) if isinstance(self, StateDependentNoiseDistribution) else self.action_dim
-        return create_mlp(latent_dim, self.action_dim, [])[0], np.full(shape, np.float32(log_std_init))
+        return create_mlp(latent_dim, self.action_dim, [])[0], Tensor.of(np.full(shape, np.float32(log_std_init)))
 
     def proba_distribution(self, mean_actions: Any, log_std: Any) -> Self:
         """Sets the parameters, and returns itself."""
@@ -111,13 +112,17 @@ class DiagGaussianDistribution(Distribution):
         return self
 
 
+class DiagGaussianDistribution(GaussianDistribution):
+    """Independent normal distributions."""
+
+
 class SquashedDiagGaussianDistribution(DiagGaussianDistribution):
     """Independent normal distributions squashed by tanh."""
 
     kind = TanhNormal
 
 
-class StateDependentNoiseDistribution(DiagGaussianDistribution):
+class StateDependentNoiseDistribution(GaussianDistribution):
     """Normal distributions of gSDE: the noise is linear in features of the observation (arXiv 2005.05719).
 
     Args:
@@ -201,8 +206,14 @@ class CategoricalDistribution(Distribution):
 
     def proba_distribution(self, action_logits: Any) -> Self:
         """Sets the parameters, and returns itself."""
-        self.distribution = self._made(jnp.asarray(np.asarray(action_logits, np.float32)))
+        self.logits = jnp.asarray(np.asarray(action_logits, np.float32))
+        self.distribution = self._made(self.logits)
         return self
+
+    def apply_masking(self, masks: Any) -> None:
+        """Forbids choices, or allows all with None."""
+        allowed = None if masks is None else jnp.asarray(np.asarray(masks, bool)).reshape(self.logits.shape)
+        self.distribution = self._made(forbid(self.logits, allowed))
 
 
 class MultiCategoricalDistribution(CategoricalDistribution):
@@ -222,6 +233,18 @@ class BernoulliDistribution(CategoricalDistribution):
 
     def _made(self, logits: Any) -> Any:
         return Bernoulli(logits)
+
+    def apply_masking(self, masks: Any) -> None:
+        """Forbids values, two for each bit: 0 and 1; or allows all with None."""
+        super().apply_masking(None)
+        if masks is not None:
+            allowed = jnp.asarray(np.asarray(masks, bool)).reshape(*self.logits.shape, 2)
+            self.distribution = self._made(-forbid(-forbid(self.logits, allowed[..., 1]), allowed[..., 0]))
+
+
+def sum_independent_dims(tensor: Any) -> np.ndarray:
+    """Returns the sums over the last axis; one sum of an array of one axis."""
+    return Tensor.of(np.sum(np.asarray(tensor), axis=-1))
 
 
 def make_proba_distribution(action_space: spaces.Space, use_sde: bool = False, dist_kwargs: Any = None) -> Distribution:
@@ -253,14 +276,14 @@ def kl_divergence(dist_true: Distribution, dist_pred: Distribution) -> np.ndarra
         raise TypeError(f"the distributions are of different kinds: {type(p).__name__} and {type(q).__name__}")
     if isinstance(p, Normal | TanhNormal):
         variance = jnp.exp(2 * (p.log_std - q.log_std))
-        return np.asarray(
+        return Tensor.of(
             0.5 * (variance + jnp.square((p.mean - q.mean) / jnp.exp(q.log_std)) - 1) + q.log_std - p.log_std
         )
     if isinstance(p, Categorical):
         log_p, log_q = jax.nn.log_softmax(p.logits), jax.nn.log_softmax(q.logits)
-        return np.asarray(jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1))
+        return Tensor.of(jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1))
     if isinstance(p, MultiCategorical):
         parts = zip(p.parts, q.parts, strict=True)
-        return np.stack([kl_divergence(Distribution(a), Distribution(b)) for a, b in parts], axis=-1).sum(axis=-1)
+        return Tensor.of(sum(kl_divergence(Distribution(a), Distribution(b)) for a, b in parts))
     log = lambda b, sign: jax.nn.log_sigmoid(sign * b.logits)  # noqa: E731
-    return np.asarray(sum(jnp.exp(log(p, sign)) * (log(p, sign) - log(q, sign)) for sign in (1, -1)))
+    return Tensor.of(sum(jnp.exp(log(p, sign)) * (log(p, sign) - log(q, sign)) for sign in (1, -1)))

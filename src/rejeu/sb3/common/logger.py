@@ -41,9 +41,11 @@ __all__ = [
     "JSONOutputFormat",
     "KVWriter",
     "Logger",
+    "SeqWriter",
     "TensorBoardOutputFormat",
     "Video",
     "configure",
+    "filter_excluded_keys",
     "make_output_format",
     "read_csv",
     "read_json",
@@ -115,8 +117,7 @@ class KVWriter(ABC):
         Raises:
             FormatUnsupportedError: for a value that the format cannot show.
         """
-        excluded = {key: key_excluded.get(key) or () for key in key_values}
-        row = {key: value for key, value in key_values.items() if not {*self.names} & {*np.atleast_1d(excluded[key])}}
+        row = filter_excluded_keys(key_values, key_excluded, *self.names)
         for value in row.values():
             if isinstance(value, Video | Figure | Image | HParam) and "tensorboard" not in self.names:
                 raise FormatUnsupportedError(self.names, type(value).__name__.lower())
@@ -126,7 +127,23 @@ class KVWriter(ABC):
         """Closes the output."""
 
 
-class HumanOutputFormat(KVWriter):
+class SeqWriter(ABC):
+    """Writes words. Abstract."""
+
+    @abstractmethod
+    def write_sequence(self, sequence: Sequence[str]) -> None:
+        """Writes words in one line."""
+
+
+def filter_excluded_keys(
+    key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], *formats: str
+) -> dict[str, Any]:
+    """Returns the values that none of these formats leaves out."""
+    excluded = {key: {*np.atleast_1d(key_excluded.get(key) or ())} for key in key_values}
+    return {key: value for key, value in key_values.items() if not {*formats} & excluded[key]}
+
+
+class HumanOutputFormat(KVWriter, SeqWriter):
     """Prints rows as tables.
 
     Args:
@@ -170,7 +187,6 @@ class HumanOutputFormat(KVWriter):
         return text if len(text) <= self.max_length else f"{text[: self.max_length - 3]}..."
 
     def write_sequence(self, sequence: Sequence[str]) -> None:
-        """Prints words in one line."""
         self.file.write(" ".join(sequence) + "\n")
         self.file.flush()
 

@@ -18,7 +18,7 @@ from rejeu.envs.snapshot import check_types
 from rejeu.io import atomic
 from rejeu.io.failed_writes import FailedWrites
 
-__all__ = ["LoadMonitorResultsError", "Monitor", "get_monitor_files", "load_results"]
+__all__ = ["LoadMonitorResultsError", "Monitor", "ResultsWriter", "get_monitor_files", "load_results"]
 
 SUFFIX = "monitor.csv"
 STATE = {"needs_reset": bool, "total_steps": int, "rewards": list[float], "episode_returns": list[float]}
@@ -75,9 +75,9 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.episode_times: list[float] = []
         self.total_steps = 0
         self.current_reset_info: dict[str, Any] = {}
-        columns = ("r", "l", "t", *self.reset_keywords, *self.info_keywords)
+        keywords = (*self.reset_keywords, *self.info_keywords)
         start = {"t_start": self.t_start, "env_id": str(env.spec.id if env.spec is not None else None)}
-        self._file = None if filename is None else MonitorFile(filename, columns, start, override_existing)
+        self._file = None if filename is None else ResultsWriter(filename, start, keywords, override_existing)
         self.path = None if self._file is None else self._file.path
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
@@ -124,7 +124,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         row = {"r": round(total, 6), "l": length, "t": round(seconds, 6)}
         row |= keywords_of(info, self.info_keywords) | self.current_reset_info
         if self._file is not None:
-            self._file.append(row)
+            self._file.write_row(row)
         return row
 
     def get_wrapper_state(self) -> dict[str, Any]:
@@ -163,31 +163,35 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return self.episode_times
 
 
-class MonitorFile:
+class ResultsWriter:
     """The CSV file of a monitor. Rows that cannot be written are kept, with a warning, and written later.
 
     Args:
         filename: as for :class:`Monitor`.
-        columns: names of the columns.
-        start: the first line, as JSON.
+        header: the first line, as JSON.
+        extra_keys: names of the columns after ``r``, ``l`` and ``t``.
         override_existing: replace an existing file; False appends to it.
     """
 
     def __init__(
-        self, filename: str | Path, columns: Sequence[str], start: Mapping[str, Any], override_existing: bool = True
+        self,
+        filename: str | Path = "",
+        header: Mapping[str, Any] | None = None,
+        extra_keys: Sequence[str] = (),
+        override_existing: bool = True,
     ) -> None:
-        self.path, self.columns = monitor_path(filename), tuple(columns)
+        self.path, self.columns = monitor_path(filename), ("r", "l", "t", *extra_keys)
         self._failed_writes = FailedWrites()
         if override_existing or not self.path.exists():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("w", newline="\n", encoding="utf-8") as file:
-                file.write(f"#{json.dumps(start)}\n")
+                file.write(f"#{json.dumps(header or {})}\n")
                 csv.writer(file).writerow(self.columns)
 
-    def append(self, row: Mapping[str, Any]) -> None:
+    def write_row(self, epinfo: Mapping[str, Any]) -> None:
         """Writes the row of an episode."""
         text = io.StringIO()
-        csv.DictWriter(text, self.columns).writerow(row)
+        csv.DictWriter(text, self.columns).writerow(epinfo)
         self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), text.getvalue().encode())
 
     def close(self) -> None:

@@ -2,13 +2,44 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import warnings
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-__all__ = ["load_from_pkl", "open_path", "save_to_pkl"]
+__all__ = [
+    "is_json_serializable",
+    "load_from_pkl",
+    "open_path",
+    "open_path_pathlib",
+    "open_path_str",
+    "recursive_getattr",
+    "recursive_setattr",
+    "save_to_pkl",
+]
+
+
+def recursive_getattr(obj: Any, attr: str, *args: Any) -> Any:
+    """Returns an attribute of an attribute: ``"policy.device"``; the optional third argument where there is none."""
+    return functools.reduce(lambda one, name: getattr(one, name, *args), attr.split("."), obj)
+
+
+def recursive_setattr(obj: Any, attr: str, val: Any) -> None:
+    """Sets an attribute of an attribute."""
+    parent, _, name = attr.rpartition(".")
+    setattr(recursive_getattr(obj, parent) if parent else obj, name, val)
+
+
+def is_json_serializable(item: Any) -> bool:
+    """Returns whether JSON has such a value."""
+    try:
+        json.dumps(item)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def open_path(path: Any, mode: str, verbose: int = 0, suffix: str | None = None) -> Any:
@@ -54,6 +85,9 @@ def open_path(path: Any, mode: str, verbose: int = 0, suffix: str | None = None)
         warnings.warn(f"Path {path.parent!s} does not exist and is created.", UserWarning, stacklevel=2)
         path.parent.mkdir(parents=True)
     return path.open("wb")
+
+
+open_path_pathlib = open_path_str = open_path
 
 
 def save_to_pkl(path: Any, obj: Any, verbose: int = 0) -> None:

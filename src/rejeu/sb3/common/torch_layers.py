@@ -39,7 +39,14 @@ from rejeu.networks.layers import own_module
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, preprocess_obs
 from rejeu.spaces import Leaf
 
-__all__ = ["BaseFeaturesExtractor", "CombinedExtractor", "FlattenExtractor", "NatureCNN", "create_mlp"]
+__all__ = [
+    "BaseFeaturesExtractor",
+    "CombinedExtractor",
+    "FlattenExtractor",
+    "NatureCNN",
+    "create_mlp",
+    "get_actor_critic_arch",
+]
 
 PREFIX = "sb3:"
 """How the names of encoders that are extractors begin."""
@@ -107,6 +114,12 @@ def create_mlp(
         layers.append(eqx.nn.Linear(n_in, n_out, use_bias=with_bias, key=jax.random.fold_in(key, i)))
         layers += [eqx.nn.Lambda(activation_fn)] * (i < len(net_arch))
     return layers + [eqx.nn.Lambda(jnp.tanh)] * bool(squash_output and layers)
+
+
+def get_actor_critic_arch(net_arch: Any) -> tuple[list[int], list[int]]:
+    """Returns the widths of actor and critic: those of a list for both, ``pi`` and ``qf`` of a dict."""
+    each = (net_arch["pi"], net_arch["qf"]) if isinstance(net_arch, Mapping) else (net_arch, net_arch)
+    return [*each[0]], [*each[1]]
 
 
 class Prepared(eqx.Module):

@@ -7,7 +7,8 @@ import os
 import platform
 import random
 import re
-from collections.abc import Iterable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -29,6 +30,7 @@ __all__ = [
     "Tensor",
     "check_for_correct_spaces",
     "check_shape_equal",
+    "configure_logger",
     "constant_fn",
     "explained_variance",
     "get_device",
@@ -43,6 +45,7 @@ __all__ = [
     "safe_mean",
     "set_random_seed",
     "should_collect_more_steps",
+    "update_learning_rate",
     "zip_strict",
 ]
 
@@ -168,12 +171,19 @@ def get_device(device: Any = "auto") -> Device:
 
 
 class Tensor(np.ndarray):
-    """A NumPy array with the methods of PyTorch's tensors that scripts end their expressions with."""
+    """A NumPy array with the methods of PyTorch's tensors that scripts end their expressions with.
+
+    Scripts that import PyTorch can give it to PyTorch's functions, which return tensors of theirs.
+    """
 
     @classmethod
     def of(cls, array: Any) -> Tensor:
         """Returns an array, or a JAX array, as one of this class."""
         return np.asarray(array).view(cls)
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        """Returns results as arrays of this class, also a mean or a sum of all values."""
+        return np.asarray(array).view(type(self))
 
     @property
     def device(self) -> Device:  # type: ignore[override]
@@ -196,6 +206,29 @@ class Tensor(np.ndarray):
         """Returns itself."""
         return self
 
+    def mean(self, axis: Any = None, *args: Any, dim: Any = None, **kwargs: Any) -> Any:
+        """Returns means over an axis, which PyTorch calls ``dim``."""
+        return super().mean(axis if dim is None else dim, *args, **kwargs)
+
+    def sum(self, axis: Any = None, *args: Any, dim: Any = None, **kwargs: Any) -> Any:
+        """Returns sums over an axis, which PyTorch calls ``dim``."""
+        return super().sum(axis if dim is None else dim, *args, **kwargs)
+
+    def clone(self) -> Tensor:
+        """Returns a copy."""
+        return self.copy()
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Returns what a function of PyTorch's does, which calls this where an argument is of this class."""
+        torch = sys.modules["torch"]
+        given = jax.tree.map(
+            lambda x: torch.as_tensor(np.asarray(x)) if isinstance(x, cls) else x, (args, kwargs or {})
+        )
+        return function(*given[0], **given[1])
+
 
 def explained_variance(y_pred: np.ndarray, y_true: np.ndarray) -> float:
     """Returns ``1 - Var(y_true - y_pred) / Var(y_true)``, NaN if ``y_true`` is constant."""
@@ -210,6 +243,25 @@ def get_latest_run_id(log_path: str | Path = "", log_name: str = "") -> int:
         name.fullmatch(os.path.basename(path)) for path in glob.glob(os.path.join(glob.escape(str(log_path)), "*"))
     )
     return max((int(match[1]) for match in found if match), default=0)
+
+
+def configure_logger(
+    verbose: int = 0, tensorboard_log: str | Path | None = None, tb_log_name: str = "", reset_num_timesteps: bool = True
+) -> Any:
+    """Returns the logger of an agent with these arguments; a run that continues keeps its folder."""
+    from rejeu.sb3.common import logger as loggers  # which needs what callbacks do
+
+    folder, kinds = os.getenv("SB3_LOGDIR"), ["stdout"] * (verbose >= 1)
+    if tensorboard_log is not None:
+        k = get_latest_run_id(tensorboard_log, tb_log_name) + reset_num_timesteps
+        folder, kinds = str(Path(tensorboard_log) / f"{tb_log_name}_{max(k, 1)}"), [*kinds, "tensorboard"]
+    return loggers.Logger(folder, [loggers.make_output_format(kind, folder or ".") for kind in kinds])
+
+
+def update_learning_rate(optimizer: Any, learning_rate: float) -> None:
+    """Sets the learning rate of an optimizer of PyTorch's; an agent's is its attribute ``learning_rate``."""
+    for group in optimizer.param_groups:
+        group["lr"] = learning_rate
 
 
 def check_for_correct_spaces(env: Any, observation_space: gym.Space, action_space: gym.Space) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.sb3.common.monitor import Monitor, MonitorFile, keywords_of
+from rejeu.sb3.common.monitor import Monitor, ResultsWriter, keywords_of
 from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper
 
 __all__ = ["VecMonitor"]
@@ -33,8 +33,8 @@ class VecMonitor(VecEnvWrapper):
         self.episode_count = 0
         self.episode_returns = np.zeros(self.num_envs)
         self.episode_lengths = np.zeros(self.num_envs, np.int64)
-        columns, start = ("r", "l", "t", *self.info_keywords), {"t_start": self.t_start, "env_id": None}
-        self._file = None if filename is None else MonitorFile(filename, columns, start)
+        start = {"t_start": self.t_start, "env_id": None}
+        self._file = None if filename is None else ResultsWriter(filename, start, self.info_keywords)
         self.path = None if self._file is None else self._file.path
 
     def close(self) -> None:
@@ -63,5 +63,5 @@ class VecMonitor(VecEnvWrapper):
         self.episode_count += 1
         self.episode_returns[i] = self.episode_lengths[i] = 0
         if self._file is not None:
-            self._file.append(row)
+            self._file.write_row(row)
         return row
