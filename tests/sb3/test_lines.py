@@ -318,6 +318,18 @@ def test_observations_are_prepared_by_their_spaces():
     assert not is_image_space(spaces.Box(0, 1, (36, 36, 3)))
 
 
+def test_random_actions_of_dqn_follow_the_seed_and_steps_can_be_set():
+    obs, actions = np.zeros(4, np.float32), []
+    for _ in range(2):
+        model = sb3.DQN("MlpPolicy", "CartPole-v1", seed=3, **SMALL)
+        model.exploration_rate = 0.9
+        actions.append([int(model.predict(obs)[0]) for _ in range(30)])
+    assert actions[0] == actions[1]
+    assert {*actions[0]} == {0, 1}
+    model.num_timesteps = 500
+    assert model.learn(4, reset_num_timesteps=False).num_timesteps == 504
+
+
 def test_small_functions(tmp_path):
     assert base_class.maybe_make_env("CartPole-v1").spec.id == "CartPole-v1"
     assert torch_layers.get_actor_critic_arch([8, 4]) == ([8, 4], [8, 4])

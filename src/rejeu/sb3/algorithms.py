@@ -170,7 +170,7 @@ class Original(Agent):
     """Whether :meth:`set_logger` was called."""
     policy_object: BasePolicy | None = None
     """What ``policy`` returns."""
-    STORED: ClassVar[tuple[str, ...]] = ("replay_buffer", "policy", "exploration_rate")
+    STORED: ClassVar[tuple[str, ...]] = ("replay_buffer", "policy", "exploration_rate", "num_timesteps")
     """Properties that can be set."""
 
     def __init__(self, policy: Any, env: Any, *args: Any, **settings: Any) -> None:
@@ -465,6 +465,15 @@ class Original(Agent):
         return super().make_noise()  # type: ignore[safe-super]
 
     @property
+    def num_timesteps(self) -> int:
+        """Environment steps so far, over all environments."""
+        return super().num_timesteps
+
+    @num_timesteps.setter
+    def num_timesteps(self, value: int) -> None:
+        self.run.step = self.reset_step + int(value)
+
+    @property
     def _last_obs(self) -> Any:
         return self.run.obs
 
@@ -530,6 +539,7 @@ class Original(Agent):
             each = (
                 [None] * np.size(action) if masks is None else np.asarray(masks, np.int8).reshape(np.size(action), -1)
             )
+            self.action_space.seed(int(self.run.rng.integers(2**31)))
             sampled = [self.action_space.sample(mask) for mask in each]
             action = np.asarray(sampled, action.dtype).reshape(np.shape(action))
         return action if isinstance(action, dict | tuple) else np.asarray(action), memory
