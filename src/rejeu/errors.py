@@ -9,8 +9,9 @@ from pathlib import Path
 class MissingExtra(ImportError):
     """An optional package is not installed. The message contains the command that installs it."""
 
-    def __init__(self, purpose: str, package: str, extra: str) -> None:
-        super().__init__(f'{purpose} needs {package}, which is not installed; run: pip install "rejeu[{extra}]"')
+    def __init__(self, purpose: str, package: str, extra: str = "") -> None:
+        needed = f'"rejeu[{extra}]"' if extra else package
+        super().__init__(f"{purpose} needs {package}, which is not installed; run: pip install {needed}")
 
 
 class CheckpointError(ValueError):

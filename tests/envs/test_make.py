@@ -401,6 +401,59 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(monkeypatc
         make_env("FetchReach-v99")
 
 
+@pytest.mark.parametrize(
+    ("env_id", "words"),
+    [
+        (
+            "dm_control/cartpole-balance-v0",
+            r'package shimmy, which is not installed: pip install "shimmy\[dm-control\]"$',
+        ),
+        ("PandaReach-v3", "package panda_gym, which is not installed: pip install panda-gym$"),
+        ("Meta-World/MT1", "pip install metaworld$"),
+        ("MiniGrid-Empty-5x5-v0", "pip install minigrid; EnvPool has MiniGrid-Empty-5x5-v0: backend='envpool'"),
+    ],
+)
+def test_an_environment_of_a_package_without_extra_is_named_with_that_package(monkeypatch, env_id, words):
+    import importlib.util
+
+    real, absent = importlib.util.find_spec, ("shimmy", "panda_gym", "metaworld", "minigrid")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
+    with pytest.raises(ValueError, match=words):
+        make_env(env_id)
+
+
+def test_minigrid_of_envpool_needs_no_package():
+    assert make_vector("MiniGrid-Empty-5x5-v0", 4).backend == "envpool"
+
+
+@pytest.mark.parametrize("env_id", ["phys2d/CartPole-v1", "tabular/CliffWalking-v0"])
+def test_a_module_that_gymnasium_misses_is_named(monkeypatch, env_id):
+    monkeypatch.setitem(sys.modules, "flax", None)
+    with pytest.raises(MissingExtra, match=rf"the environment {env_id} needs flax, .*; run: pip install flax$"):
+        make_env(env_id)
+
+
+def test_robots_can_be_made_with_enumerations_that_equal_no_numpy_integer(monkeypatch):
+    """As in MuJoCo 3.12 and later."""
+    mujoco = pytest.importorskip("mujoco")
+    utils = pytest.importorskip("gymnasium_robotics.utils.mujoco_utils")
+
+    class Kind(int):
+        __eq__ = lambda self, other: type(other) is Kind and int(self) == int(other)  # noqa: E731
+        __hash__ = int.__hash__
+
+    class Kinds:
+        __members__ = {name: Kind(kind) for name, kind in mujoco.mjtJoint.__members__.items()}
+
+    for name, kind in Kinds.__members__.items():
+        setattr(Kinds, name, kind)
+    monkeypatch.setattr(mujoco, "mjtJoint", Kinds)
+    monkeypatch.setattr(utils, "mujoco", mujoco)
+    env = make_env("FetchReach-v4")
+    assert env.reset(seed=0)[0]["achieved_goal"].shape == (3,)
+    env.close()
+
+
 def test_a_dependency_that_gymnasium_misses_is_named_likewise(monkeypatch):
     def make(*args, **kwargs):
         raise gym.error.DependencyNotInstalled("Box2D is not installed, run `pip install swig`")

@@ -352,7 +352,8 @@ def envpool_knows(env_id: str) -> bool:
     """
     if not in_envpool(env_id) or (env_id not in gym.registry and newer_version(env_id) is not None):
         return False
-    needs_package_for_goals = provider(env_id) is not None and env_id != "parking-v0"
+    source = provider(env_id)
+    needs_package_for_goals = source is not None and source.extra and env_id != "parking-v0"
     return not needs_package_for_goals or register(env_id)
 
 

@@ -8,6 +8,7 @@ import importlib.util
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -48,6 +49,10 @@ PROVIDERS: dict[tuple[str, ...], Provider] = {
     ("Fetch", "Hand", "PointMaze", "AntMaze", "Adroit", "FrankaKitchen"): Provider(
         "gymnasium_robotics", "gymnasium-robotics", "robotics"
     ),
+    ("MiniGrid-", "BabyAI-"): Provider("minigrid", "minigrid", ""),
+    ("dm_control/",): Provider("shimmy", '"shimmy[dm-control]"', ""),
+    ("Meta-World/",): Provider("metaworld", "metaworld", ""),
+    ("Panda",): Provider("panda_gym", "panda-gym", ""),
 }  # fmt: skip
 """Packages that register environments, by the prefixes of their ids."""
 
@@ -74,7 +79,16 @@ def register(env_id: str) -> bool:
         module = importlib.import_module(source.module)
         if source.module == "gymnasium_robotics":
             gym.register_envs(module)
+            _compare_joints()
     return env_id in gym.registry or ":" in env_id
+
+
+def _compare_joints() -> None:
+    """Lets Gymnasium-Robotics tell kinds of joints, which equal no NumPy integer any more in MuJoCo 3.12 and later."""
+    mujoco = importlib.import_module("mujoco")
+    kinds = SimpleNamespace(**{name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()})
+    utils = importlib.import_module("gymnasium_robotics.utils.mujoco_utils")
+    utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": kinds})  # type: ignore[attr-defined]
 
 
 def _without_notice(module: str) -> None:
@@ -133,6 +147,8 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         missing = need is not None and importlib.util.find_spec(need.module) is None
         if need and missing and isinstance(error, gym.error.DependencyNotInstalled):
             raise MissingExtra(f"the environment {env_id}", need.package, need.extra) from None
+        if isinstance(error, ModuleNotFoundError) and error.name == "flax":
+            raise MissingExtra(f"the environment {env_id}", "flax") from None
         if newer := newer_version(env_id):
             raise ValueError(
                 f"{env_id} is an old version that cannot be made any more ({error}); use {newer}"
@@ -167,6 +183,10 @@ def unknown_environment(env_id: str) -> str:
         return f"{env_id} is of the package ale-py{old}, which is not installed: pip install ale-py{also}"
     if newer := newer_version(env_id):
         return f"{env_id} is an old version that Gymnasium no longer has; use {newer}"
+    source = provider(env_id)
+    if source is not None and importlib.util.find_spec(source.module) is None:
+        text = f"{env_id} is of the package {source.module}, which is not installed: pip install {source.package}"
+        return "; ".join(filter(None, (text, elsewhere)))
     if elsewhere:
         return f"Gymnasium has no {env_id}, so it cannot be drawn or stepped by Gymnasium; {elsewhere}"
     known = {*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"}
