@@ -459,6 +459,7 @@ def test_a_dependency_that_gymnasium_misses_is_named_likewise(monkeypatch):
         raise gym.error.DependencyNotInstalled("Box2D is not installed, run `pip install swig`")
 
     monkeypatch.setattr(gym, "make", make)
+    monkeypatch.setitem(sys.modules, "Box2D", None)
     with pytest.raises(MissingExtra, match=r'pip install "rejeu\[box2d\]"'):
         make_env("LunarLander-v3")
 

@@ -61,6 +61,7 @@ NEEDS = {
     "box2d": Provider("Box2D", "box2d", "box2d"),
     "mujoco": Provider("mujoco", "mujoco", "mujoco"),
     "pygame": Provider("pygame", "pygame", "parking"),
+    "flax": Provider("flax", "flax", ""),
 }
 """Packages that Gymnasium's own environments import when they are made."""
 
@@ -145,10 +146,8 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     except (gym.error.DeprecatedEnv, gym.error.DependencyNotInstalled, ImportError) as error:
         need = next((p for name, p in NEEDS.items() if name in str(error)), None)
         missing = need is not None and importlib.util.find_spec(need.module) is None
-        if need and missing and isinstance(error, gym.error.DependencyNotInstalled):
+        if need and missing and isinstance(error, gym.error.DependencyNotInstalled | ModuleNotFoundError):
             raise MissingExtra(f"the environment {env_id}", need.package, need.extra) from None
-        if isinstance(error, ModuleNotFoundError) and error.name == "flax":
-            raise MissingExtra(f"the environment {env_id}", "flax") from None
         if newer := newer_version(env_id):
             raise ValueError(
                 f"{env_id} is an old version that cannot be made any more ({error}); use {newer}"
