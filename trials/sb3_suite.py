@@ -7,7 +7,8 @@ repository. ``SITE_PACKAGES`` is searched last, for what rejeu does not need and
 runs in a process of its own. The counts, and each failed test with its kind, are written to
 ``trials/results/sb3_suite.json``; with ``--log`` the output of pytest to that folder. ``--original`` runs the tests against
 Stable-Baselines3 itself, in an interpreter that has it, so that the result says how many tests a file has; of a file that
-cannot be imported all count as failed. The kinds:
+cannot be imported all count as failed. ``--only`` runs some files and keeps the results of the others, ``--join`` takes those
+of other runs over, and each file has the commit that it ran with. The kinds:
 
 - ``tensor``: something of rejeu's was given to PyTorch, or a PyTorch module or optimizer to rejeu.
 - ``name``: a module, attribute or argument is missing.
@@ -113,7 +114,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the tests")
     parser.add_argument("--packages", nargs="*", default=[], help="folders of packages that are searched last")
-    parser.add_argument("--only", nargs="+", help="names of files")
+    parser.add_argument("--only", nargs="*", help="names of files")
+    parser.add_argument("--join", nargs="*", type=Path, default=[], help="other results whose files are taken over")
     parser.add_argument("--limit", type=float, default=1200, help="seconds that a file may take")
     parser.add_argument("--original", action="store_true", help="run them against Stable-Baselines3")
     parser.add_argument("--log", type=Path, help="folder for the output of pytest")
@@ -124,7 +126,8 @@ def main() -> None:
     earlier = json.loads(arguments.output.read_text(encoding="utf-8")) if arguments.output.is_file() else {}
     original = earlier.get("original", [])
     tests = {row["file"]: row["passed"] + row["failed"] for row in original}
-    rows: list[dict[str, Any]] = []
+    joined = [row for path in arguments.join for row in json.loads(path.read_text(encoding="utf-8"))["files"]]
+    rows: list[dict[str, Any]] = [*{row["file"]: row for row in joined}.values()]
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "tests"
         shutil.copytree(arguments.folder, folder)
@@ -134,7 +137,8 @@ def main() -> None:
                 text = re.sub(old, new, text)
             path.write_text(text, encoding="utf-8")
         (folder / "conftest.py").write_text(CONFTEST.format(packages=arguments.packages))
-        names = arguments.only or sorted(path.name for path in folder.glob("test_*.py"))
+        every = sorted(path.name for path in folder.glob("test_*.py"))
+        names = every if arguments.only is None else arguments.only
         for name in names:
             rows.append(
                 run_file(folder, name, arguments.limit, arguments.log, tests.get(name, 1)) | {"commit": commit()}
@@ -142,6 +146,7 @@ def main() -> None:
             print({key: value for key, value in rows[-1].items() if key != "failures"}, flush=True)
     print(total_of(rows))
     names = {str(arguments.folder): "FOLDER", str(arguments.log): "LOG", str(arguments.output): "OUTPUT"}
+    names |= {str(path): "RESULTS" for path in arguments.join}
     names |= dict.fromkeys(arguments.packages, "SITE_PACKAGES")
     if arguments.original:
         counted = [{key: row[key] for key in ("file", "passed", "failed", "skipped")} for row in rows]

@@ -85,7 +85,7 @@ def test_a_plain_replay_buffer_has_no_hindsight(given):
         ({"batch_size": "64"}, "batch_size='64' must be a whole number"),
         ({"buffer_size": float("inf")}, "buffer_size=inf must be a whole number"),
         ({"learning_starts": -1}, "learning_starts=-1 must be a whole number of at least 0"),
-        ({"tau": 0}, "tau=0 must be a finite number, above 0 and at most 1"),
+        ({"tau": -0.1}, "tau=-0.1 must be a finite number, at least 0 and at most 1"),
         ({"tau": 1.1}, "tau=1.1 must be a finite number"),
         ({"gamma": float("nan")}, "gamma=nan must be a finite number, at least 0 and at most 1"),
         ({"gamma": -0.1}, "gamma=-0.1 must be"),

@@ -111,7 +111,10 @@ def test_a_study_of_which_a_trial_cannot_be_started_goes_on_later(pretend, tmp_p
         (["tune", "Pendulum-v9", "--algo", "SAC"], "Pendulum"),
         (["tune", "Pendulum-v1", "--only", "gama"], "has no setting 'gama'; did you mean gamma?"),
         (["tune", "Pendulum-v1", "--search", "gamma=0.9..0.8"], "--search gamma: the range from 0.9 to 0.8 is empty"),
-        (["tune", "Pendulum-v1", "--search", "tau=0.1..7.0"], "tau=7.0 must be a finite number, above 0 and at most 1"),
+        (
+            ["tune", "Pendulum-v1", "--search", "tau=0.1..7.0"],
+            "tau=7.0 must be a finite number, at least 0 and at most 1",
+        ),
         (["tune", "Pendulum-v1", "--set", "gama=0.9"], "SAC has no setting 'gama'"),
         (["tune", "Pendulum-v1", "--trials", "0"], "--trials=0 must be a whole number of at least 1"),
         (["tune", "Pendulum-v1", "--pruner", "x"], "--pruner 'x' must be one of median, halving, none"),

@@ -55,7 +55,7 @@ def test_hindsight_is_searched_where_it_is_used():
         (
             {"search": {"tau": LogUniform(0.1, 9.0)}},
             ValueError,
-            "tau=9.0 must be a finite number, above 0 and at most 1",
+            "tau=9.0 must be a finite number, at least 0 and at most 1",
         ),
         ({"fixed": {"lr": 1}}, TypeError, "the step size is called learning_rate"),
         ({"trials": 0}, ValueError, "trials=0"),

@@ -109,6 +109,15 @@ def test_nothing_is_learned_without_gradient_steps():
     assert all((array == before[name]).all() for name, array in still.get_parameters().items())
 
 
+def test_targets_stay_with_a_tau_of_zero():
+    fixed = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=4, batch_size=4, tau=0, seed=0, **SMALL)
+    before = fixed.get_parameters()
+    after = fixed.learn(12).get_parameters()
+    same = {name for name in before if (before[name] == after[name]).all()}
+    assert {name for name in before if name.startswith("target_critics")} <= same
+    assert not any(name.startswith("critics.") and name.endswith("weight") for name in same)
+
+
 def test_files_leave_out_and_contain_what_save_is_told(tmp_path):
     model = sb3.PPO("MlpPolicy", "CartPole-v1", verbose=2, gamma=0.5, ent_coef=0.1, **SMALL)
     model.note = {"trained by": "me", "scores": [1, 2.5]}

@@ -152,7 +152,7 @@ class OffPolicyConfig(AlgorithmConfig):
     """Transitions per gradient step, drawn with replacement. Larger batches reduce the variance of the gradient at a higher
     cost."""
     tau: float = 0.005
-    """Coefficient of the soft update of the target network (Polyak averaging), in (0, 1]."""
+    """Coefficient of the soft update of the target network (Polyak averaging), in [0, 1]; 0 never moves it."""
     train_freq: int | tuple[int, Literal["step", "episode"]] = 1
     """Update every ``train_freq`` environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
     environments together."""
@@ -200,7 +200,7 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, ("buffer_size", "batch_size", "n_steps"), whole, least=1, most=MOST_ROWS)
         coerce(self, "frame_stack", whole, least=1, optional=True)
         coerce(self, "learning_starts", whole, least=0)
-        coerce(self, "tau", number, above=0, most=1)
+        coerce(self, "tau", number, least=0, most=1)
         coerce(self, "train_freq", train_freq)
         coerce(self, "gradient_steps", whole, least=-1)
         coerce(self, "overlap", flag)
