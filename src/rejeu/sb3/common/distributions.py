@@ -190,15 +190,17 @@ class TanhBijector:
         return Tensor.of(np.log(1.0 - np.square(np.tanh(np.asarray(x))) + self.epsilon))
 
 
-class CategoricalDistribution(Distribution):
-    """One choice among ``action_dim``."""
+class LogitsDistribution(Distribution):
+    """A distribution that ``action_dim`` logits determine. Abstract."""
+
+    kind: Any
 
     def __init__(self, action_dim: int) -> None:
         super().__init__()
         self.action_dim = action_dim
 
     def _made(self, logits: Any) -> Any:
-        return Categorical(logits)
+        return self.kind(logits)
 
     def proba_distribution_net(self, latent_dim: int) -> eqx.Module:
         """Returns a linear layer for the logits."""
@@ -216,7 +218,13 @@ class CategoricalDistribution(Distribution):
         self.distribution = self._made(forbid(self.logits, allowed))
 
 
-class MultiCategoricalDistribution(CategoricalDistribution):
+class CategoricalDistribution(LogitsDistribution):
+    """One choice among ``action_dim``."""
+
+    kind = Categorical
+
+
+class MultiCategoricalDistribution(LogitsDistribution):
     """Several choices, each among its own number."""
 
     def __init__(self, action_dims: Sequence[int]) -> None:
@@ -228,11 +236,10 @@ class MultiCategoricalDistribution(CategoricalDistribution):
         return MultiCategorical(tuple(Categorical(part) for part in jnp.split(logits, ends, axis=-1)))
 
 
-class BernoulliDistribution(CategoricalDistribution):
+class BernoulliDistribution(LogitsDistribution):
     """Independent bits."""
 
-    def _made(self, logits: Any) -> Any:
-        return Bernoulli(logits)
+    kind = Bernoulli
 
     def apply_masking(self, masks: Any) -> None:
         """Forbids values, two for each bit: 0 and 1; or allows all with None."""
