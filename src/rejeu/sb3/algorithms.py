@@ -89,6 +89,8 @@ NEUTRAL: dict[str, tuple[Any, ...]] = {
     "enable_critic_lstm": (True,),
 }
 """Settings that some algorithms do not have, with the values that they would have there."""
+RUN = {"_last_obs": "obs", "_last_episode_starts": "ended", "_n_updates": "n_updates", "_episode_num": "episode"}
+"""Attributes of a run by the names that scripts read of an agent."""
 OPTIMIZERS: dict[str, dict[str, Any]] = {
     "Adam": {"name": "adam"},
     "AdamW": {"name": "adamw"},
@@ -330,6 +332,10 @@ class Original(Agent):
             return utils.of_remaining(value) if name in SCHEDULED and callable(value) else value
         if name in policies.NETWORKS:
             return getattr(self.policy, name)
+        if name in RUN:
+            return getattr(self.run, RUN[name])
+        if name in ("_logger", "_vec_normalize_env"):
+            return self.logger if name == "_logger" else self.get_vec_normalize_env()
         if name in ("log_ent_coef", "ent_coef_tensor") and hasattr(self.learner.shapes, "log_alpha"):
             log_alpha = np.asarray(self.state.log_alpha)
             if name == "log_ent_coef":
@@ -474,33 +480,9 @@ class Original(Agent):
         self.run.step = self.reset_step + int(value)
 
     @property
-    def _last_obs(self) -> Any:
-        return self.run.obs
-
-    @property
-    def _last_episode_starts(self) -> np.ndarray:
-        return self.run.ended
-
-    @property
-    def _n_updates(self) -> int:
-        return self.run.n_updates
-
-    @property
-    def _episode_num(self) -> int:
-        return self.run.episode
-
-    @property
-    def _vec_normalize_env(self) -> Any:
-        return self.get_vec_normalize_env()
-
-    @property
     def _current_progress_remaining(self) -> float:
         call = self.training_call
         return 1.0 if call is None else 1.0 - float(call.progress(self.run.step, self.run.episode))
-
-    @property
-    def _logger(self) -> Any:
-        return self.logger
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seeds Python, NumPy, the batches and the next reset of the environments; None does nothing."""
