@@ -47,8 +47,6 @@ PAGES = [
     *(page for name in ("benchmarks", "docs", "trials") for page in sorted((ROOT / name).rglob("*.md"))),
 ]
 BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
-CURVE_WINDOW = 20
-"""Episodes over which ``benchmarks/curves.py`` averages."""
 SHARED = (
     (ppo.Config, "PPO", "ppo.md#hyperparameters"),
     (sac.Config, "SAC", "sac.md#hyperparameters"),
@@ -133,7 +131,7 @@ def learned(folder: str) -> str:
                 ", ".join(filter(None, (result.env_id, result.setting))),
                 result.algorithm,
                 result.budget.removesuffix(" steps"),
-                f"{result.measure} {result.figures}",
+                result.figures,
                 "; ".join(others),
                 str(result.seeds),
                 content["commit"],
@@ -158,9 +156,8 @@ def curve(algorithm: str) -> str:
     data = load(f"curves/{algorithm}.json")
     last = [values[-1] for values in data["returns"]]
     return (
-        f"The last {CURVE_WINDOW} training episodes of the {len(last)} seeds have a mean return of "
-        f"{sum(last) / len(last):.1f} ({min(last):.1f} to\n{max(last):.1f}) on {data['env'].removeprefix('rejeu/')} after "
-        f"{data['steps'][-1]:,} steps."
+        f"{data['env'].removeprefix('rejeu/')}, {len(last)} seeds: at the end a mean return of {sum(last) / len(last):.1f} "
+        f"({min(last):.1f} to {max(last):.1f}) in training."
     )
 
 
