@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 import rejeu
 from rejeu.envs.ball import Ball
+from rejeu.envs.ball_drawing import BallDrawing
 from rejeu.errors import MissingExtra
 
 NOTHING = np.zeros(2, np.float32)
@@ -169,7 +170,7 @@ def test_picture_shows_the_ball_where_it_is(dimension):
     height, width, channels = frame.shape
     assert channels == 3
     assert height % 2 == width % 2 == 0  # for videos
-    drawing = ball._drawing
+    drawing = BallDrawing(dimension, 500, "rgb_array")
     place = drawing.main.place
     x, y = drawing.main.points(np.array([ball.position]), 0)[0]
     patch = frame[round(y) - 5 : round(y) + 6, max(round(x) - 5, 0) : round(x) + 6].astype(int)
@@ -211,7 +212,7 @@ def test_in_three_dimensions_the_third_coordinate_is_drawn_where_it_is():
     balls = [placed(1.0, 2.0, third, render_mode="rgb_array") for third in (0.0, -5.0)]
     middle, low = (ball.render().astype(int) for ball in balls)
     assert middle.shape[0] % 2 == middle.shape[1] % 2 == 0  # for videos
-    drawing = balls[0]._drawing
+    drawing = BallDrawing(3, 500, "rgb_array")
     plane, (_, second, third) = round(drawing.main.right), drawing.strips
     assert (middle[:, :plane] == low[:, :plane]).all()
     assert (middle[: int(second.bottom)] == low[: int(second.bottom)]).all()
@@ -236,8 +237,9 @@ def test_many_dimensions_are_drawn_as_the_first_ten_beside_the_plane():
     pytest.importorskip("pygame")
     ball = placed(*[0.0] * 14, render_mode="rgb_array")
     assert ball.render().shape == (666, 940, 3)
-    assert len(ball._drawing.strips) == 10
-    assert ball._drawing.strips[-1].bottom == pytest.approx(ball._drawing.main.bottom)
+    drawing = BallDrawing(14, 500, "rgb_array")
+    assert len(drawing.strips) == 10
+    assert drawing.strips[-1].bottom == pytest.approx(drawing.main.bottom)
 
 
 def test_drawing_without_pygame_names_the_extra(monkeypatch):

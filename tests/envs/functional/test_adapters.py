@@ -94,10 +94,10 @@ def test_gymnaxs_own_cart_pole_is_ours():
     gymnax = pytest.importorskip("gymnax")
     env = from_gymnax(*gymnax.make("CartPole-v1"))
     vector = rejeu.make_vector(env, 3)
-    vector.reset(seed=0)
+    obs = vector.reset(seed=0)
     own = cart_pole.CartPole()
     for i in range(30):
-        state = jnp.asarray(vector._obs)
+        state = jnp.asarray(obs)
         action = np.array([i % 2, 0, 1])
         step = vector.step(action)
         ours = jax.vmap(own.step, (None, 0, 0))(
@@ -105,8 +105,7 @@ def test_gymnaxs_own_cart_pole_is_ours():
         )
         np.testing.assert_allclose(step.obs, ours[1], atol=1e-5)
         np.testing.assert_array_equal(step.terminated, ours[3])
-        if step.terminated.any():
-            vector.reset_done(step.terminated)
+        obs = vector.reset_done(step.terminated) if step.terminated.any() else step.obs
     with jax.numpy_rank_promotion("allow"):
         for env_id in set(gymnax.registered_envs) - {"MNISTBandit-bsuite"}:  # which downloads images
             vector = rejeu.make_vector(from_gymnax(*gymnax.make(env_id)), 2, seed=0)
