@@ -26,6 +26,8 @@ from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac
 from tests.tiers import crossed
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 ENDING = [name for name, fault in EVERY.items() if fault.trained is not None]
 GOING_ON = [name for name, fault in EVERY.items() if fault.trained is None]
 SEEN = r"(environment 0, (step 3|the first reset)|in environment 0 after [24] steps)"
