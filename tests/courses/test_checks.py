@@ -9,7 +9,7 @@ import pytest
 
 import rejeu
 from rejeu.courses import checks
-from rejeu.courses.checks import base, box, dqn_ppo, goals
+from rejeu.courses.checks import box, dqn_ppo, goals
 from tests.bit_flipping import BitFlipping
 from tests.courses import box_answers, dqn_ppo_answers, goals_answers
 
@@ -70,7 +70,7 @@ def test_a_typical_mistake_is_named(check, wrong, message, capsys):
 
 @pytest.mark.parametrize("course", ["base", "dqn_ppo", "box", "goals"])
 def test_messages_are_in_both_languages_with_the_same_values(course):
-    for exercise in base.messages(course).values():
+    for exercise in checks.messages(course).values():
         for name, message in exercise.items():
             if name in ("case", "where", "right", "each", "compiles"):
                 continue

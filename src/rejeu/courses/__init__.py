@@ -5,7 +5,7 @@
 
 from typing import Any
 
-from rejeu.courses.checks.base import SESSION
+from rejeu.courses.checks import SESSION
 from rejeu.courses.notebooks import LANGUAGES, Language, Version, minutes, notebook, sources, steps, text, write
 from rejeu.errors import MissingExtra
 

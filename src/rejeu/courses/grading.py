@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rejeu.courses.checks import base
+from rejeu.courses import checks
 from rejeu.courses.notebooks import jupytext
 
 SECONDS = 120.0
@@ -55,7 +55,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
     try:
         cells = [cell.source for cell in jupytext().read(path).cells if cell.cell_type == "code"]
     except Exception as error:  # jupytext and nbformat raise errors of many kinds
-        return Grade(path, {}, f"it is not a notebook ({base.short(error)})")
+        return Grade(path, {}, f"it is not a notebook ({checks.short(error)})")
     names = [name for cell in cells for name in _checks(cell)]
     if not names:
         return Grade(path, {}, "it has no checks of a course")
@@ -75,7 +75,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
     except subprocess.TimeoutExpired:
         return Grade(path, dict.fromkeys(names), f"it took longer than {seconds:g} seconds")
     except (IndexError, ValueError):
-        return Grade(path, dict.fromkeys(names), f"its process ended ({base.short(done.stderr[-160:])})")
+        return Grade(path, dict.fromkeys(names), f"its process ended ({checks.short(done.stderr[-160:])})")
     return Grade(path, {name: found.get(name) for name in names})
 
 
@@ -84,7 +84,7 @@ def main() -> None:
     cells = json.load(sys.stdin)
     with contextlib.redirect_stdout(io.StringIO()):
         execute(cells)
-    print(json.dumps(base.SESSION.found), flush=True)
+    print(json.dumps(checks.SESSION.found), flush=True)
     os._exit(0)  # whatever a notebook has started ends here
 
 

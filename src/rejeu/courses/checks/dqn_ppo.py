@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rejeu.core import Transition
-from rejeu.courses.checks.base import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers, tabulated
+from rejeu.courses.checks import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers, tabulated
 
 globals().update(tabulated(__name__))
 

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import SAC
-from rejeu.courses.checks.base import Wrong, call, close, diagnose, exercise, mistakes, numbers, tabulated
+from rejeu.courses.checks import Wrong, call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 N = 4_000
 """Draws of a strategy, enough that every time occurs."""
