@@ -270,6 +270,21 @@ def test_a_row_is_logged_every_so_many_steps(tmp_path):
     model.logger.close()
 
 
+class Kept(loggers.Logger):
+    """A logger that keeps the values of the last row."""
+
+    def dump(self, step=0):
+        pass
+
+
+def test_a_logger_that_keeps_values_gets_those_of_the_last_row():
+    model = sb3.DQN("MlpPolicy", envs.IdentityEnv(2, ep_length=5), learning_starts=100, **SMALL)
+    logger = Kept(None, [])
+    model.set_logger(logger)
+    model.learn(40, log_interval=1)
+    assert logger.name_to_value["time/total_timesteps"] == 40
+
+
 class Console(gym.Env):
     """Has what Atari wrappers ask a game: lives, the meanings of actions, frames."""
 

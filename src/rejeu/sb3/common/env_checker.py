@@ -69,16 +69,15 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
 def unsupported_observations(space: spaces.Space, path: str = "") -> Iterator[str]:
     """Yields why agents of Stable-Baselines3 cannot learn from observations."""
     where = f" under {path!r}" if path else ""
-    for kind in (spaces.Graph, spaces.Sequence, spaces.OneOf, spaces.Text):
-        if isinstance(space, kind):
-            yield f"{kind.__name__} observation space{where} is not supported: it has no fixed size"
+    if isinstance(space, spaces.Graph | spaces.Sequence | spaces.OneOf | spaces.Text):
+        yield f"{type(space).__name__} observation space{where} is not supported: it has no fixed size"
     if isinstance(space, spaces.Tuple):
         yield f"Tuple observation space{where} is not supported by Stable-Baselines3; rejeu takes it"
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        parts = [*(space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces))]
         if any(isinstance(part, spaces.Dict | spaces.Tuple) for _, part in parts):
             yield "Nested observation spaces are not supported by Stable-Baselines3; rejeu takes them"
-        for key, part in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
+        for key, part in parts:
             yield from unsupported_observations(part, f"{path}.{key}".lstrip("."))
 
 

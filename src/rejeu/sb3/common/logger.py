@@ -331,6 +331,7 @@ class _Rows:
         for key, value in metrics.items():
             self.logger.record(key, value, self.logger.exclusions.pop(key, None))
         self.logger.dump(step)
+        self.logger.left = dict(self.logger.name_to_value)
 
     def close(self) -> None:
         """Does nothing: the user closes the logger."""
@@ -351,6 +352,8 @@ class Logger(logging.Logger):
         self.name_to_excluded: dict[str, Any] = {}
         self.exclusions: dict[str, Any] = {}
         """What :meth:`take` took from ``name_to_excluded``."""
+        self.left: dict[str, Any] = {}
+        """Values of the last row that a ``dump`` of one's own did not clear."""
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
         """Records a value for the next row, and replaces an earlier one.
@@ -369,6 +372,9 @@ class Logger(logging.Logger):
 
     def take(self) -> dict[str, Any]:
         """Returns and clears the recorded values."""
+        for key in [key for key, value in self.left.items() if self.name_to_value.get(key) is value]:
+            del self.name_to_value[key]
+        self.left = {}
         self.exclusions, self.name_to_excluded = self.name_to_excluded, {}
         return super().take()
 
