@@ -41,7 +41,7 @@ from trials.provenance import provenance, write
 RESULT = Path(__file__).parent / "results" / "catalog.json"
 STEPS, SECONDS, KNOWN_SECONDS, SEEDED, CHECKED, TRAINED, CUT = 1_000, 15.0, 1.0, 20, 10, 500, 300
 BATCH, LONGEST = 40, 300
-"""Environments of one process, and seconds of one environment after which it counts as hung."""
+"""Environments of one process, and seconds of one environment after which it counts as hung, by default."""
 ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
     "MUJOCO_GL": "disable",
@@ -80,9 +80,17 @@ def made(env_id: str, backend: str = "gymnasium", **kwargs: Any) -> Any:
 
 
 def vector_of(env: Any) -> Any:
+    """Returns two environments of a function, or a vector environment."""
     import rejeu
 
     return rejeu.make_vector(env, 2, seed=0)
+
+
+def grid(env_id: str) -> Any:
+    """Returns an environment of MiniGrid without its mission, which is a text."""
+    from rejeu.envs.registry import make_env
+
+    return import_module("minigrid.wrappers").ImgObsWrapper(make_env(env_id))
 
 
 def registered(package: str) -> dict[str, str]:
@@ -120,7 +128,7 @@ def atari_ids(package: str) -> dict[str, str]:
 def atari_vector(env_id: str) -> Any:
     from gymnasium.vector import AutoresetMode
 
-    name = re.sub(r"(?<!^)(?=[A-Z])", "_", env_id[4:-3]).lower()
+    name = re.sub(r"(?<!^)(?=[A-Z]|3D)", "_", env_id[4:-3]).lower().replace("3_d", "3d")
     make = import_module("ale_py.vector_env").AtariVectorEnv
     return vector_of(make(name, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP))
 
@@ -159,7 +167,9 @@ def groups() -> dict[str, Group]:
         "gymnasium": gymnasium_group("gymnasium", "mujoco"),
         "robotics": gymnasium_group("gymnasium_robotics", "mujoco"),
         "highway": gymnasium_group("highway_env"),
-        "minigrid": gymnasium_group("minigrid"),
+        "minigrid": Group(
+            ("minigrid",), lambda: registered("minigrid"), lambda env_id: vector_of(lambda: grid(env_id)), grid
+        ),
         "ale": gymnasium_group("ale_py")._replace(ids=lambda: atari_ids("ale_py")),
         "dm-control": gymnasium_group("shimmy", "dm-control", "mujoco"),
         "panda": gymnasium_group("panda_gym", "pybullet"),
@@ -423,7 +433,7 @@ def try_batch(name: str, path: Path, env_ids: list[str]) -> None:
         append(path, try_one(group, env_id, read_rows(path)))
 
 
-def run(name: str, folder: Path, minutes: float, only: list[str]) -> None:
+def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]) -> None:
     """Tries the environments of a group that have no row yet."""
     folder.mkdir(parents=True, exist_ok=True)
     path, group = folder / f"{name}.jsonl", groups()[name]
@@ -441,7 +451,7 @@ def run(name: str, folder: Path, minutes: float, only: list[str]) -> None:
                 time.sleep(0.2)
                 if (now := len(read_rows(path))) != n:
                     n, since = now, time.monotonic()
-                if time.monotonic() - since > LONGEST or time.monotonic() > until + LONGEST:
+                if time.monotonic() - since > longest or time.monotonic() > until + longest:
                     is_late = True
                     os.killpg(child.pid, signal.SIGKILL)  # with the programs that environments started
                     child.wait()
@@ -449,7 +459,7 @@ def run(name: str, folder: Path, minutes: float, only: list[str]) -> None:
             last = (errors.read().strip().splitlines() or [""])[-1][:200]
         todo = todo[len(read_rows(path)) - n_before :]
         if child.returncode and todo and todo[0] in batch:
-            why = f"took longer than {LONGEST} s" if is_late else f"crash, exit status {child.returncode}: {last}"
+            why = f"took longer than {longest:g} s" if is_late else f"crash, exit status {child.returncode}: {last}"
             row = {"id": todo[0], "family": families[todo[0]], "failed": "process", "error": why}
             append(path, {**row, "seconds": round(time.monotonic() - since, 1)})
             todo = todo[1:]
@@ -518,12 +528,13 @@ def main() -> None:
     parser.add_argument("group")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--longest", type=float, default=LONGEST, help="seconds of one environment")
     parser.add_argument("--only", nargs="*", default=[])
     given = parser.parse_args()
     if given.action == "collect":
         collect(Path(given.group))
     elif given.action == "run":
-        run(given.group, given.out, given.minutes, given.only)
+        run(given.group, given.out, given.minutes, given.longest, given.only)
     else:
         try_batch(given.group, given.out / f"{given.group}.jsonl", given.only)
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import abc
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from rejeu.envs import checker
 from rejeu.envs.goals import goal_functions, over_batches, parking_reward
 from rejeu.envs.make import GymnasiumVector, InProcess, make_vector
 from tests.environments import Counter, Reach
@@ -127,6 +130,18 @@ class Asymmetric(Reach):
 def test_goal_functions_are_found_beneath_wrappers():
     assert goal_functions(gym.wrappers.TimeLimit(Reach(), 5)).reward is not None
     assert goal_functions(Reach()).terminated is None
+
+
+class Unfinished(Reach):
+    @abc.abstractmethod
+    def compute_terminated(self, achieved, desired, info):
+        raise NotImplementedError
+
+
+def test_an_abstract_method_is_none():
+    """As FrankaKitchen of Gymnasium-Robotics has one."""
+    assert goal_functions(Unfinished()).terminated is None
+    checker.check_env(Unfinished(), warn=False)
 
 
 def test_an_environment_without_compute_reward_has_no_goal_functions():

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 
 from rejeu.envs import validation
+from rejeu.envs.goals import attribute
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain
 
@@ -282,7 +283,8 @@ def goal_findings(env: gym.Env, seen: Sequence[Seen]) -> list[Finding]:
         check_goal_space(env.observation_space)
     except ValueError as error:
         return [Finding("error", str(error))]
-    if not env.has_wrapper_attr("compute_reward"):
+    functions = {name: attribute(env, name) for name in ("compute_reward", "compute_terminated")}
+    if functions["compute_reward"] is None:
         text = (
             "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
             "there is none; add it, for hindsight replay"
@@ -290,8 +292,7 @@ def goal_findings(env: gym.Env, seen: Sequence[Seen]) -> list[Finding]:
         return [Finding("error", text)]
     ended = [one for one in seen if one.terminated][: MOST_GOALS // 4]
     rows = [*seen[:MOST_GOALS], *ended]
-    names = [name for name in ("compute_reward", "compute_terminated") if env.has_wrapper_attr(name)]
-    first = [next(_goal_faults(name, env.get_wrapper_attr(name), rows), None) for name in names]
+    first = [next(_goal_faults(name, one, rows), None) for name, one in functions.items() if one is not None]
     return [Finding(*fault) for fault in first if fault is not None]
 
 

@@ -48,11 +48,12 @@ def goal_functions(env: Any) -> GoalFunctions | None:
 
 
 def attribute(env: Any, name: str) -> Any:
-    """Returns an attribute of an environment or of one of its wrappers, or None if there is none."""
+    """Returns an attribute of an environment or of one of its wrappers, or None if there is none, or an abstract method."""
     try:
-        return env.get_wrapper_attr(name)
+        found = env.get_wrapper_attr(name)
     except AttributeError:
         return None
+    return None if getattr(found, "__isabstractmethod__", False) else found
 
 
 def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.ndarray]:
