@@ -17,7 +17,7 @@ from rejeu.envs import checker
 from rejeu.envs.checker import findings
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
-from rejeu.envs.workers import local
+from rejeu.envs.workers import pool
 from rejeu.errors import BadEnvironmentError
 from rejeu.loops import checks
 from rejeu.loops.checks import check_finite
@@ -25,8 +25,6 @@ from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
 from tests.helpers import small_sac
 from tests.tiers import crossed
-
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 ENDING = [name for name, fault in EVERY.items() if fault.trained is not None]
 GOING_ON = [name for name, fault in EVERY.items() if fault.trained is None]
@@ -185,9 +183,7 @@ def test_wrapped_vectors_that_were_given_are_explained():
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # by which Gymnasium shows the traceback
 def test_workers_that_were_given_are_explained():
-    env = AsyncVectorEnv(
-        [EVERY["too long"].make] * 2, context=local.START_METHOD, autoreset_mode=AutoresetMode.DISABLED
-    )
+    env = AsyncVectorEnv([EVERY["too long"].make] * 2, context=pool.START_METHOD, autoreset_mode=AutoresetMode.DISABLED)
     vector = GymnasiumVector(env)
     vector.reset(0)
     action = np.zeros((2, 1), np.float32)

@@ -21,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from rejeu.envs.make import GymnasiumVector, make_vector
-from rejeu.envs.workers import local
+from rejeu.envs.workers import pool
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
@@ -285,7 +285,7 @@ def test_a_function_that_cannot_be_sent_is_refused():
 
 def test_a_self_resetting_vector_without_shared_memory_is_refused():
     """Its workers forget a masked reset, and would reset once more instead of taking the next step."""
-    env = AsyncVectorEnv([Counter] * 2, shared_memory=False, context=local.START_METHOD)
+    env = AsyncVectorEnv([Counter] * 2, shared_memory=False, context=pool.START_METHOD)
     with pytest.raises(
         ValueError, match=r"AsyncVectorEnv without shared memory .*autoreset_mode=AutoresetMode.DISABLED"
     ):

@@ -20,8 +20,7 @@ from rejeu.envs.base import SUCCESS_KEYS, Step, VectorEnv, describe_spec, succes
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.workers import process
-from rejeu.envs.workers.local import Processes
-from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Starter, Workers
+from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, Restarted, Starter, Workers
 from rejeu.envs.workers.process import Failure, ToSharedMemory
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.io.records import Count, convert

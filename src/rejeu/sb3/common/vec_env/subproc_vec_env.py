@@ -8,8 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.envs.validation import with_location
-from rejeu.envs.workers.local import Processes, ProcessWorker
-from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Restarted, Workers
+from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker, Restarted, Workers
 from rejeu.envs.workers.process import Failure
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
