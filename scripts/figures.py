@@ -134,8 +134,11 @@ def learned(folder: str) -> str:
                 result.figures,
                 "; ".join(others),
                 str(result.seeds),
+                " to ".join(dict.fromkeys(f"{seconds:.0f}" for seconds in result.seconds)),
                 content["commit"],
-                code(re.sub(r"^python benchmarks/learning\.py \S+ \S+ ?", "", result.command)),
+                code(
+                    re.sub(r"^python benchmarks/learning\.py \S+ \S+ ?| --continue --out FOLDER$", "", result.command)
+                ),
             )
         )
     header = (
@@ -145,6 +148,7 @@ def learned(folder: str) -> str:
         "rejeu",
         "published",
         "seeds",
+        "seconds",
         "commit",
         "options",
     )
