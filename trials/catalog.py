@@ -6,7 +6,7 @@
 Packages conflict with each other, so groups run in virtual environments of their own; docs/environments.md says which fit
 together. Each environment is tried in two copies: it is made; two vectors with one seed give the same 20 steps; 1,000 random
 steps of each copy are finite, and inside the declared bounds; episodes end at the time limit at the latest and are reset.
-These steps take 15 seconds at most, and one second where the same kind of observations and actions in the same family was
+These steps take 15 seconds at most, and half a second where the same kind of observations and actions in the same family was
 tried. The first ten of a family pass ``rejeu check``. One of each kind in a family is also trained for 500 steps by the
 default algorithm, saved and loaded, and resumed from a checkpoint; the resumed run must equal the uninterrupted one, bit for
 bit, where the state of the environment can be saved. A second id of EnvPool for the same environment is only made.
@@ -39,8 +39,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "catalog.json"
-STEPS, SECONDS, KNOWN_SECONDS, SEEDED, CHECKED, TRAINED, CUT = 1_000, 15.0, 1.0, 20, 10, 500, 300
-BATCH, LONGEST = 40, 300
+STEPS, SECONDS, KNOWN_SECONDS, SEEDED, CHECKED, TRAINED, CUT = 1_000, 15.0, 0.5, 20, 10, 500, 300
+BATCH, LONGEST = 100, 300
 """Environments of one process, and seconds of one environment after which it counts as hung, by default."""
 ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
@@ -202,8 +202,8 @@ def groups() -> dict[str, Group]:
 class Case:
     """The environment that is tried. Its stages are methods that return what is to be recorded; None for ``"ok"``."""
 
-    def __init__(self, group: Group, env_id: str, rows: list[dict[str, Any]]) -> None:
-        self.group, self.env_id = group, env_id
+    def __init__(self, group: Group, env_id: str, rows: list[dict[str, Any]], is_brief: bool) -> None:
+        self.group, self.env_id, self.is_brief = group, env_id, is_brief
         self.rows = rows
         self.row: dict[str, Any] = {"id": env_id, "family": group.ids()[env_id]}
         self.of_family = [row for row in rows if row["family"] == self.row["family"]]
@@ -214,7 +214,7 @@ class Case:
             yield from (self.seed, self.step, self.bounds, self.end)
             if self.group.one is not None and sum("check" in row for row in self.of_family) < CHECKED:
                 yield self.check
-            if self.is_new_kind():
+            if self.is_new_kind() and not self.is_brief:
                 yield from (self.train, self.save, self.resume)
 
     def make(self) -> str | None:
@@ -233,7 +233,8 @@ class Case:
         if self.vector.backend != "envpool":
             return None
         specs = import_module("envpool.registration").registry.specs
-        same = [row["id"] for row in self.rows if specs[row["id"]] == specs[self.env_id]]
+        others = [row["id"] for row in self.rows if row["id"] != self.env_id and "same_as" not in row]
+        same = [one for one in others if specs[one] == specs[self.env_id]]
         return same[0] if same else None
 
     def is_new_kind(self) -> bool:
@@ -277,7 +278,7 @@ class Case:
         self.vector.reset()
         rng, length = np.random.default_rng(1), np.zeros(self.vector.n_envs, int)
         self.n_steps, self.n_terminated, self.n_truncated, self.longest, self.outside = 0, 0, 0, 0, ""
-        until = time.monotonic() + (SECONDS if self.is_new_kind() else KNOWN_SECONDS)
+        until = time.monotonic() + (KNOWN_SECONDS if self.is_brief or not self.is_new_kind() else SECONDS)
         while self.n_steps < STEPS * self.vector.n_envs and time.monotonic() < until:
             result = self.vector.step(self.actions(rng))
             self.n_steps += self.vector.n_envs
@@ -398,10 +399,10 @@ def said(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".replace("\n", " ")[:300]
 
 
-def try_one(group: Group, env_id: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def try_one(group: Group, env_id: str, rows: list[dict[str, Any]], is_brief: bool) -> dict[str, Any]:
     """Returns the row of one environment: each stage that was reached, and where and why the last one failed."""
     began = time.perf_counter()
-    case = Case(group, env_id, rows)
+    case = Case(group, env_id, rows, is_brief)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         stage: Callable[[], str | None]
@@ -416,6 +417,15 @@ def try_one(group: Group, env_id: str, rows: list[dict[str, Any]]) -> dict[str, 
     return {key: value for key, value in case.row.items() if value is not None}
 
 
+def untrained(rows: dict[str, dict[str, Any]]) -> list[str]:
+    """Returns the first environment of each kind in a family of which none was trained."""
+    kinds: dict[tuple[str, str], list[dict[str, Any]]] = collections.defaultdict(list)
+    for row in rows.values():
+        if "seed" in row and row.get("failed") in (None, "train", "save", "resume"):
+            kinds[row["family"], row["kind"]].append(row)
+    return [of_kind[0]["id"] for of_kind in kinds.values() if not any("train" in row for row in of_kind)]
+
+
 def read_rows(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
@@ -426,24 +436,34 @@ def append(path: Path, row: dict[str, Any]) -> None:
     print(json.dumps(row), flush=True)
 
 
-def try_batch(name: str, path: Path, env_ids: list[str]) -> None:
+def try_batch(name: str, path: Path, env_ids: list[str], is_brief: bool) -> None:
     """Tries some environments in this process, one after the other."""
     group = groups()[name]
     for env_id in env_ids:
-        append(path, try_one(group, env_id, read_rows(path)))
+        append(path, try_one(group, env_id, read_rows(path), is_brief))
 
 
-def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]) -> None:
+def run(name: str, folder: Path, minutes: float, longest: float, only: list[str], brief: bool) -> None:
     """Tries the environments of a group that have no row yet."""
     folder.mkdir(parents=True, exist_ok=True)
     path, group = folder / f"{name}.jsonl", groups()[name]
     families = group.ids()
-    done = {row["id"] for row in read_rows(path)}
-    todo = [env_id for env_id in only or families if env_id not in done]
+    rows = {row["id"]: row for row in read_rows(path)}
+    todo = [env_id for env_id in only or families if env_id not in rows] + ([] if brief else untrained(rows))
     until = time.monotonic() + 60 * minutes
     while todo and time.monotonic() < until:
         batch, n_before = todo[:BATCH], len(read_rows(path))
-        command = [sys.executable, __file__, "batch", name, "--out", str(folder), "--only", *batch]
+        command = [
+            sys.executable,
+            __file__,
+            "batch",
+            name,
+            "--out",
+            str(folder),
+            *["--brief"] * brief,
+            "--only",
+            *batch,
+        ]
         with tempfile.TemporaryFile("w+") as errors:
             child = subprocess.Popen(command, env={**os.environ, **ENVIRONMENT}, stderr=errors, start_new_session=True)
             n, since, is_late = n_before, time.monotonic(), False
@@ -496,7 +516,7 @@ def collect(folder: Path) -> None:
     """Writes the table of all groups: a line for each family, and the ids that failed or stood out by what was found."""
     result: dict[str, Any] = {**provenance({str(folder): "FOLDER"}), "groups": {}, "families": [], "failures": []}
     for path in sorted(folder.glob("*.jsonl")):
-        name, rows = path.stem, read_rows(path)
+        name, rows = path.stem, [*{row["id"]: row for row in read_rows(path)}.values()]
         result["groups"][name] = json.loads(read_text(path.with_suffix(".json")))
         by_family, by_cause = collections.defaultdict(list), collections.defaultdict(list)
         for row in rows:
@@ -528,15 +548,16 @@ def main() -> None:
     parser.add_argument("group")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--brief", action="store_true", help="train nothing yet: a later run without this does")
     parser.add_argument("--longest", type=float, default=LONGEST, help="seconds of one environment")
     parser.add_argument("--only", nargs="*", default=[])
     given = parser.parse_args()
     if given.action == "collect":
         collect(Path(given.group))
     elif given.action == "run":
-        run(given.group, given.out, given.minutes, given.longest, given.only)
+        run(given.group, given.out, given.minutes, given.longest, given.only, given.brief)
     else:
-        try_batch(given.group, given.out / f"{given.group}.jsonl", given.only)
+        try_batch(given.group, given.out / f"{given.group}.jsonl", given.only, given.brief)
 
 
 if __name__ == "__main__":
