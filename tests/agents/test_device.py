@@ -18,6 +18,7 @@ from rejeu.cli import main
 from rejeu.loops.device import chunks
 from rejeu.sb3.common.callbacks import BaseCallback
 from tests.loops.device.test_off_policy import make
+from tests.tiers import exhaustive, only
 
 
 def rewards_of(agent: Any, progress: Any) -> None:
@@ -129,7 +130,7 @@ def test_what_seeds_cannot_be_combined_with_is_said_in_one_line(
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("seeds", [1, 2])
+@pytest.mark.parametrize("seeds", only([2], [1, 2]))
 def test_compiled_programs_are_collected_with_their_agents(seeds: int) -> None:
     settings: dict[str, Any] = {"learning_starts": 10, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
     agents = rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 30, seeds=seeds, **settings)
@@ -143,8 +144,8 @@ def test_compiled_programs_are_collected_with_their_agents(seeds: int) -> None:
 @pytest.mark.parametrize(
     ("kind", "env_id", "settings"),
     [
-        (rejeu.PPO, "jax/CartPole-v1", {"n_steps": 16, "batch_size": 16}),
-        (rejeu.PQN, "jax/CartPole-v1", {"n_steps": 16}),
+        pytest.param(rejeu.PPO, "jax/CartPole-v1", {"n_steps": 16, "batch_size": 16}, marks=exhaustive),
+        pytest.param(rejeu.PQN, "jax/CartPole-v1", {"n_steps": 16}, marks=exhaustive),
         (rejeu.PQN, "CartPole-v1", {"n_steps": 16}),
         (rejeu.SAC, "jax/Pendulum-v1", {"priorities": {}, "learning_starts": 20, "batch_size": 8}),
     ],

@@ -117,7 +117,6 @@ DEFAULT_CASES = {
         "TD3, memory, noise",
         "priorities, n steps",
         "episodes",
-        "normalised",
         "EnvPool",
         "worker processes",
         "EnvPool, whole episodes",
