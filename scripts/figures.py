@@ -113,8 +113,8 @@ def code(text: str) -> str:
     return f"`{text}`" * bool(text)
 
 
-def learned(folder: str) -> str:
-    """Every result of a folder of ``benchmarks/results``, beside all that is published for its algorithm and environment."""
+def learned(folder: str, length: str = "") -> str:
+    """Every result of a folder of ``benchmarks/results``, beside all that is published; ``short`` leaves its origin out."""
     rows = []
     for path in sorted((DATA / folder).glob("*.json")):
         content = load(path.name, path.parent)
@@ -152,7 +152,8 @@ def learned(folder: str) -> str:
         "commit",
         "options",
     )
-    return table(header, rows)
+    n = 5 if length == "short" else len(header)
+    return table(header[:n], [row[:n] for row in rows])
 
 
 def curve(algorithm: str) -> str:
