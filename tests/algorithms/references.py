@@ -42,7 +42,8 @@ class Reference:
 
     def __init__(self, state: Any, config: Any, rate: float) -> None:
         self.config, self.tau = config, config.tau
-        self.interval = getattr(config, "policy_delay", 0) or config.target_update_interval
+        self.delay = getattr(config, "policy_delay", 1)
+        self.interval = getattr(config, "target_update_interval", self.delay)
         self.critics_name = "critic" if hasattr(state, "critic") else "critics"
         self.actor, self.critics = layers(state.actor), members(getattr(state, self.critics_name))
         self.target_critics = members(getattr(state, f"target_{self.critics_name}"))
@@ -166,7 +167,7 @@ class TD3(DDPG):
         )
 
     def improve(self, batch: Transition) -> dict[str, float]:
-        if self.n % self.interval == 0:
+        if self.n % self.delay == 0:
             self.last_loss = super().improve(batch)["actor_loss"]
         return {"actor_loss": self.last_loss}
 
@@ -196,6 +197,9 @@ class DiscreteDDPG(DDPG):
 class SAC(Reference):
     """Stochastic actor with a temperature; half of the squared errors."""
 
+    last = 0.0, 0.0
+    """Loss and entropy at the actor's last step."""
+
     def __init__(self, state: Any, config: Any, rate: float) -> None:
         super().__init__(state, config, rate)
         self.log_alphas = [[np.array(float(state.log_alpha))]]
@@ -224,12 +228,25 @@ class SAC(Reference):
         """Returns the values of the TD target, ``(batch,)``."""
         return self.smallest([action_value(critic, obs, action) for critic in critics])
 
-    judge = bootstrap
-    """Returns the values that the actor climbs, ``(batch,)``."""
+    def judge(self, critics: list[Layers], obs: Any, action: Any) -> np.ndarray:
+        """Returns the values that the actor climbs, ``(batch,)``: with ``target_subset`` the mean of all critics."""
+        if self.config.target_subset is None:
+            return self.bootstrap(critics, obs, action)
+        return np.mean([action_value(critic, obs, action) for critic in critics], axis=0)
+
+    def drawn(self, key: Any) -> list[Layers]:
+        """Returns the target critics of this update; with ``target_subset`` those that its random numbers name."""
+        n, size = len(self.target_critics), self.config.target_subset
+        if size is None:
+            return self.target_critics
+        chosen = np.asarray(jax.random.choice(jax.random.fold_in(key, 2), n, (size,), replace=False))
+        assert len(set(chosen.tolist())) == size
+        return [self.target_critics[i] for i in chosen]
 
     def target(self, batch: Transition) -> np.ndarray:
-        action, log_prob = self.sample(batch.next_obs, jax.random.split(self.keys)[0])
-        value = self.bootstrap(self.target_critics, batch.next_obs, action)
+        target_key = jax.random.split(self.keys)[0]
+        action, log_prob = self.sample(batch.next_obs, target_key)
+        value = self.bootstrap(self.drawn(target_key), batch.next_obs, action)
         return self.backed_up(batch, value, self.alpha * log_prob)
 
     def backed_up(self, batch: Transition, value: np.ndarray, cost: np.ndarray) -> np.ndarray:
@@ -241,13 +258,17 @@ class SAC(Reference):
         return np.mean(self.alpha * log_prob - self.judge(self.critics, batch.obs, action)), -log_prob
 
     def improve(self, batch: Transition) -> dict[str, float]:
-        loss, entropies = self.actor_loss(batch)
-        entropy, alpha = entropies.mean(), self.alpha
-        found = {"actor_loss": loss, "ent_coef": alpha, "entropy": entropy}
-        self.actor_adam.descend(lambda: self.actor_loss(batch)[0])
-        if isinstance(self.config.ent_coef, str):
-            alpha_loss = lambda: float(self.log_alphas[0][0]) * (entropy - self.target_entropy)  # noqa: E731
+        alpha, learns_alpha = self.alpha, isinstance(self.config.ent_coef, str)
+        alpha_loss = lambda: float(self.log_alphas[0][0]) * (self.last[1] - self.target_entropy)  # noqa: E731
+        due = self.n % self.delay == 0
+        if due:
+            loss, entropies = self.actor_loss(batch)
+            self.last = loss, entropies.mean()
+            self.actor_adam.descend(lambda: self.actor_loss(batch)[0])
+        found = {"actor_loss": self.last[0], "ent_coef": alpha, "entropy": self.last[1]}
+        if learns_alpha:
             found["ent_coef_loss"] = alpha_loss()
+        if learns_alpha and due:
             self.alpha_adam.descend(alpha_loss)
         return found
 
@@ -264,15 +285,19 @@ class DiscreteSAC(SAC):
     def least(self, critics: list[Layers], obs: Any) -> np.ndarray:
         return self.smallest([forward(critic, obs) for critic in critics])
 
+    def judge(self, critics: list[Layers], obs: Any, action: Any = None) -> np.ndarray:
+        values = [forward(critic, obs) for critic in critics]
+        return self.least(critics, obs) if self.config.target_subset is None else np.mean(values, axis=0)
+
     def target(self, batch: Transition) -> np.ndarray:
         probabilities = softmax(forward(self.actor, batch.next_obs))
-        rows = zip(probabilities, self.least(self.target_critics, batch.next_obs), strict=True)
+        rows = zip(probabilities, self.least(self.drawn(self.keys), batch.next_obs), strict=True)
         soft = [sum(p * (q - self.alpha * np.log(p)) for p, q in zip(*row, strict=True)) for row in rows]
         return batch.reward + batch.discount * soft
 
     def actor_loss(self, batch: Transition) -> tuple[float, np.ndarray]:
         probabilities = softmax(forward(self.actor, batch.obs))
-        costs = self.alpha * np.log(probabilities) - self.least(self.critics, batch.obs)
+        costs = self.alpha * np.log(probabilities) - self.judge(self.critics, batch.obs)
         return np.mean((probabilities * costs).sum(axis=1)), entropy_of(probabilities)
 
 

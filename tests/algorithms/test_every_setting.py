@@ -328,9 +328,27 @@ def the_actor_learns_once_a_delay(case: Case) -> None:
     for _ in range(4):
         found = case.update(policy_delay=2, state=state)
         delayed = [name for name in found.before if name.startswith(("actor.", "target_"))]
+        if "ent_coef" in case.fields:  # the targets follow the critics
+            delayed = [name for name in delayed if name.startswith("actor.")]
         moves.append({bool((found.after[name] != found.before[name]).any()) for name in delayed if "bias" in name})
         state = found.state
     assert moves == [{False}, {True}] * 2
+
+
+@shows("target_subset")
+def the_target_is_the_smallest_of_so_many_critics_that_each_update_draws(case: Case) -> None:
+    """Over many updates with three critics, rewards of 0 and no entropy: every pair occurs, and no other number of critics."""
+    made = case.make(n_critics=3, target_subset=2, ent_coef=1e-12)
+    state = made.init(jax.random.PRNGKey(1))
+    found: set[bytes] = set()
+    for i in range(40):
+        index = case.config(n_critics=3, target_subset=2).for_target(jnp.arange(3.0), jax.random.PRNGKey(i))
+        assert len(set(index.tolist())) == 2
+        found.add(bytes(sorted(np.asarray(index, np.uint8).tolist())))
+    assert len(found) == 3
+    assert case.config(n_critics=3).for_target(jnp.arange(3.0), jax.random.PRNGKey(0)).shape == (3,)
+    all_three, two = (case.update(n_critics=3, target_subset=n, state=state).metrics[TD_ERROR] for n in (3, 2))
+    assert case.kind == "TQC" or np.abs(all_three - two).max() > 1e-6
 
 
 @shows("target_policy_noise", "target_noise_clip")
@@ -778,6 +796,7 @@ ELSEWHERE = {
     # policy_kwargs
     **dict.fromkeys(("net_arch", "pi", "qf", "layer_norm", "architecture", "n_blocks", "width"), FORWARD),
     **dict.fromkeys(("state_layers", "action_layers", "common_layers", "critic_layers", "actor_layers"), FORWARD),
+    "dropout": "tests/algorithms/test_redq.py::test_every_pass_of_an_update_drops_units_of_the_critics",
     "vf": f"{PPO}::test_policy_and_value_have_the_widths_asked_for",
     "activation_fn": "tests/networks/test_layers.py::test_activations_equal_their_formulas",
     **dict.fromkeys(

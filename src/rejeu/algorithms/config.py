@@ -105,6 +105,8 @@ class AlgorithmConfig:
     name: ClassVar[str] = ""
     can_mask: ClassVar[bool] = False
     """Whether the algorithm can take masks of the allowed actions."""
+    can_drop: ClassVar[bool] = False
+    """Whether the critics can learn with dropout."""
     is_checked: ClassVar[bool] = False
     """Whether :meth:`__post_init__` has run; set on each instance."""
     policy_kwargs_class: ClassVar[type[PolicyConfig]] = PolicyConfig
@@ -132,6 +134,8 @@ class AlgorithmConfig:
             raise ValueError(
                 f"action_masks=True: {self.name} takes no masks; use PPO, A2C, TRPO, RecurrentPPO, DQN, QRDQN or SAC"
             )
+        if self.policy_kwargs.dropout and not self.can_drop:
+            raise ValueError(f"policy_kwargs: {self.name} has no critics with dropout; leave it out, or use SAC or TQC")
         assign(self, is_checked=True)
 
     def doubts(self, n_envs: int) -> str:

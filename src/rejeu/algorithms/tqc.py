@@ -9,8 +9,9 @@ critics give ``z'_n``. With policy ``pi``, temperature ``alpha`` and discount ``
     J_Z         = sum_n mean rho(y_i - z_n(s, a)),                                    the quantile Huber loss
     J_pi        = mean (alpha log pi(a | s) - mean of all quantiles z_n(s, a)),       a ~ pi(. | s), reparameterized
 
-Policy, temperature, targets and the order of the steps are SAC's (:mod:`rejeu.algorithms.sac`). As there, the critics'
-losses are summed, which gives each the gradient of its own; Stable-Baselines3 Contrib takes their mean.
+Policy, temperature, targets and the order of the steps are SAC's (:mod:`rejeu.algorithms.sac`); with ``target_subset`` the
+quantiles of so many critics are pooled. As there, the critics' losses are summed, which gives each the gradient of its own;
+Stable-Baselines3 Contrib takes their mean.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from rejeu.algorithms.sac.continuous import (
     Config as SACConfig,
     SdeActor,
     State,
+    after_actor,
+    after_critics,
+    every,
     exploit,
     explore,
     explorer_of,
@@ -38,11 +42,10 @@ from rejeu.algorithms.sac.continuous import (
     metrics_of,
     networks,
     policy,
-    temperature_and_targets,
 )
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
-from rejeu.networks import Network, QNetwork, each
+from rejeu.networks import Network, QNetwork, each, with_dropout
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
@@ -82,7 +85,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, shape = leaves(observation_space), config.policy_kwargs
     target_entropy = config.entropy_target(-float(action_dim))
-    n_kept = config.n_critics * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
+    n_pooled = config.target_subset or config.n_critics
+    n_kept = n_pooled * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
@@ -95,20 +99,25 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch, target_key, n_kept)
+        target_critics = config.for_target(state.target_critics, target_key)
+        target = without_gradient(td_target)(state.actor, target_critics, alpha, batch, target_key, n_kept)
+        drop, judge_drop = config.dropout_keys(actor_key)
         critics, critics_optimizer, critic_loss, quantiles = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, drop
         )
-        actor, actor_optimizer, policy_loss, log_prob = minimize(
-            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
-        )
-        state = temperature_and_targets(
-            state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, target_entropy, config, rate
-        )
+        state = after_critics(state, critics, critics_optimizer, config)
+
+        def improve(state: State) -> tuple[State, Array, Array]:
+            judges = with_dropout(critics, judge_drop), alpha, batch.obs, actor_key
+            actor, actor_optimizer, loss, log_prob = minimize(
+                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judges
+            )
+            state = after_actor(state, actor, actor_optimizer, log_prob, target_entropy, config, rate)
+            return state, loss, -jnp.mean(log_prob)
+
+        state, policy_loss, entropy = every(config.policy_delay, state, improve)
         values, expected = jnp.mean(quantiles, axis=-1), jnp.mean(target, axis=-1)
-        return state, metrics_of(
-            critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, expected, target_entropy, config
-        )
+        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, expected, target_entropy, config)
 
     values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
     actor = lambda state: state.actor  # noqa: E731
@@ -140,9 +149,12 @@ def td_target(
     return batch.reward[:, None] + batch.discount[:, None] * (kept - (alpha * next_log_prob)[:, None])
 
 
-def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
-    """Returns the quantile Huber loss, averaged over the batch and summed over critics, and the critics' quantiles."""
-    quantiles = action_quantiles(critics, batch.obs, batch.action)
+def critics_loss(critics: QNetwork, batch: Transition, target: Array, drop: Array | None = None) -> tuple[Array, Array]:
+    """Returns the quantile Huber loss, averaged over the batch and summed over critics, and the critics' quantiles.
+
+    ``drop`` is the key of the critics' dropout, None for none.
+    """
+    quantiles = action_quantiles(with_dropout(critics, drop), batch.obs, batch.action)
     return jnp.sum(weighted_mean(quantile_huber_loss(quantiles, target), batch.weight)), quantiles
 
 

@@ -13,8 +13,8 @@ from rejeu.networks.encoder import (
     make_encoder,
     reads_image,
 )
-from rejeu.networks.layers import ACTIVATIONS, ENCODERS, MLP, LayerNorm, Linear, register_encoder
-from rejeu.networks.memory import Cell, MemoryConfig, Recurrent, each, first, with_memory
+from rejeu.networks.layers import ACTIVATIONS, ENCODERS, MLP, LayerNorm, Linear, register_encoder, with_dropout
+from rejeu.networks.memory import Cell, MemoryConfig, Recurrent, each, first, some, with_memory
 from rejeu.networks.network import (
     Branches,
     Network,
@@ -56,7 +56,9 @@ __all__ = [
     "reads_image",
     "register_encoder",
     "settled",
+    "some",
     "split_net_arch",
     "values_by_critics",
+    "with_dropout",
     "with_memory",
 ]

@@ -104,24 +104,65 @@ class LayerNorm(eqx.Module):
         return centered * jax.lax.rsqrt(variance + 1e-5) * scale + offset
 
 
+class Dropout(eqx.Module):
+    """Sets each number to 0 with probability ``rate`` and divides the others by ``1 - rate`` (Srivastava et al. 2014).
+
+    It does so only with a key, which :func:`with_dropout` gives it for one forward pass.
+    """
+
+    key: Array | None
+    rate: float = eqx.field(static=True)
+
+    def __call__(self, x: Array) -> Array:
+        """Returns ``x`` of any shape, some of it dropped; unchanged without a key."""
+        if self.key is None:
+            return x
+        kept = jax.random.bernoulli(self.key, 1.0 - self.rate, x.shape)
+        return jnp.where(kept, x / (1.0 - self.rate), 0.0)
+
+
+def with_dropout(networks: Any, key: Array | None) -> Any:
+    """Returns stacked networks whose dropout layers draw from ``key``, each layer its own numbers; unchanged for None."""
+    if key is None:
+        return networks
+    n = jax.tree.leaves(networks)[-1].shape[0]
+    is_dropout = lambda node: isinstance(node, Dropout)  # noqa: E731
+    given, tree = jax.tree.flatten(networks, is_leaf=is_dropout)
+    keys = [jax.random.split(jax.random.fold_in(key, i), n) for i in range(len(given))]
+    pairs = zip(given, keys, strict=True)
+    return jax.tree.unflatten(tree, [Dropout(k, node.rate) if is_dropout(node) else node for node, k in pairs])
+
+
 class MLP(eqx.Module):
-    """Hidden layers, each a linear map, an optional layer norm and a nonlinearity. No output layer."""
+    """Hidden layers, each a linear map, an optional dropout and layer norm, and a nonlinearity. No output layer."""
 
     layers: tuple[Linear, ...]
     norms: tuple[LayerNorm, ...]
+    dropouts: tuple[Dropout, ...]
     activation: str = eqx.field(static=True)
 
-    def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str, layer_norm: bool) -> None:
+    def __init__(
+        self,
+        key: Array,
+        n_inputs: int,
+        widths: Sequence[int],
+        activation: str,
+        layer_norm: bool,
+        dropout: float = 0.0,
+    ) -> None:
         keys = jax.random.split(key, max(len(widths), 1))
         sizes = (n_inputs, *widths)
         self.layers = tuple(Linear(k, i, o) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=False))
         self.norms = tuple(LayerNorm(width) for width in widths) if layer_norm else ()
+        self.dropouts = tuple(Dropout(None, dropout) for _ in widths) if dropout else ()
         self.activation = activation
 
     def __call__(self, x: Array) -> Array:
         """Maps ``(batch, n_inputs)`` to ``(batch, widths[-1])``."""
         for i, layer in enumerate(self.layers):
             x = layer(x)
+            if self.dropouts:
+                x = self.dropouts[i](x)
             if self.norms:
                 x = self.norms[i](x)
             x = ACTIVATIONS[self.activation](x)

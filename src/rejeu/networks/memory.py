@@ -210,7 +210,12 @@ def each(critics: Any, obs: PyTree, call: Callable[[Any, PyTree], Array]) -> Arr
     return jax.vmap(lambda critic: call(critic, obs))(critics)
 
 
+def some(critics: Any, index: Any) -> Any:
+    """Returns those of stacked critics that ``index`` names: the numbers of several, or of one without the leading axis."""
+    reader = jax.tree.map(lambda leaf: leaf[index], critics.reader if isinstance(critics, Recurrent) else critics)
+    return dataclasses.replace(critics, reader=reader) if isinstance(critics, Recurrent) else reader
+
+
 def first(critics: Any) -> Any:
     """Returns the first of stacked critics."""
-    reader = jax.tree.map(lambda leaf: leaf[0], critics.reader if isinstance(critics, Recurrent) else critics)
-    return dataclasses.replace(critics, reader=reader) if isinstance(critics, Recurrent) else reader
+    return some(critics, 0)

@@ -32,7 +32,8 @@ class Branches(eqx.Module):
     ) -> None:
         """Builds the branches of ``shape``, ``widths`` being those of the last part; no action branch for None."""
         keys = jax.random.split(key, 4)
-        layers = lambda k, n_inputs, sizes: MLP(k, n_inputs, sizes, shape.activation_fn, shape.layer_norm)  # noqa: E731
+        settings = shape.activation_fn, shape.layer_norm, shape.dropout
+        layers = lambda k, n_inputs, sizes: MLP(k, n_inputs, sizes, *settings)  # noqa: E731
         self.state = layers(keys[0], n_features, shape.state_layers)
         self.action = None if action_dim is None else layers(keys[1], action_dim, shape.action_layers)
         n_joined = joined_width(n_features, action_dim, shape)
@@ -126,7 +127,8 @@ def make_torso(
         return branches, (joined_width(n_features, action_dim, shape), *shape.common_layers, *widths)[-1]
     if shape.architecture == "simba":
         return SimBa(key, n_inputs, widths, shape.activation_fn), widths[-1]
-    return MLP(key, n_inputs, widths, shape.activation_fn, shape.layer_norm), (n_inputs, *widths)[-1]
+    plain = MLP(key, n_inputs, widths, shape.activation_fn, shape.layer_norm, shape.dropout)
+    return plain, (n_inputs, *widths)[-1]
 
 
 def make_head(key: Array, n_inputs: int, n_outputs: int, shape: PolicyConfig) -> Any:

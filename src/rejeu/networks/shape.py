@@ -10,7 +10,7 @@ from jax import Array
 
 from rejeu.networks.layers import ACTIVATIONS, find_encoder
 from rejeu.spaces import Leaf
-from rejeu.validation import assign, choice, coerce, flag, whole
+from rejeu.validation import assign, choice, coerce, flag, number, whole
 
 
 class Widths(NamedTuple):
@@ -40,6 +40,9 @@ class PolicyConfig:
     of that name (``jax.nn.relu``, ``torch.nn.ReLU``) is accepted too."""
     layer_norm: bool = False
     """Normalize each hidden layer before its nonlinearity: steadier critics, above all at high learning rates."""
+    dropout: float = 0.0
+    """Share of each critic's hidden units that is set to 0 at random while it learns and is learned from (DroQ, arXiv
+    2110.02034; SAC and TQC). A larger share regularizes more."""
     cnn_layer_norm: bool = False
     """Normalize the layers of the CNN of an image likewise, each pixel over its channels."""
     cnn_features: int | None = None
@@ -85,6 +88,7 @@ class PolicyConfig:
         coerce(self, ("n_blocks", "width"), whole, least=1)
         coerce(self, "activation_fn", activation_name)
         coerce(self, ("layer_norm", "cnn_layer_norm", "normalize_images"), flag)
+        coerce(self, "dropout", number, least=0, most=0.9)
         coerce(self, "cnn_features", whole, least=1, optional=True)
         coerce(self, "architecture", choice, among=("mlp", "simba"))
         self._check_shape()
@@ -98,7 +102,7 @@ class PolicyConfig:
         branches = [key for key in BRANCHES if getattr(self, key)]
         simba = ["architecture='simba'"] * (self.architecture == "simba")
         own = ["torso"] * (self.torso is not None)
-        norm = ["layer_norm"] * self.layer_norm
+        norm = ["layer_norm"] * self.layer_norm + ["dropout"] * (self.dropout > 0)
         pairs = [(branches, arch), (branches, simba), (simba, norm)]
         for one, other in pairs + [(own, others) for others in (arch, branches, simba, norm)]:
             if one and other:

@@ -15,14 +15,20 @@ the temperature share one sample of actions, and the losses use the temperature 
 Stable-Baselines3. The critics' losses are summed over the critics, which gives each the gradient of its own ``J_Q``. As in
 Stable-Baselines3, the temperature's loss is written in ``log alpha`` rather than ``alpha``. TQC and CrossQ share the
 temperature.
+
+With ``target_subset`` M, ``min`` in ``y`` is over M critics that are drawn anew for each update, and ``J_pi`` has the mean
+of all critics in place of ``min``: REDQ (Chen et al. 2021, arXiv 2101.05982, algorithm 1), which has 10 critics, M = 2, and
+one step of the actor for 20 of the critics (``policy_delay``). With dropout in the critics, in every pass of an update, it is
+DroQ (Hiraoka et al. 2022, arXiv 2110.02034, algorithm 2).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -61,7 +67,9 @@ from rejeu.networks import (
     make_encoder,
     make_head,
     make_torso,
+    some,
     values_by_critics,
+    with_dropout,
     with_memory,
 )
 from rejeu.prng import nth
@@ -69,6 +77,8 @@ from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
 from rejeu.validation import coerce, flag, number, whole
 
+S = TypeVar("S", bound=Any)
+"""The state of an algorithm with an entropy bonus."""
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
 
@@ -116,6 +126,11 @@ class Config(EntropyConfig):
 
     target_update_interval: int = 1
     """Gradient steps between two updates of the target critics."""
+    target_subset: int | None = None
+    """Number of critics, drawn anew for each update, of which the target takes the smallest value; the actor then follows
+    the mean of all (REDQ, arXiv 2101.05982). A larger number is more pessimistic. None: the smallest of all, for both."""
+    policy_delay: int = 1
+    """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
     use_sde: bool = False
     """Explore by state-dependent noise (gSDE, arXiv 2005.05719), which is kept for many steps and gives smooth motion. Box
     actions only, without ``action_noise``."""
@@ -127,10 +142,14 @@ class Config(EntropyConfig):
     name: ClassVar[str] = "SAC"
     can_mask: ClassVar[bool] = True
     can_remember: ClassVar[bool] = True
+    can_drop: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        coerce(self, "target_update_interval", whole, least=1)
+        coerce(self, ("target_update_interval", "policy_delay"), whole, least=1)
+        coerce(self, "target_subset", whole, least=1, optional=True)
+        if (self.target_subset or 0) > self.n_critics:
+            raise ValueError(f"target_subset={self.target_subset} is more than n_critics={self.n_critics}")
         coerce(self, "use_sde", flag)
         coerce(self, "sde_sample_freq", whole, least=-1)
         coerce(self, "sde_log_std_init", number)
@@ -140,6 +159,22 @@ class Config(EntropyConfig):
             raise ValueError("use_sde=True explores by itself; leave action_noise out")
         if self.use_sde and self.has_memory:
             raise ValueError("use_sde=True is not available for policies with memory; leave it or lstm_hidden_size out")
+
+    @property
+    def judged_by(self) -> Callable[..., Array]:
+        """What the actor's loss makes of the values of all critics."""
+        return jnp.min if self.target_subset is None else jnp.mean
+
+    def dropout_keys(self, key: Array) -> Any:
+        """Returns keys for the dropout of critics that learn and that are learned from; None for both without dropout."""
+        return jax.random.split(jax.random.fold_in(key, 1)) if self.policy_kwargs.dropout else (None, None)
+
+    def for_target(self, critics: Any, key: Array) -> Any:
+        """Returns the target critics of an update: all of them or ``target_subset``, with dropout if they have it."""
+        if self.target_subset is not None:
+            index = jax.random.choice(jax.random.fold_in(key, 2), self.n_critics, (self.target_subset,), replace=False)
+            critics = some(critics, index)
+        return with_dropout(critics, self.dropout_keys(key)[1])
 
 
 class SdeActor(eqx.Module):
@@ -189,6 +224,10 @@ class State(eqx.Module):
     """Root of the random numbers of the updates, ``uint32[2]``; never changes."""
     n_updates: Array
     """Gradient steps taken, ``int32[]``."""
+    actor_loss: Array | None = None
+    """Of the actor's last step, ``float32[]``, with ``policy_delay``."""
+    entropy: Array | None = None
+    """Of the policy at that step, in nats, ``float32[]``, likewise."""
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
@@ -207,19 +246,24 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch, target_key)
+        target_critics = config.for_target(state.target_critics, target_key)
+        target = without_gradient(td_target)(state.actor, target_critics, alpha, batch, target_key)
+        drop, judge_drop = config.dropout_keys(actor_key)
         critics, critics_optimizer, critic_loss, values = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, drop
         )
-        actor, actor_optimizer, policy_loss, log_prob = minimize(
-            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
-        )
-        state = temperature_and_targets(
-            state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, target_entropy, config, rate
-        )
-        return state, metrics_of(
-            critic_loss, policy_loss, alpha, -jnp.mean(log_prob), values, target, target_entropy, config
-        )
+        state = after_critics(state, critics, critics_optimizer, config)
+
+        def improve(state: State) -> tuple[State, Array, Array]:
+            judges = with_dropout(critics, judge_drop), alpha, batch.obs, actor_key, config.judged_by
+            actor, actor_optimizer, loss, log_prob = minimize(
+                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judges
+            )
+            state = after_actor(state, actor, actor_optimizer, log_prob, target_entropy, config, rate)
+            return state, loss, -jnp.mean(log_prob)
+
+        state, policy_loss, entropy = every(config.policy_delay, state, improve)
+        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, target, target_entropy, config)
 
     actor = lambda state: state.actor  # noqa: E731
     algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values_by_critics)
@@ -279,45 +323,50 @@ def initial_state(
         alpha_optimizer=alpha_optimizer,
         key=update_key,
         n_updates=jnp.int32(0),
+        actor_loss=None if config.policy_delay == 1 else jnp.float32(0.0),
+        entropy=None if config.policy_delay == 1 else jnp.float32(0.0),
     )
 
 
-def temperature_and_targets(
-    state: State,
-    actor: tuple[Network | SdeActor, PyTree],
-    critics: tuple[Any, PyTree],
-    log_prob: Array,
-    target_entropy: Any,
-    config: Any,
-    rate: Any,
-) -> State:
-    """Returns the state after the last two steps of an update, those of the temperature and the target critics.
+def after_critics(state: State, critics: Any, optimizer_state: PyTree, config: Any) -> State:
+    """Returns the state with new critics, their optimizer's state, and the targets moved by ``config.tau`` if they are due."""
+    n_updates = state.n_updates + 1
+    tau = tau_at(n_updates, config.tau, config.target_update_interval)
+    targets = polyak(state.target_critics, critics, tau)
+    return dataclasses.replace(
+        state, critics=critics, critics_optimizer=optimizer_state, target_critics=targets, n_updates=n_updates
+    )
 
-    Args:
-        state: from before the update.
-        actor: the new actor and its optimizer state.
-        critics: likewise.
-        log_prob: of the actions that the actor sampled, ``(batch,)``.
-        target_entropy: in nats.
-        config: gives ``tau`` and ``target_update_interval``.
-        rate: the learning rate.
+
+def after_actor(
+    state: S, actor: Any, optimizer_state: PyTree, log_prob: Array, target_entropy: Any, config: Any, rate: Any
+) -> S:
+    """Returns the state with a new actor and its optimizer's state, after a step of the temperature.
+
+    ``log_prob`` is that of the actions that the actor sampled, ``(batch,)``; ``target_entropy`` is in nats.
     """
     log_alpha, alpha_optimizer = temperature_step(
         state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
     )
-    n_updates = state.n_updates + 1
-    tau = tau_at(n_updates, config.tau, config.target_update_interval)
-    return State(
-        actor=actor[0],
-        critics=critics[0],
-        target_critics=polyak(state.target_critics, critics[0], tau),
-        log_alpha=log_alpha,
-        actor_optimizer=actor[1],
-        critics_optimizer=critics[1],
-        alpha_optimizer=alpha_optimizer,
-        key=state.key,
-        n_updates=n_updates,
+    return dataclasses.replace(
+        state, actor=actor, actor_optimizer=optimizer_state, log_alpha=log_alpha, alpha_optimizer=alpha_optimizer
     )
+
+
+def every(policy_delay: int, state: S, improve: Callable[[S], tuple[S, Array, Array]]) -> tuple[S, Array, Array]:
+    """Returns ``improve(state)`` at every ``policy_delay``-th update of the critics, which ``state.n_updates`` counts.
+
+    That is the state after a step of the actor, its loss and the entropy; at other updates those of its latest step.
+    """
+    if policy_delay == 1:
+        return improve(state)
+
+    def step(state: S) -> S:
+        state, loss, entropy = improve(state)
+        return dataclasses.replace(state, actor_loss=loss, entropy=entropy)
+
+    state = jax.lax.cond(state.n_updates % policy_delay == 0, step, lambda s: s, state)
+    return state, state.actor_loss, state.entropy
 
 
 def explore(actor: Network | SdeActor, obs: PyTree, key: Array, clock: Clock) -> Array:
@@ -347,18 +396,29 @@ def td_target(
     return batch.reward + batch.discount * (next_value - alpha * next_log_prob)
 
 
-def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
-    """Returns half the squared TD error, averaged over the batch and summed over critics, and the values."""
-    values = action_values(critics, batch.obs, batch.action)
+def critics_loss(critics: QNetwork, batch: Transition, target: Array, drop: Array | None = None) -> tuple[Array, Array]:
+    """Returns half the squared TD error, averaged over the batch and summed over critics, and the values.
+
+    ``drop`` is the key of the critics' dropout, None for none.
+    """
+    values = action_values(with_dropout(critics, drop), batch.obs, batch.action)
     return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
 
 
 def actor_loss(
-    actor: Network | SdeActor, critics: QNetwork, alpha: Array, obs: PyTree, key: Array
+    actor: Network | SdeActor,
+    critics: QNetwork,
+    alpha: Array,
+    obs: PyTree,
+    key: Array,
+    judged_by: Callable[..., Array] = jnp.min,
 ) -> tuple[Array, Array]:
-    """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)`` (equation 7)."""
+    """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)`` (equation 7).
+
+    The critics are combined by ``judged_by``, ``jnp.min`` or ``jnp.mean``.
+    """
     action, log_prob = policy(actor, obs).sample_and_log_prob(key)
-    value = jnp.min(action_values(critics, obs, action), axis=0)
+    value = judged_by(action_values(critics, obs, action), axis=0)
     return jnp.mean(alpha * log_prob - value), log_prob
 
 

@@ -29,10 +29,12 @@ from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
     Config,
     State,
+    after_actor,
+    after_critics,
+    every,
     initial_state,
     metrics_of,
     networks,
-    temperature_and_targets,
 )
 from rejeu.core import (
     Algorithm,
@@ -47,7 +49,8 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import Categorical, forbid
-from rejeu.networks import Network, each
+from rejeu.networks import Network, each, with_dropout
+from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, leaves
 
@@ -75,20 +78,24 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
         target_entropy: Any = config.entropy_target(TARGET_ENTROPY_SHARE * mean_log_count(batch.obs, n_actions))
-        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch)
+        key = nth(state.key, state.n_updates)
+        target = without_gradient(td_target)(state.actor, config.for_target(state.target_critics, key), alpha, batch)
+        drop, judge_drop = config.dropout_keys(jax.random.fold_in(key, 3))
         critics, critics_optimizer, critic_loss, values = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, drop
         )
-        least_values = jnp.min(all_values(critics, batch.obs), axis=0)
-        actor, actor_optimizer, policy_loss, entropy = minimize(
-            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, least_values, alpha, batch.obs
-        )
-        state = temperature_and_targets(
-            state, (actor, actor_optimizer), (critics, critics_optimizer), -entropy, target_entropy, config, rate
-        )
-        return state, metrics_of(
-            critic_loss, policy_loss, alpha, jnp.mean(entropy), values, target, target_entropy, config
-        )
+        state = after_critics(state, critics, critics_optimizer, config)
+
+        def improve(state: State) -> tuple[State, Array, Array]:
+            judged = config.judged_by(all_values(with_dropout(critics, judge_drop), batch.obs), axis=0)
+            actor, actor_optimizer, loss, entropy = minimize(
+                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, judged, alpha, batch.obs
+            )
+            state = after_actor(state, actor, actor_optimizer, -entropy, target_entropy, config, rate)
+            return state, loss, jnp.mean(entropy)
+
+        state, policy_loss, entropy = every(config.policy_delay, state, improve)
+        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, target, target_entropy, config)
 
     values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
     algorithm = Algorithm(
@@ -135,9 +142,9 @@ def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Trans
     return batch.reward + batch.discount * jnp.sum(jnp.exp(log_probabilities) * soft_values, axis=-1)
 
 
-def critics_loss(critics: PyTree, batch: Transition, target: Array) -> tuple[Array, Array]:
+def critics_loss(critics: PyTree, batch: Transition, target: Array, drop: Array | None = None) -> tuple[Array, Array]:
     """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
-    values = all_values(critics, batch.obs)
+    values = all_values(with_dropout(critics, drop), batch.obs)
     index = jnp.broadcast_to(batch.action[None, :, None], (*values.shape[:-1], 1))
     values = jnp.take_along_axis(values, index, axis=-1)[..., 0]
     return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values

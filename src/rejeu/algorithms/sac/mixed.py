@@ -16,10 +16,11 @@ components; a number given as ``target_entropy`` is that of the Box components.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,8 +34,10 @@ from rejeu.algorithms.sac.continuous import (
     LOG_STD_RANGE,
     Config,
     State,
+    after_actor,
+    after_critics,
+    every,
     initial_state,
-    temperature_and_targets,
 )
 from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE
 from rejeu.core import (
@@ -49,7 +52,7 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import Categorical, TanhNormal
-from rejeu.networks import Network, QNetwork
+from rejeu.networks import Network, QNetwork, with_dropout
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_width, check_action, check_box_action, leaves, members
@@ -98,8 +101,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def init(key: Array) -> State:
         state = initial_state(key, obs_leaves, n + 2 * n_box, critic, config, optimizer)
         log_alpha = jnp.full((2,), state.log_alpha)
-        alphas = (log_alpha, ALPHA_OPTIMIZER.init(log_alpha))
-        return eqx.tree_at(lambda s: (s.log_alpha, s.alpha_optimizer), state, alphas)
+        entropy = None if state.entropy is None else jnp.zeros((2,), jnp.float32)
+        return dataclasses.replace(
+            state, log_alpha=log_alpha, alpha_optimizer=ALPHA_OPTIMIZER.init(log_alpha), entropy=entropy
+        )
 
     def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
         choice_key, box_key = jax.random.split(key)
@@ -113,18 +118,24 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
         rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target = without_gradient(td_target)(state.actor, state.target_critics, alpha, batch, target_key, n)
+        target_critics = config.for_target(state.target_critics, target_key)
+        target = without_gradient(td_target)(state.actor, target_critics, alpha, batch, target_key, n)
         choice, box = parted(batch.action)
+        drop, judge_drop = config.dropout_keys(actor_key)
         critics, critics_optimizer, critic_loss, values = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, choice, box, target
+            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, choice, box, target, drop
         )
-        actor, actor_optimizer, policy_loss, log_prob = minimize(
-            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key, n
-        )
-        state = temperature_and_targets(
-            state, (actor, actor_optimizer), (critics, critics_optimizer), log_prob, targets, config, rate
-        )
-        entropies = -jnp.mean(log_prob, axis=0)
+        state = after_critics(state, critics, critics_optimizer, config)
+
+        def improve(state: State) -> tuple[State, Array, Array]:
+            judges = with_dropout(critics, judge_drop), alpha, batch.obs, actor_key, n, config.judged_by
+            actor, actor_optimizer, loss, log_prob = minimize(
+                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judges
+            )
+            state = after_actor(state, actor, actor_optimizer, log_prob, targets, config, rate)
+            return state, loss, -jnp.mean(log_prob, axis=0)
+
+        state, policy_loss, entropies = every(config.policy_delay, state, improve)
         return state, {
             "critic_loss": critic_loss,
             "actor_loss": policy_loss,
@@ -165,13 +176,19 @@ def all_values(critics: PyTree, obs: PyTree, box: Array) -> Array:
 
 
 def soft_value(
-    actor: Network, critics: PyTree, alpha: Array, obs: PyTree, key: Array, n: int
+    actor: Network,
+    critics: PyTree,
+    alpha: Array,
+    obs: PyTree,
+    key: Array,
+    n: int,
+    judged_by: Callable[..., Array] = jnp.min,
 ) -> tuple[Array, tuple[Array, Array]]:
     """Returns ``V``, ``(batch,)``, and the mean log-probability of the choice and that of the sampled Box components."""
     choice, box = policy(actor, obs, n)
     sample, box_log_prob = box.sample_and_log_prob(key)
     log_probabilities = jax.nn.log_softmax(choice.logits)
-    values = jnp.min(all_values(critics, obs, sample), axis=0) - alpha[0] * log_probabilities
+    values = judged_by(all_values(critics, obs, sample), axis=0) - alpha[0] * log_probabilities
     value = jnp.sum(jnp.exp(log_probabilities) * values, axis=-1) - alpha[1] * box_log_prob
     return value, (-choice.entropy(), box_log_prob)
 
@@ -181,15 +198,25 @@ def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Trans
     return batch.reward + batch.discount * soft_value(actor, target_critics, alpha, batch.next_obs, key, n)[0]
 
 
-def critics_loss(critics: PyTree, batch: Transition, choice: Array, box: Array, target: Array) -> tuple[Array, Array]:
+def critics_loss(
+    critics: PyTree, batch: Transition, choice: Array, box: Array, target: Array, drop: Array | None = None
+) -> tuple[Array, Array]:
     """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
-    values = all_values(critics, batch.obs, box)
+    values = all_values(with_dropout(critics, drop), batch.obs, box)
     index = jnp.broadcast_to(choice[None, :, None], (*values.shape[:2], 1))
     taken = jnp.take_along_axis(values, index, axis=-1)[..., 0]
     return 0.5 * jnp.sum(weighted_mean(jnp.square(taken - target[None]), batch.weight)), taken
 
 
-def actor_loss(actor: Network, critics: PyTree, alpha: Array, obs: PyTree, key: Array, n: int) -> tuple[Array, Any]:
+def actor_loss(
+    actor: Network,
+    critics: PyTree,
+    alpha: Array,
+    obs: PyTree,
+    key: Array,
+    n: int,
+    judged_by: Callable[..., Array] = jnp.min,
+) -> tuple[Array, Any]:
     """Returns the soft policy loss, and the log-probabilities of choice and Box components, ``(batch, 2)``."""
-    value, log_probs = soft_value(actor, critics, alpha, obs, key, n)
+    value, log_probs = soft_value(actor, critics, alpha, obs, key, n, judged_by)
     return -jnp.mean(value), jnp.stack(log_probs, axis=-1)
