@@ -27,6 +27,7 @@ from rejeu.sb3.common.preprocessing import (
     is_image_space,
     preprocess_obs,
 )
+from rejeu.sb3.common.type_aliases import DictReplayBufferSamples
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
 
@@ -220,6 +221,7 @@ def test_replay_buffers_by_hand(nested):
         batch.dones[:, 0] == (ends & (batch.rewards[:, 0] < 0))
     ).all()  # the first environment's end was a time limit
     assert batch.actions.dtype == np.float32
+    assert isinstance(batch, DictReplayBufferSamples) == nested
     env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), norm_obs=False)
     env.ret_rms.var = np.array(4.0)
     np.testing.assert_allclose(np.abs(buffer.sample(50, env=env).rewards).max(), 3.0, atol=1.0)
@@ -283,6 +285,8 @@ def test_a_logger_that_keeps_values_gets_those_of_the_last_row():
     model.set_logger(logger)
     model.learn(40, log_interval=1)
     assert logger.name_to_value["time/total_timesteps"] == 40
+    sac = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=8, batch_size=4, **SMALL)
+    assert sac.learn(12).logger.name_to_value["train/n_updates"] == 4
 
 
 class Console(gym.Env):

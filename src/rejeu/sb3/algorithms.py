@@ -559,7 +559,11 @@ class Original(Agent):
         self.exploration_rate_set = None
         callbacks = [as_callback(one) for one in given]
         flags = (reset_num_timesteps, progress_bar)
-        return super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
+        super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
+        if isinstance(self.logger, loggers.Logger):  # where scripts look for what the last updates said
+            self.logger.left |= {k: v for k, v in self.statistics().items() if k.startswith("train/")}
+            self.logger.name_to_value |= self.logger.left
+        return self
 
     def set_logger(self, logger: Any) -> None:
         """Replaces the logger for all further training."""

@@ -18,7 +18,12 @@ from gymnasium import spaces
 
 from rejeu.buffers.ring import LAST, TERMINATED
 from rejeu.sb3.common.preprocessing import get_action_dim, get_obs_shape
-from rejeu.sb3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
+from rejeu.sb3.common.type_aliases import (
+    DictReplayBufferSamples,
+    DictRolloutBufferSamples,
+    ReplayBufferSamples,
+    RolloutBufferSamples,
+)
 from rejeu.sb3.common.utils import Tensor, get_device
 from rejeu.sb3.common.vec_env.base_vec_env import TIME_LIMIT_TRUNCATED
 
@@ -117,7 +122,7 @@ class BaseBuffer(ABC):
 
     @staticmethod
     def _normalize_obs(obs: Any, env: Any = None) -> Any:
-        return obs if env is None else env.normalize_obs(obs)
+        return obs if env is None else by_leaf(Tensor.of, env.normalize_obs(obs))
 
     @staticmethod
     def _normalize_reward(reward: np.ndarray, env: Any = None) -> np.ndarray:
@@ -252,7 +257,8 @@ class ReplayBuffer(BaseBuffer):
         """Returns transitions from the rows ``first`` to the rows ``last``, with the rewards of ``first``."""
         pick = lambda array, rows: by_leaf(lambda leaf: self.to_torch(leaf[rows, envs]), array)  # noqa: E731
         terminal = self.dones[last, envs] * (1 - self.timeouts[last, envs])
-        return ReplayBufferSamples(
+        kind = DictReplayBufferSamples if isinstance(self.observations, dict) else ReplayBufferSamples
+        return kind(
             self._normalize_obs(pick(self.observations, first), env),
             self.to_torch(self.actions[first, envs]).reshape(len(first), -1),
             self._normalize_obs(pick(self.next_observations, last), env),
@@ -493,7 +499,8 @@ class RolloutBuffer(BaseBuffer):
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> RolloutBufferSamples:
         flat = lambda array: by_leaf(lambda leaf: self.to_torch(self.swap_and_flatten(leaf)[batch_inds]), array)  # noqa: E731
         parts = (self.values, self.log_probs, self.advantages, self.returns)
-        return RolloutBufferSamples(
+        kind = DictRolloutBufferSamples if isinstance(self.observations, dict) else RolloutBufferSamples
+        return kind(
             flat(self.observations), flat(self.actions).astype(np.float32), *(flat(part).reshape(-1) for part in parts)
         )
 

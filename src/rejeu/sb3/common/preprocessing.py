@@ -71,7 +71,7 @@ def preprocess_obs(obs: Any, observation_space: spaces.Space, normalize_images: 
     if isinstance(observation_space, spaces.Dict):
         inner = observation_space.spaces.items()
         return {key: preprocess_obs(obs[key], part, normalize_images) for key, part in inner}
-    values = jnp.asarray(obs)
+    values = jnp.asarray(obs if isinstance(obs, jax.Array) else np.asarray(obs))
     if isinstance(observation_space, spaces.Box):
         scale = 255.0 if normalize_images and is_image_space(observation_space) else 1.0
         return values.astype(jnp.float32) / scale

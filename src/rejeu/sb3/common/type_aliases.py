@@ -50,8 +50,12 @@ class ReplayBufferSamples(NamedTuple):
     """``(batch, 1)``, of n-step returns."""
 
 
-DictRolloutBufferSamples = RolloutBufferSamples
-DictReplayBufferSamples = ReplayBufferSamples
+class DictRolloutBufferSamples(RolloutBufferSamples):
+    """A minibatch with Dict observations."""
+
+
+class DictReplayBufferSamples(ReplayBufferSamples):
+    """A batch with Dict observations."""
 
 
 class RolloutReturn(NamedTuple):
