@@ -49,13 +49,18 @@ ENVIRONMENT = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0",
 }
 CAUSES = {
-    r"took longer than": "hangs or takes longer than five minutes",
+    r"took longer than": "a step takes too long, or hangs",
     r"^crash": "crashes the process",
-    r"old version|DeprecatedEnv|mujoco.py": "an old version that can no longer be made; the newest one works",
-    r"action space|actions .* no algorithm": "the actions are of a kind that no algorithm takes",
-    r"Text|Sequence|Graph|fixed-size|observation .*space": "the observations are of a kind that no network takes",
     r"Qt 5": "needs the libraries of Qt 5 on the system (apt install qtbase5-dev)",
-    r"MissingExtra|No module|DependencyNotInstalled": "needs a package that is not installed with the extra",
+    r"flax": "needs flax: pip install flax",
+    r"shimmy\[gym-v|named 'gym'": "no environment, but a wrapper of those for Gym",
+    r"compatibility-env": "no environment, but a wrapper of those for DeepMind's interface",
+    r"old version|DeprecatedEnv|mujoco.py|needs mujoco": "an old version that can no longer be made; the newest one works",
+    r"flex_vertedge": 'dm-control 1.0.50 fails with MuJoCo 4.0: add "mujoco<4"',
+    r"minigrid\[wfc": "needs more packages: pip install 'minigrid[wfc]'",
+    r"loading texture": "its textures are not in the package",
+    r"no algorithm here takes": "the actions are of a kind that no algorithm takes",
+    r"the observation space at": "an observation is of a kind that no network takes (MiniGrid: ImgObsWrapper)",
 }
 """What errors mean, by a pattern of their text; those of no pattern are shown as they are."""
 
@@ -487,6 +492,7 @@ def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]
     before = json.loads(text) if (text := read_text(folder / f"{name}.json")) else {}
     names = {str(folder): "FOLDER"}
     origin = {**provenance(names), "ids": len(families), "versions": {p: version(p) for p in group.packages}}
+    origin["families"] = collections.Counter(families.values())
     origin["cpu_minutes"] = round(before.get("cpu_minutes", 0.0) + (used.ru_utime + used.ru_stime) / 60, 1)
     write(folder / f"{name}.json", origin)
     print(f"{name}: {len(todo)} of {len(families)} left, {origin['cpu_minutes']} minutes of processor time")
@@ -523,23 +529,25 @@ def collect(folder: Path) -> None:
             by_family[row["family"]].append(row)
             if why := cause(row):
                 by_cause[row["family"], why].append(row["id"])
-        for family, of_family in sorted(by_family.items()):
+        known = result["groups"][name].pop("families", {})
+        for family in sorted({*by_family, *known}):
+            of_family = by_family[family]
             resumed = [row["resume"] for row in of_family if "resume" in row]
             result["families"].append({
-                "group": name, "family": family, "ids": len(of_family),
+                "group": name, "family": family, "ids": known.get(family, len(of_family)),
+                "tried": len(of_family),
                 "work": sum(not cause(row) for row in of_family),
                 "same_episodes_by_seed": sum(row.get("seed") == "ok" for row in of_family),
                 "inside_bounds": sum(row.get("bounds", "ok") == "ok" and "seed" in row for row in of_family),
                 "trained": ", ".join(sorted({row["algorithm"] for row in of_family if row.get("train") == "ok"})),
-                "resumed_exactly": f"{resumed.count('ok')} of {len(resumed)}",
+                "resumed_exactly": f"{resumed.count('ok')} of {len(resumed)}" if resumed else "",
                 "seconds": round(sum(row["seconds"] for row in of_family)),
             })  # fmt: skip
         for (family, why), ids in sorted(by_cause.items()):
             result["failures"].append({"group": name, "family": family, "cause": why, "number": len(ids), "ids": ids})
-    tried, work = (sum(row[key] for row in result["families"]) for key in ("ids", "work"))
-    result |= {"ids": tried, "work": work}
+    result |= {key: sum(row[key] for row in result["families"]) for key in ("ids", "tried", "work")}
     write(RESULT, result)
-    print(f"{work} of {tried} work")
+    print({key: result[key] for key in ("ids", "tried", "work")})
 
 
 def main() -> None:
