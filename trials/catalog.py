@@ -56,6 +56,8 @@ CAUSES = {
     r"shimmy\[gym-v|named 'gym'": "no environment, but a wrapper of those for Gym",
     r"compatibility-env": "no environment, but a wrapper of those for DeepMind's interface",
     r"old version|DeprecatedEnv|mujoco.py|needs mujoco": "an old version that can no longer be made; the newest one works",
+    r"No OpenGL": "its observations are pictures, and there was no OpenGL (MUJOCO_GL=egl)",
+    r"PhysicsError": "random actions make its simulation invalid",
     r"flex_vertedge": 'dm-control 1.0.50 fails with MuJoCo 4.0: add "mujoco<4"',
     r"minigrid\[wfc": "needs more packages: pip install 'minigrid[wfc]'",
     r"loading texture": "its textures are not in the package",
