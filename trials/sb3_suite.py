@@ -144,7 +144,13 @@ def main() -> None:
                 run_file(folder, name, arguments.limit, arguments.log, tests.get(name, 1)) | {"commit": commit()}
             )
             print({key: value for key, value in rows[-1].items() if key != "failures"}, flush=True)
+            record(rows, earlier, arguments)
     print(total_of(rows))
+    record(rows, earlier, arguments)
+
+
+def record(rows: list[dict[str, Any]], earlier: dict[str, Any], arguments: argparse.Namespace) -> None:
+    """Writes the results so far, with the earlier ones of other files."""
     names = {str(arguments.folder): "FOLDER", str(arguments.log): "LOG", str(arguments.output): "OUTPUT"}
     names |= {str(path): "RESULTS" for path in arguments.join}
     names |= dict.fromkeys(arguments.packages, "SITE_PACKAGES")
@@ -154,6 +160,7 @@ def main() -> None:
     else:
         kept = [row for row in earlier.get("files", []) if row["file"] not in {row["file"] for row in rows}]
         files = sorted(kept + rows, key=lambda row: str(row["file"]))
+        original = earlier.get("original", [])
         content = {**provenance(names), "total": total_of(files), "original": original, "files": files}
     write(arguments.output, content, rows="files")
 
