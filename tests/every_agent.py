@@ -51,6 +51,7 @@ KINDS = {
     "DDPG, Discrete": Kind("DDPG", True, {}),
     "DQN": Kind("DQN", True, EPSILON),
     "QRDQN": Kind("QRDQN", True, {**EPSILON, "n_quantiles": 5}),
+    "IQN": Kind("IQN", True, {**EPSILON, "n_quantiles": 8, "n_target_quantiles": 8, "n_policy_quantiles": 8}),
 }
 """Every algorithm with every kind of action space that it supports."""
 

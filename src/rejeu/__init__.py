@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         DDPG as DDPG,
         DQN as DQN,
         IQL as IQL,
+        IQN as IQN,
         PPO as PPO,
         PQN as PQN,
         QRDQN as QRDQN,
@@ -79,7 +80,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL PPO PQN QRDQN SAC TD3 TQC TRPO CrossQ MaskablePPO OffPolicyAgent "
+    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL IQN PPO PQN QRDQN SAC TD3 TQC TRPO CrossQ MaskablePPO OffPolicyAgent "
     "OnPolicyAgent RecurrentPPO load register",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",

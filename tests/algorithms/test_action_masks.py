@@ -134,9 +134,10 @@ def test_the_target_of_qr_dqn_is_the_distribution_of_the_best_allowed_action():
     batch, mask = batch_of(np.random.default_rng(1))
     config = qrdqn.Config(n_quantiles=3, policy_kwargs={"net_arch": [4]}, action_masks=True)
     network = qrdqn.make(config, *spaces_of()).init(jax.random.PRNGKey(0)).network
-    quantiles = np.asarray(network.quantiles(batch.next_obs.obs))
+    quantiles = np.asarray(network(batch.next_obs.obs))
     expected = batch.reward[:, None] + batch.discount[:, None] * best(quantiles, quantiles.mean(axis=-1), mask)
-    np.testing.assert_allclose(qrdqn.td_target(network, batch), expected, rtol=1e-5, atol=1e-6)
+    returns = qrdqn.quantile_returns(3)
+    np.testing.assert_allclose(dqn.td_target(network, network, batch, False, returns), expected, rtol=1e-5, atol=1e-6)
 
 
 def log_policy(logits, mask):

@@ -88,11 +88,12 @@ def test_double_q_takes_the_targets_value_of_the_networks_best_action():
 def test_td_loss_equals_numpy(name, weighted):
     network, batch = other_network(), random_batch(weighted=weighted)
     target = np.linspace(-3.0, 3.0, BATCH, dtype=np.float32)
-    loss, td_error = dqn.td_loss(network, batch, jnp.array(target), dqn.LOSSES[name])
+    loss, (td_error, value) = dqn.td_loss(network, batch, jnp.array(target), dqn.LOSSES[name])
     values = forward(network, batch.obs)
     errors = [values[i, batch.action[i]] - target[i] for i in range(BATCH)]
     assert min(map(abs, errors)) < 1 < max(map(abs, errors)), "both branches of Huber's function are met"
     np.testing.assert_allclose(td_error, errors, atol=1e-5)
+    np.testing.assert_allclose(value, values[np.arange(BATCH), batch.action], atol=1e-5)
     penalty = {"huber": lambda e: e * e / 2 if abs(e) < 1 else abs(e) - 0.5, "squared": lambda e: e * e}[name]
     weights = batch.weight if weighted else np.ones(BATCH)
     assert float(loss) == pytest.approx(

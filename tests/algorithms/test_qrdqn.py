@@ -12,7 +12,7 @@ import optax
 import pytest
 
 import rejeu
-from rejeu.algorithms import qrdqn
+from rejeu.algorithms import dqn, qrdqn
 from rejeu.core import TD_ERROR, Clock, Transition
 from tests.algorithms.test_dqn import (
     BATCH,
@@ -27,6 +27,7 @@ from tests.algorithms.test_dqn import (
 
 ACTION_SPACE = gym.spaces.Discrete(N_ACTIONS)
 N_QUANTILES = 3
+RETURNS = qrdqn.quantile_returns(N_QUANTILES)
 
 
 @functools.cache
@@ -56,15 +57,15 @@ def test_network_gives_the_means_of_its_quantiles():
     _, state = make()
     obs = random_batch().obs
     expected = numpy_quantiles(state.network, obs)
-    np.testing.assert_allclose(state.network.quantiles(obs), expected, atol=1e-5)
-    np.testing.assert_allclose(state.network(obs), expected.mean(axis=2), atol=1e-5)
+    np.testing.assert_allclose(state.network(obs), expected, atol=1e-5)
+    np.testing.assert_allclose(RETURNS.values(state.network, obs, None), expected.mean(axis=2), atol=1e-5)
 
 
 @pytest.mark.usefixtures("strict_dtypes")
 def test_td_target_moves_the_quantiles_of_the_action_with_the_highest_mean():
     _, state = make()
     batch = random_batch()
-    given = qrdqn.td_target(state.network, batch)
+    given = dqn.td_target(state.network, state.network, batch, False, RETURNS)
     following = numpy_quantiles(state.network, batch.next_obs)
     expected = [
         batch.reward[i] + batch.discount[i] * following[i, following[i].mean(axis=1).argmax()] for i in range(BATCH)
@@ -78,9 +79,10 @@ def test_quantile_loss_equals_loops(weighted):
     _, state = make()
     batch = random_batch(weighted=weighted)
     target = np.linspace(-3.0, 3.0, BATCH * N_QUANTILES, dtype=np.float32).reshape(BATCH, N_QUANTILES)
-    loss, current = qrdqn.quantile_loss(state.network, batch, jnp.array(target))
+    loss, (error, value) = dqn.td_loss(state.network, batch, jnp.array(target), RETURNS)
     expected = numpy_quantiles(state.network, batch.obs)[np.arange(BATCH), batch.action]
-    np.testing.assert_allclose(current, expected, atol=1e-5)
+    np.testing.assert_allclose(value, expected.mean(axis=1), atol=1e-5)
+    np.testing.assert_allclose(error, expected.mean(axis=1) - target.mean(axis=1), atol=1e-5)
     weights = batch.weight if weighted else np.ones(BATCH)
     losses = [w * numpy_quantile_huber(c, t) for w, c, t in zip(weights, expected, target, strict=True)]
     assert float(loss) == pytest.approx(np.mean(losses), abs=1e-5)
@@ -103,8 +105,8 @@ def test_update_descends_by_adam_with_the_papers_epsilon():
     algorithm, state = make(learning_rate=0.1, batch_size=4)
     batch = random_batch()
     after, _ = algorithm.update(state, batch, CLOCK)
-    target = qrdqn.td_target(state.target_network, batch)
-    gradient, _ = jax.grad(qrdqn.quantile_loss, has_aux=True)(state.network, batch, target)
+    target = dqn.td_target(state.network, state.target_network, batch, False, RETURNS)
+    gradient, _ = jax.grad(dqn.td_loss, has_aux=True)(state.network, batch, target, RETURNS)
     optimizer = optax.adam(0.1, eps=0.01 / 4)
     step, _ = optimizer.update(gradient, optimizer.init(state.network))
     expected = optax.apply_updates(state.network, step)
@@ -125,7 +127,7 @@ def test_values_of_a_chain_are_learnt():
         learning_rate=3e-3, target_update_interval=50, n_quantiles=5, policy_kwargs={"net_arch": [32]}
     )
     state = learn_chain(qrdqn.make(config, Chain.observation_space, Chain.action_space), 2_000)
-    values = state.network(np.arange(5, dtype=np.int32))
+    values = state.network(np.arange(5, dtype=np.int32)).mean(axis=-1)
     np.testing.assert_allclose(values, Chain().values(), atol=0.03)
 
 
@@ -144,5 +146,5 @@ def test_quantiles_of_a_coin_are_learnt():
         return algorithm.update(state, batch, Clock(jnp.uint32(1), jnp.uint32(0), progress))[0], None
 
     state, _ = jax.jit(lambda s: jax.lax.scan(update, s, jnp.linspace(0.0, 1.0, 2_000)))(state)
-    quantiles = state.network.quantiles(obs[:1])[0, 0]
+    quantiles = state.network(obs[:1])[0, 0]
     np.testing.assert_allclose(quantiles, [-10 + 1 / 3, 10 - 1 / 3], atol=0.02)

@@ -1,7 +1,7 @@
 """Agents: environments, a learner and a buffer behind the methods of Stable-Baselines3."""
 
 from rejeu.agents.agent import Agent
-from rejeu.agents.off_policy import DDPG, DQN, IQL, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
+from rejeu.agents.off_policy import DDPG, DQN, IQL, IQN, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
 from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
 from rejeu.agents.registry import AGENTS, agent_of_file, find_agent, load, modules_of, register
 from rejeu.callbacks.base import Callback
@@ -14,6 +14,7 @@ __all__ = [
     "DDPG",
     "DQN",
     "IQL",
+    "IQN",
     "PPO",
     "PQN",
     "QRDQN",

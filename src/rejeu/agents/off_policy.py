@@ -13,7 +13,7 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
-from rejeu.algorithms import crossq, ddpg, dqn, iql, qrdqn, sac, td3, tqc
+from rejeu.algorithms import crossq, ddpg, dqn, iql, iqn, qrdqn, sac, td3, tqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import ring_io
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
@@ -209,7 +209,7 @@ class TD3(OffPolicyAgent):
 
 
 class DQN(OffPolicyAgent):
-    """Deep Q-learning (Mnih et al. 2015), for Discrete actions; double, dueling and n-step by option."""
+    """Deep Q-learning (Mnih et al. 2015), for Discrete actions; with the parts of Rainbow, C51 among them, by option."""
 
     algorithm: ClassVar[ModuleType] = dqn
 
@@ -218,6 +218,12 @@ class QRDQN(OffPolicyAgent):
     """Quantile regression DQN (Dabney et al. 2018), for Discrete actions."""
 
     algorithm: ClassVar[ModuleType] = qrdqn
+
+
+class IQN(OffPolicyAgent):
+    """Implicit quantile networks (Dabney et al. 2018), for Discrete actions."""
+
+    algorithm: ClassVar[ModuleType] = iqn
 
 
 class TQC(OffPolicyAgent):

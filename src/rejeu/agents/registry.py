@@ -16,7 +16,7 @@ import gymnasium as gym
 from rejeu import presets as all_presets
 from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
-from rejeu.agents.off_policy import DDPG, DQN, IQL, QRDQN, SAC, TD3, TQC, CrossQ
+from rejeu.agents.off_policy import DDPG, DQN, IQL, IQN, QRDQN, SAC, TD3, TQC, CrossQ
 from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, RecurrentPPO
 from rejeu.algorithms import config as configs
 from rejeu.errors import CheckpointError
@@ -26,7 +26,7 @@ from rejeu.presets import Preset
 
 A = TypeVar("A", bound=type[Agent])
 
-KINDS = (SAC, DDPG, TD3, DQN, QRDQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO, PQN, TRPO, ARS, IQL)
+KINDS = (SAC, DDPG, TD3, DQN, QRDQN, IQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO, PQN, TRPO, ARS, IQL)
 BUILT_IN: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
 
 AGENTS: dict[str, type[Agent]] = dict(BUILT_IN)

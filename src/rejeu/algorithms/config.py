@@ -132,7 +132,7 @@ class AlgorithmConfig:
         coerce(self, "action_masks", flag)
         if self.action_masks and not self.can_mask:
             raise ValueError(
-                f"action_masks=True: {self.name} takes no masks; use PPO, A2C, TRPO, RecurrentPPO, DQN, QRDQN or SAC"
+                f"action_masks=True: {self.name} takes no masks; use PPO, A2C, TRPO, RecurrentPPO, DQN, QRDQN, IQN or SAC"
             )
         if self.policy_kwargs.dropout and not self.can_drop:
             raise ValueError(f"policy_kwargs: {self.name} has no critics with dropout; leave it out, or use SAC or TQC")

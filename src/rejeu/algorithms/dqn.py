@@ -2,7 +2,9 @@
 
 Sources: Mnih et al. 2015, "Human-level control through deep reinforcement learning" (doi 10.1038/nature14236); van
 Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning" (arXiv 1509.06461); Wang et al. 2016, "Dueling
-Network Architectures for Deep Reinforcement Learning" (arXiv 1511.06581). With network ``Q``, target network ``Q'`` and
+Network Architectures for Deep Reinforcement Learning" (arXiv 1511.06581); Fortunato et al. 2018, "Noisy Networks for
+Exploration" (arXiv 1706.10295); Vieillard et al. 2020, "Munchausen Reinforcement Learning" (arXiv 2007.14430); for
+``distribution="categorical"`` (C51) see :mod:`rejeu.algorithms.categorical`. With network ``Q``, target network ``Q'`` and
 discount ``d`` (0 where the MDP terminated, gamma to the power n for n-step returns)::
 
     y      = r + d max_a' Q'(s', a')                        double_q: r + d Q'(s', argmax_a' Q(s', a'))
@@ -11,7 +13,13 @@ discount ``d`` (0 where the MDP terminated, gamma to the power n for n-step retu
     Q'    <- Q' + tau (Q - Q')                              once every target_update_interval environment steps
     a      = argmax_a Q(s, a), or any with probability epsilon
 
-With masks, every maximum is over the allowed actions, and so are the random ones.
+With masks, every maximum is over the allowed actions, and so are the random ones. With ``noisy``, epsilon is 0 and every
+weight is drawn anew (:mod:`rejeu.networks.noisy`): once for each call that chooses actions, and in an update once for each
+network and role (Rainbow, Hessel et al. 2018, arXiv 1710.02298). With ``munchausen_alpha`` the target is that of
+:func:`munchausen_target`.
+
+What a network predicts of the return, and how it learns it, are the functions of :class:`Returns`: its mean here, or in
+place of it probabilities, quantiles (:mod:`rejeu.algorithms.qrdqn`) or a quantile function (:mod:`rejeu.algorithms.iqn`).
 
 The target moves just before the first gradient step at or after every multiple of ``target_update_interval``: to the
 same numbers as in Stable-Baselines3, where it moves between two gradient steps. If several multiples have passed since
@@ -26,7 +34,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from functools import partial
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,7 +44,7 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers, search
+from rejeu.algorithms import categorical, optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
 from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.search import SearchSpace
@@ -59,6 +68,8 @@ from rejeu.core import (
 from rejeu.distributions import forbid
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso, with_memory
+from rejeu.networks.noisy import drawn, noisy
+from rejeu.prng import nth
 from rejeu.schedules import Exponential, Linear, Schedule, at
 from rejeu.spaces import Leaf, check_discrete_action, nth_allowed
 from rejeu.validation import choice, coerce, flag, number, whole
@@ -71,7 +82,7 @@ HIDDEN_LAYERS = (64, 64)
 
 @dataclass(frozen=True, kw_only=True)
 class QLearningConfig(OffPolicyConfig):
-    """The hyperparameters that DQN and QR-DQN share. Abstract."""
+    """The hyperparameters that DQN, QR-DQN and IQN share. Abstract."""
 
     batch_size: int = 32
     """Transitions per gradient step. Larger batches reduce the variance of the gradient at a higher cost."""
@@ -92,9 +103,24 @@ class QLearningConfig(OffPolicyConfig):
     exploration_schedule: Literal["linear", "exponential"] = "linear"
     """How epsilon decreases: linearly, or by the same factor for equal parts of the run. The run is measured in what
     ``learn`` was given: steps, episodes or minutes."""
+    double_q: bool = False
+    """Choose the next action by the network and evaluate it by the target network, which reduces overestimation."""
+    dueling: bool = False
+    """Split the last hidden layer into a stream for the state's value and one for the actions' advantages."""
+    noisy: bool = False
+    """Explore by noise on the weights, whose scale is learned, in place of random actions; ``exploration_...`` then have no
+    effect."""
+    munchausen_alpha: float | None = None
+    """Weight of the scaled log-probability of the action that is added to the reward, in [0, 1]; 0.9 in the paper. The target
+    is then that of a softmax policy. None for the usual target."""
+    munchausen_temperature: float = 0.03
+    """Temperature of that policy, in the unit of the return. A larger value is closer to the uniform policy."""
+    munchausen_clip: float = -1.0
+    """Lower limit of the scaled log-probability, at most 0."""
     max_grad_norm: float | None = 10.0
 
     can_mask: ClassVar[bool] = True
+    can_remember: ClassVar[bool] = True
     hidden_layers: ClassVar[Widths] = Widths(HIDDEN_LAYERS, HIDDEN_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
     search_space: ClassVar[SearchSpace] = search.Q_LEARNING
@@ -106,13 +132,25 @@ class QLearningConfig(OffPolicyConfig):
                 f"action_noise={self.action_noise} does not apply to Discrete actions; explore by exploration_final_eps, "
                 "or by action_noise=ParameterNoise()"
             )
+        if self.noisy and self.action_noise is not None:
+            raise ValueError("noisy=True and action_noise are both noise on the weights; give one of the two")
         coerce(self, "target_update_interval", whole, least=1)
+        coerce(self, ("double_q", "dueling", "noisy"), flag)
+        coerce(self, "munchausen_alpha", number, least=0, most=1, optional=True)
+        coerce(self, "munchausen_temperature", number, above=0)
+        coerce(self, "munchausen_clip", number, most=0)
         check_epsilon(self)
 
     @property
     def epsilon(self) -> Schedule:
         """The probability of a random action as a function of the progress."""
-        return epsilon_schedule(self)
+        return Linear(0.0, 0.0) if self.noisy else epsilon_schedule(self)
+
+    @property
+    def munchausen(self) -> Munchausen | None:
+        """The settings of the target, None for the usual one."""
+        alpha = self.munchausen_alpha
+        return None if alpha is None else Munchausen(alpha, self.munchausen_temperature, self.munchausen_clip)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,32 +162,82 @@ class Config(QLearningConfig):
     """Maximum absolute value of each component of the gradient, applied before ``max_grad_norm``. None: no limit."""
     loss: Literal["huber", "squared"] = "huber"
     """Loss of the TD error: ``huber`` grows linearly beyond 1, ``squared`` is the square."""
-    double_q: bool = False
-    """Choose the next action by the network and evaluate it by the target network, which reduces overestimation."""
-    dueling: bool = False
-    """Split the last hidden layer into a stream for the state's value and one for the actions' advantages."""
+    distribution: Literal["expected", "categorical"] = "expected"
+    """What is learned of the return: its mean, or the probabilities of ``n_atoms`` values (C51), whose loss is the
+    cross-entropy. For quantiles there are QRDQN and IQN."""
+    v_min: float = -10.0
+    """Lowest return that ``categorical`` can represent, with the discount; lower ones count as this one."""
+    v_max: float = 10.0
+    """Highest return that ``categorical`` can represent."""
+    n_atoms: int = 51
+    """Values from ``v_min`` to ``v_max``, at equal distances. A larger number describes the distribution more finely."""
 
-    can_remember: ClassVar[bool] = True
     name: ClassVar[str] = "DQN"
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
         coerce(self, "loss", choice, among=tuple(LOSSES))
         coerce(self, "clip_grad_value", number, above=0, optional=True)
-        coerce(self, ("double_q", "dueling"), flag)
+        coerce(self, "distribution", choice, among=("expected", "categorical"))
+        coerce(self, ("v_min", "v_max"), number)
+        coerce(self, "n_atoms", whole, least=2)
+        if self.v_min >= self.v_max:
+            raise ValueError(f"v_min={self.v_min} must be below v_max={self.v_max}")
+
+    @property
+    def returns(self) -> Returns:
+        """What the network predicts, and how it learns it."""
+        if self.distribution == "categorical":
+            return categorical_returns(categorical.make_atoms(self.v_min, self.v_max, self.n_atoms))
+        return LOSSES[self.loss]
 
 
 class State(eqx.Module):
-    """Everything that DQN or QR-DQN learns; every leaf is an array."""
+    """Everything that DQN, QR-DQN or IQN learns; every leaf is an array."""
 
     network: Any
-    """Maps observations to the values of all actions: a :class:`Network`, :class:`Dueling` or ``QuantileNetwork``."""
+    """Maps observations to the values of all actions, or to what describes the returns of all actions."""
     target_network: Any = eqx.field(metadata=AVERAGED)
     optimizer: PyTree
     step: Array
     """Environment steps at the newest gradient step, ``uint32[]``: determines the next update of the target."""
     n_updates: Array
     """Gradient steps taken, ``int32[]``."""
+    key: Array | None = None
+    """Root of what is drawn at random in updates, ``uint32[2]``; never changes. None where nothing is."""
+
+
+class Munchausen(NamedTuple):
+    """Settings of :func:`munchausen_target`."""
+
+    alpha: float
+    temperature: float
+    clip: float
+
+
+class Returns(NamedTuple):
+    """What a network predicts of the return of every action, and how it learns it.
+
+    Keys are for what is drawn at random: noise on the weights, or the fractions of quantiles. None stands for no noise.
+    """
+
+    build: Callable[[Array, tuple[Leaf, ...], Any, int, bool], Any]
+    """``build(key, leaves, shape, n_actions, dueling)``: the network."""
+    values: Callable[[Any, PyTree, Array | None], Array]
+    """``values(network, obs, key)``: the mean of the return of every action, ``(batch, n_actions)``."""
+    describe: Callable[[Any, PyTree, Any], Array]
+    """``describe(network, obs, key)``: values, quantiles or probabilities, of which a mean over actions makes sense,
+    ``(batch, n_actions, ...)``."""
+    target: Callable[[Array, Array, Array], Array]
+    """``target(reward, discount, following)``: what is learned from ``(batch,)`` twice and what describes the return that
+    follows, ``(batch, ...)``."""
+    loss: Callable[[Any, PyTree, Array, Array, Any], tuple[Array, Array, Array]]
+    """``loss(network, obs, action, target, key)``: the loss, the error that priorities go by, and the mean of the
+    prediction, ``(batch,)`` each."""
+    is_random: bool = False
+    """Whether updates draw something at random."""
+    munchausen: Munchausen | None = None
+    """Settings of the target, None for that of the best action."""
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
@@ -159,39 +247,41 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         ValueError: if the action space is not Discrete.
         TypeError: if the observation space holds something that is not an array.
     """
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm, config.clip_grad_value)
+    return q_learning(config, observation_space, action_space, config.returns, optimizer)
+
+
+def q_learning(
+    config: Any, observation_space: spaces.Space, action_space: spaces.Space, returns: Returns, optimizer: Optimizer
+) -> Algorithm:
+    """Returns the algorithm of these spaces that learns this of the return."""
     n_actions = check_discrete_action(action_space, config.name)
     obs_leaves, shape = network_inputs(config, observation_space)
-    optimizer = optimizers.make(config.optimizer, config.max_grad_norm, config.clip_grad_value)
+    returns = (with_noise(returns) if config.noisy else returns)._replace(munchausen=config.munchausen)
     epsilon = config.epsilon
 
     def init(key: Array) -> State:
-        kind = Dueling if config.dueling else Network
-        network = with_memory(
-            key,
-            obs_leaves,
-            shape,
-            lambda leaves, shape: kind(key, leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape),
-        )
-        return initial_state(network, optimizer)
+        build = lambda leaves, shape: returns.build(key, leaves, shape, n_actions, config.dueling)  # noqa: E731
+        network = with_memory(key, obs_leaves, shape, build)
+        network = noisy(network) if config.noisy else network
+        update_key = jax.random.fold_in(key, 5) if returns.is_random else None
+        return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0), update_key)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
         moves = moves_due(state.step, clock.step, config.target_update_interval)
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
-        target = without_gradient(td_target)(state.network, target_network, batch, config.double_q)
+        key, *keys = (None, *NO_KEYS) if state.key is None else jax.random.split(nth(state.key, state.n_updates), 3)
+        target = without_gradient(td_target)(state.network, target_network, batch, config.double_q, returns, keys)
         rate = at(config.learning_rate, clock.progress)
-        network, optimizer_state, loss, td_error = minimize(
-            td_loss, state.network, state.optimizer, optimizer, rate, batch, target, LOSSES[config.loss]
+        network, optimizer_state, loss, (td_error, value) = minimize(
+            td_loss, state.network, state.optimizer, optimizer, rate, batch, target, returns, key
         )
+        metrics = metrics_of(loss, jnp.mean(value), epsilon, clock) | {TD_ERROR: jnp.abs(td_error)}
         step = jnp.asarray(clock.step, jnp.uint32)
-        metrics = metrics_of(loss, jnp.mean(td_error + target), epsilon, clock) | {TD_ERROR: jnp.abs(td_error)}
-        return State(network, target_network, optimizer_state, step, state.n_updates + 1), metrics
+        return State(network, target_network, optimizer_state, step, state.n_updates + 1, state.key), metrics
 
-    return remembering(epsilon_greedy_algorithm(init, update, epsilon), shape, lambda state: (state.network,))
-
-
-def initial_state(network: Any, optimizer: Optimizer) -> State:
-    """Returns the state before the first update."""
-    return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0))
+    algorithm = epsilon_greedy_algorithm(init, update, epsilon, values=returns.values)
+    return remembering(algorithm, shape, lambda state: (state.network,))
 
 
 def epsilon_greedy_algorithm(
@@ -199,35 +289,27 @@ def epsilon_greedy_algorithm(
     update: Callable[..., Any],
     epsilon: Schedule,
     state_value: Callable[..., Array] | None = None,
+    values: Callable[[Any, PyTree, Array | None], Array] = lambda network, obs, key: network(obs),
 ) -> Algorithm:
-    """Returns the algorithm that explores by :func:`epsilon_greedy` and exploits by :func:`greedy` actions.
+    """Returns the algorithm that explores by :func:`epsilon_greedy` actions, of a state with a field ``network``.
 
-    Args:
-        init: of :class:`Algorithm`, as are the other functions. The state has a field ``network``, which maps observations
-            to the values of all actions.
-        update: learns from a batch or a rollout.
-        epsilon: the probability of a random action as a function of the progress.
-        state_value: the values of observations, or None.
+    ``values`` is as in :class:`Returns`, ``epsilon`` a function of the progress; the rest is of :class:`Algorithm`.
     """
 
     def explore(network: Any, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return epsilon_greedy(network(obs), at(epsilon, clock.progress), key, unmasked(obs)[1])
-
-    def exploit(network: Any, obs: PyTree) -> Array:
-        return greedy(network(obs), unmasked(obs)[1])
-
-    def values(state: Any, obs: PyTree, action: None) -> Array:
-        return state.network(obs)[None]
+        return epsilon_greedy(values(network, obs, key), at(epsilon, clock.progress), key, unmasked(obs)[1])
 
     return Algorithm(
         init,
         lambda state: state.network,
         explore,
-        exploit,
+        lambda network, obs: greedy(values(network, obs, None), unmasked(obs)[1]),
         update,
-        action_values=values,
+        action_values=lambda state, obs, action: values(state.network, obs, None)[None],
         state_value=state_value,
-        imitation=lambda network, obs, action: margin_loss(forbid(network(obs), unmasked(obs)[1]), action),
+        imitation=lambda network, obs, action: margin_loss(
+            forbid(values(network, obs, None), unmasked(obs)[1]), action
+        ),
     )
 
 
@@ -250,6 +332,27 @@ def metrics_of(loss: Array, q_value: Array, epsilon: Schedule, clock: Clock) -> 
     return {"loss": loss, "q_value": q_value, "exploration_rate": exploration_rate}
 
 
+def value_network(
+    key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig, n_actions: int, dueling: bool, n: int | None = None
+) -> Any:
+    """Returns a network from observations to values ``(batch, n_actions)``, or ``(batch, n_actions, n)`` for a number n."""
+    kind, widths, n_outputs = Dueling if dueling else Network, shape.critic_widths(HIDDEN_LAYERS), n_actions * (n or 1)
+    outputs = kind(key, leaves, n_outputs, widths, shape, **({"n_streams": n} if dueling and n else {}))
+    return outputs if n is None else DistributionalNetwork(outputs, n)
+
+
+class DistributionalNetwork(eqx.Module):
+    """Observation to what describes the return of every action, such as quantiles."""
+
+    outputs: Any
+    n: int = eqx.field(static=True)
+
+    def __call__(self, obs: PyTree) -> Array:
+        """Maps observations ``(batch, ...)`` to ``(batch, n_actions, n)``."""
+        outputs = self.outputs(obs)
+        return outputs.reshape(outputs.shape[0], -1, self.n)
+
+
 class Dueling(eqx.Module):
     """Observation to the values of all actions by two streams, which part before the last hidden layer.
 
@@ -265,58 +368,145 @@ class Dueling(eqx.Module):
     advantage_head: Any
 
     def __init__(
-        self, key: Array, leaves: tuple[Leaf, ...], n_actions: int, widths: Sequence[int], shape: PolicyConfig
+        self,
+        key: Array,
+        leaves: tuple[Leaf, ...],
+        n_outputs: int,
+        widths: Sequence[int],
+        shape: PolicyConfig,
+        n_streams: int = 1,
     ) -> None:
+        """Builds the streams of ``n_outputs``, those of the actions one after another, with ``n_streams`` for each."""
         keys = jax.random.split(key, 6)
-        plain = shape.torso is None and shape.architecture == "mlp" and not shape.has_branches
-        shared, own = (widths[:-1], widths[-1:]) if plain else (widths, ())
+        shared, own = parted(widths, shape)
         stream = lambda k, n_inputs: MLP(k, n_inputs, own, shape.activation_fn, shape.layer_norm)  # noqa: E731
         self.encoder = make_encoder(keys[0], leaves, shape)
         self.torso, n_shared = make_torso(keys[1], self.encoder.n_features, None, shared, shape)
         self.value = stream(keys[2], n_shared)
         self.advantage = stream(keys[3], n_shared)
         n_hidden = (n_shared, *own)[-1]
-        self.value_head = make_head(keys[4], n_hidden, 1, shape)
-        self.advantage_head = make_head(keys[5], n_hidden, n_actions, shape)
+        self.value_head = make_head(keys[4], n_hidden, n_streams, shape)
+        self.advantage_head = make_head(keys[5], n_hidden, n_outputs, shape)
 
     def __call__(self, obs: PyTree) -> Array:
-        """Maps observations ``(batch, ...)`` to values ``(batch, n_actions)``."""
+        """Maps observations ``(batch, ...)`` to ``(batch, n_outputs)``."""
         shared = self.torso(self.encoder(obs))
-        return joined(self.value_head(self.value(shared)), self.advantage_head(self.advantage(shared)))
+        value = self.value_head(self.value(shared))[:, None]
+        advantage = self.advantage_head(self.advantage(shared))
+        return joined(value, advantage.reshape(value.shape[0], -1, value.shape[2])).reshape(advantage.shape)
+
+
+def parted(widths: Sequence[int], shape: PolicyConfig) -> tuple[Sequence[int], Sequence[int]]:
+    """Returns the widths of hidden layers before the last one, and of the last one where it is a layer of its own."""
+    plain = shape.torso is None and shape.architecture == "mlp" and not shape.has_branches
+    return (widths[:-1], widths[-1:]) if plain else (widths, ())
 
 
 def joined(value: Array, advantage: Array) -> Array:
-    """Returns ``V + A - mean A``, ``(batch, n_actions)`` (arXiv 1511.06581, equation 9).
+    """Returns ``V + A - mean A``, ``(batch, n_actions, ...)`` (arXiv 1511.06581, equation 9).
 
-    Without the mean, a constant could move between ``value``, ``(batch, 1)``, and ``advantage``,
-    ``(batch, n_actions)``, and neither would mean anything.
+    Without the mean, a constant could move between ``value``, ``(batch, 1, ...)``, and ``advantage``,
+    ``(batch, n_actions, ...)``, and neither would mean anything.
 
     >>> joined(jnp.array([[10.0]]), jnp.array([[1.0, 2.0, 6.0]]))
     Array([[ 8.,  9., 13.]], dtype=float32)
     """
-    return value + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
+    return value + advantage - jnp.mean(advantage, axis=1, keepdims=True)
+
+
+def expected(penalty: Callable[[Array], Array]) -> Returns:
+    """Returns what learns the mean of the return, with this function of the TD error as the loss."""
+
+    def loss(network: Any, obs: PyTree, action: Array, target: Array, key: Any) -> tuple[Array, Array, Array]:
+        value = taken(network(obs), action)
+        return penalty(value - target), value - target, value
+
+    values = lambda network, obs, key: network(obs)  # noqa: E731
+    return Returns(
+        value_network, values, values, lambda reward, discount, following: reward + discount * following, loss
+    )
+
+
+LOSSES: dict[str, Returns] = {"huber": expected(optax.huber_loss), "squared": expected(jnp.square)}
+"""What learns the mean of the return, by the name of the setting ``loss``."""
+MEAN, NO_KEYS = LOSSES["huber"], (None, None)
+
+
+def categorical_returns(atoms: Array) -> Returns:
+    """Returns what learns the probabilities of these atoms (C51). Priorities go by the divergence, as in Rainbow."""
+    probabilities = lambda network, obs, key: jax.nn.softmax(network(obs), axis=-1)  # noqa: E731
+
+    def target(reward: Array, discount: Array, following: Array) -> Array:
+        return categorical.project(reward[:, None] + discount[:, None] * atoms[None], following, atoms)
+
+    def loss(network: Any, obs: PyTree, action: Array, target: Array, key: Any) -> tuple[Array, Array, Array]:
+        logits = taken(network(obs), action)
+        entropy = -jnp.sum(jax.scipy.special.xlogy(target, target), axis=-1)
+        loss = categorical.cross_entropy(logits, target)
+        return loss, loss - entropy, categorical.mean_of(logits, atoms)
+
+    values = lambda network, obs, key: categorical.mean_of(network(obs), atoms)  # noqa: E731
+    return Returns(partial(value_network, n=atoms.shape[0]), values, probabilities, target, loss)
+
+
+def with_noise(returns: Returns) -> Returns:
+    """Returns the same with noise on the weights of the network, unless the key is None."""
+    return returns._replace(
+        values=lambda network, obs, key: returns.values(drawn(network, key), obs, key),
+        describe=lambda network, obs, key: returns.describe(drawn(network, key), obs, key),
+        loss=lambda network, obs, action, target, key: returns.loss(drawn(network, key), obs, action, target, key),
+        is_random=True,
+    )
 
 
 def td_target(
-    network: Network | Dueling, target_network: Network | Dueling, batch: Transition, double_q: bool
+    network: Any, target_network: Any, batch: Transition, double_q: bool, returns: Returns = MEAN, keys: Any = NO_KEYS
 ) -> Array:
-    """Returns the TD targets, ``(batch,)``."""
-    next_values = target_network(batch.next_obs)
-    chooser = network(batch.next_obs) if double_q else next_values
-    mask = unmasked(some_allowed(batch.next_obs))[1]
-    return batch.reward + batch.discount * taken(next_values, greedy(chooser, mask))
+    """Returns the TD targets, ``(batch,)`` or ``(batch, ...)``; ``keys`` are for the network and the target network."""
+    chooser, key = (network, keys[0]) if double_q else (target_network, keys[1])
+    values, mask = returns.values(chooser, batch.next_obs, key), unmasked(some_allowed(batch.next_obs))[1]
+    following = returns.describe(target_network, batch.next_obs, keys[1])
+    if returns.munchausen is not None:
+        own = returns.values(target_network, batch.obs, keys[1])
+        return returns.target(*munchausen_target(returns.munchausen, batch, own, forbid(values, mask), following))
+    return returns.target(batch.reward, batch.discount, taken(following, greedy(values, mask)))
+
+
+def munchausen_target(
+    settings: Munchausen, batch: Transition, own: Array, values: Array, following: Array
+) -> tuple[Array, Array, Array]:
+    """Returns the reward, the discount and what follows, of Munchausen Q-learning (arXiv 2007.14430, equation 3 and M-IQN).
+
+    With the policies ``pi = softmax(Q' / tau)`` and a description ``Z'`` of the return that follows::
+
+        r + alpha [tau log pi(a|s)]_clip^0 + d sum_a' pi(a'|s') (Z'(s', a') - tau log pi(a'|s'))
+
+    The entropy does not depend on the description, so that it is a part of the reward here. For n-step returns it is
+    discounted with the value that follows, and only the first action has its log-probability added.
+
+    Args:
+        settings: ``alpha``, the temperature ``tau`` and ``clip``.
+        batch: of transitions.
+        own: values of all actions in ``obs``, ``(batch, n_actions)``.
+        values: by which the policy chooses in ``next_obs``, likewise.
+        following: ``(batch, n_actions, ...)``.
+    """
+    tau = settings.temperature
+    log_policy = jax.nn.log_softmax(values / tau, axis=-1)
+    policy = jnp.exp(log_policy)
+    entropy = -tau * jnp.sum(policy * log_policy, axis=-1)
+    own = jax.nn.log_softmax(forbid(own, unmasked(batch.obs)[1]) / tau, axis=-1)
+    bonus = settings.alpha * jnp.clip(tau * taken(own, batch.action), settings.clip, 0.0)
+    mean = jnp.einsum("ba,ba...->b...", policy, following)
+    return batch.reward + bonus + batch.discount * entropy, batch.discount, mean
 
 
 def td_loss(
-    network: Network | Dueling, batch: Transition, target: Array, penalty: Callable[[Array], Array]
-) -> tuple[Array, Array]:
-    """Returns the mean penalty of the TD errors, and the errors ``Q(s, a) - y``, ``(batch,)``."""
-    td_error = taken(network(batch.obs), batch.action) - target
-    return weighted_mean(penalty(td_error), batch.weight), td_error
-
-
-LOSSES: dict[str, Callable[[Array], Array]] = {"huber": optax.huber_loss, "squared": jnp.square}
-"""The losses of a TD error by the name of the setting ``loss``."""
+    network: Any, batch: Transition, target: Array, returns: Returns, key: Array | None = None
+) -> tuple[Array, tuple[Array, Array]]:
+    """Returns the mean loss, and of each transition the error and the mean of the prediction, ``(batch,)``."""
+    loss, td_error, value = returns.loss(network, batch.obs, batch.action, target, key)
+    return weighted_mean(loss, batch.weight), (td_error, value)
 
 
 def taken(values: Array, action: Array) -> Array:

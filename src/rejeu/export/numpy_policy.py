@@ -30,7 +30,7 @@ ACTIVATIONS: dict[str, Function] = {
 }
 SQUASHED = ("SAC", "TQC", "CrossQ", "TD3", "DDPG")
 ACTORS = {
-    **dict.fromkeys(("PPO", "A2C", "TRPO", "MaskablePPO", "DQN", "PQN"), "network"),
+    **dict.fromkeys(("PPO", "A2C", "TRPO", "MaskablePPO", "DQN", "IQN", "PQN"), "network"),
     **dict.fromkeys(SQUASHED, "actor"),
     "QRDQN": "network.outputs",
     "ARS": "actor.network",
@@ -53,18 +53,28 @@ class NumpyPolicy:
         scaled = self._normalizations(config["normalize"]) if is_normalized else [None] * len(self._leaves)
         self._encoders = [encoder(leaf, scale) for leaf, scale in zip(self._leaves, scaled, strict=True)]
         self._shape = config["policy_kwargs"]
+        n_outputs = config["n_quantiles"] if name == "QRDQN" else None
         prefix = ACTORS[name]
+        if config.get("distribution") == "categorical":
+            prefix, n_outputs = "network.outputs", config["n_atoms"]
         hidden = self._torso(f"{prefix}.torso")
+        if name == "IQN":
+            described = self._described(config["n_policy_quantiles"])
+            hidden += [lambda x: x[..., None, :] * described, *self._torso("network.reader.torso")]
+            prefix = "network.reader"
         if f"{prefix}.value_head.weight" in self._arrays and f"{prefix}.advantage_head.weight" in self._arrays:
             value, advantage = (
                 [*self._layers(f"{prefix}.{part}"), self._linear(f"{prefix}.{part}_head")]
                 for part in ("value", "advantage")
             )
-            hidden.append(lambda x: joined(applied(value, x), applied(advantage, x)))
+            hidden.append(lambda x: joined(applied(value, x), applied(advantage, x), n_outputs or 1))
         else:
             hidden.append(self._linear(f"{prefix}.head"))
-        if name == "QRDQN":
-            hidden.append(lambda x: x.reshape(*x.shape[:-1], -1, config["n_quantiles"]).mean(axis=-1))
+        if n_outputs is not None:
+            mean = np.mean if name == "QRDQN" else categorical_mean(config["v_min"], config["v_max"], n_outputs)
+            hidden.append(lambda x: mean(x.reshape(*x.shape[:-1], -1, n_outputs), axis=-1))
+        if name == "IQN":
+            hidden.append(lambda x: x.mean(axis=-2))
         self._steps = hidden
         self.takes_masks = config.get("action_masks", name == "MaskablePPO")
         is_squashed = name in SQUASHED or (
@@ -165,6 +175,13 @@ class NumpyPolicy:
             i += 1
         return steps
 
+    def _described(self, n: int) -> np.ndarray:
+        """Returns what describes the fractions of ``n`` quantiles of IQN, ``(n, n_features)``."""
+        embed = self._linear("network.embedding")
+        frequencies = np.pi * np.arange(len(self._arrays["network.embedding.weight"]), dtype=np.float32)
+        fractions = (np.arange(n, dtype=np.float32) + 0.5) / n
+        return np.maximum(embed(np.cos(fractions[:, None] * frequencies.astype(np.float32))), 0.0).astype(np.float32)
+
     def _linear(self, prefix: str) -> Function:
         weight, bias = self._arrays[f"{prefix}.weight"], self._arrays[f"{prefix}.bias"]
         return lambda x: x @ weight + bias
@@ -198,9 +215,21 @@ def residual(steps: list[Function]) -> Function:
     return lambda x: x + applied(steps, x)
 
 
-def joined(value: np.ndarray, advantage: np.ndarray) -> np.ndarray:
-    """Returns ``V + A - mean A``, the values of all actions."""
-    return value + advantage - advantage.mean(axis=-1, keepdims=True)
+def joined(value: np.ndarray, advantage: np.ndarray, n: int) -> np.ndarray:
+    """Returns ``V + A - mean A``, for each action ``n`` numbers, ``(batch, n_actions * n)``."""
+    advantages = advantage.reshape(*advantage.shape[:-1], -1, n)
+    return (value[..., None, :] + advantages - advantages.mean(axis=-2, keepdims=True)).reshape(advantage.shape)
+
+
+def categorical_mean(v_min: float, v_max: float, n: int) -> Callable[..., np.ndarray]:
+    """Returns the function from logits to the means of their distributions."""
+    atoms = np.linspace(v_min, v_max, n, dtype=np.float32)
+
+    def mean(logits: np.ndarray, axis: int) -> np.ndarray:
+        exponential = np.exp(logits - logits.max(axis=axis, keepdims=True))
+        return exponential @ atoms / exponential.sum(axis=axis)
+
+    return mean
 
 
 def standardizer(mean: Any, variance: Any, epsilon: float, limit: float) -> Function:
