@@ -56,6 +56,8 @@ CAUSES = {
     r"shimmy\[gym-v|named 'gym'": "no environment, but a wrapper of those for Gym",
     r"compatibility-env": "no environment, but a wrapper of those for DeepMind's interface",
     r"old version|DeprecatedEnv|mujoco.py|needs mujoco": "an old version that can no longer be made; the newest one works",
+    r"ConcatVecEnv resets": "SuperSuit's vector does not say how it resets, and is refused",
+    r"spaces not consistent": "its agents have different observations",
     r"No OpenGL": "its observations are pictures, and there was no OpenGL (MUJOCO_GL=egl)",
     r"PhysicsError": "random actions make its simulation invalid",
     r"flex_vertedge": 'dm-control 1.0.50 fails with MuJoCo 4.0: add "mujoco<4"',
