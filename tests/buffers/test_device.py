@@ -21,7 +21,7 @@ from rejeu.envs.functional.vector import goal_functions
 from rejeu.loops.device.off_policy import draws
 from rejeu.prng import below
 from rejeu.schedules import Linear
-from tests.buffers.test_hindsight import closest
+from tests.buffers.test_hindsight import nearby
 from tests.jax_environments import Reach
 from tests.loops.device.same_draws import use_same_draws
 
@@ -109,7 +109,13 @@ def test_uniform_batches_equal_those_of_the_host(n_envs: int, n: int, n_steps: i
 
 @pytest.mark.parametrize(
     "strategy",
-    ["future", closest, *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("final", "episode", "random"))],
+    [
+        "future",
+        nearby,
+        "closest",
+        "next_future",
+        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("final", "episode", "random")),
+    ],
 )
 @pytest.mark.parametrize(
     ("n", "n_steps", "stops"),

@@ -28,6 +28,8 @@ from tests.replay_model import GOAL_OBSERVATION, Model, Turn, make_ring, observe
 
 GAMMA = 0.9
 STRATEGIES = [strategy.value for strategy in GoalSelectionStrategy]
+EVEN = ["future", "final", "episode", "random"]
+"""Strategies by which all allowed goals are equally likely."""
 
 
 def reward(achieved, desired):
@@ -58,7 +60,7 @@ def filled(n_envs, rows, history, strategy="future", k=4, n_steps=1, ends=False,
 def allowed_goals(model, strategy, env, place):
     """All (environment, place) whose achieved goal may replace the goal of the step at (env, place)."""
     episode = model.episode(env, place)
-    if strategy == "future":
+    if strategy in ("future", "closest", "next_future"):
         return {(env, later) for later in episode if later > place}
     if strategy == "final":
         return {(env, episode[-1])}
@@ -137,7 +139,7 @@ RUNNING_AND_WRAPPED = [turn("truncated" if i == 5 else "terminated" if i == 13 e
 the third still runs."""
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("strategy", EVEN)
 def test_every_allowed_goal_is_drawn_and_equally_often(strategy):
     """Pearson's chi-square of the goals of every step, at the 0.1 % level over about 15 steps together."""
     replay, model = filled(1, 16, RUNNING_AND_WRAPPED, strategy)
@@ -153,6 +155,36 @@ def test_every_allowed_goal_is_drawn_and_equally_often(strategy):
         assert min(counts) > 0
         if len(counts) > 1:
             assert stats.chisquare(counts).pvalue > 1e-3 / 15
+
+
+def later_goals(strategy):
+    """Of a running episode of 10 steps: times of 40,000 relabeled steps and of their goals."""
+    replay, _ = filled(1, 16, [turn("no")] * 10, strategy, k=10**6)
+    batch = replay.sample(np.random.default_rng(0), (40_000,))
+    return (batch.obs[key][:-1, 1].astype(int) for key in ("observation", "desired_goal"))
+
+
+def test_of_the_goals_of_next_future_a_quarter_more_is_the_next_moment():
+    """With ``m`` later moments the next one has the probability 1/4 + 3/4 1/m, and every other one 3/4 1/m."""
+    places, goals = later_goals("next_future")
+    for place in range(10):
+        m, of_place = 10 - place, goals[places == place]
+        counts = np.bincount(of_place - place - 1, minlength=m)
+        expected = len(of_place) * (0.75 / m + 0.25 * (np.arange(m) == 0))
+        assert len(counts) == m
+        assert m == 1 or stats.chisquare(counts, expected).pvalue > 1e-4
+
+
+def test_the_goal_of_closest_is_the_nearest_of_eight_later_moments():
+    """The goal is at place -1, so the earliest of 8 of ``m`` is nearest: the least is above j with (1 - j/m)^8."""
+    places, goals = later_goals("closest")
+    for place in range(10):
+        m, of_place = 10 - place, goals[places == place]
+        counts = np.bincount(of_place - place - 1, minlength=m)
+        above = (1 - np.arange(m + 1) / m) ** 8
+        expected = len(of_place) * (above[:-1] - above[1:])
+        many = expected > 5
+        np.testing.assert_allclose(counts[many], expected[many], atol=5 * np.sqrt(expected[many].max()))
 
 
 def test_future_reaches_the_final_observation_and_never_the_present_one():
@@ -232,7 +264,9 @@ def test_a_ring_without_the_counters_of_the_strategy_is_refused():
             HerReplayBuffer(make_ring(8, 1, GOAL_OBSERVATION, kept), GAMMA, config, GoalFunctions(reward))
 
 
-@pytest.mark.parametrize(("strategy", "n_counters"), [("random", 0), ("future", 1), ("final", 1), ("episode", 2)])
+@pytest.mark.parametrize(
+    ("strategy", "n_counters"), [("random", 0), ("future", 1), ("final", 1), ("closest", 1), ("episode", 2)]
+)
 def test_a_row_takes_what_the_strategy_needs(strategy, n_counters):
     """Observations like parking-v0's: 18 numbers, two actions and a reward of 4 bytes each, and one byte for the kind."""
     box = gym.spaces.Box(-np.inf, np.inf, (6,), np.float64)
@@ -251,7 +285,10 @@ def test_a_strategy_is_given_by_string_or_enum(strategy):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"goal_selection_strategy": "furture"}, "'furture' must be one of future, final, episode, random"),
+        (
+            {"goal_selection_strategy": "furture"},
+            "'furture' must be one of future, final, episode, random, closest, next_future",
+        ),
         ({"n_sampled_goal": -1}, "n_sampled_goal=-1 must be a whole number of at least 0"),
         ({"n_sampled_goal": 1.5}, "n_sampled_goal=1.5 must be a whole number"),
         ({"n_sampled_goal": True}, "n_sampled_goal=True must be a whole number"),
@@ -270,8 +307,8 @@ FUNCTIONS = {
 }
 
 
-@register_goal_strategy("closest")
-def closest(steps):
+@register_goal_strategy("nearby")
+def nearby(steps):
     """Of four later observations, takes the one whose achieved goal is closest to the goal."""
     times = steps.integers(steps.np.repeat(steps.time[:, None] + 1, 4, axis=1), steps.last[:, None] + 1)
     distance = steps.np.abs(steps.achieved(times) - steps.desired()[:, None]).sum(axis=-1)
@@ -279,8 +316,8 @@ def closest(steps):
 
 
 def test_a_strategy_of_the_users_own_sees_goals_and_is_known_by_its_name():
-    named, _ = filled(1, 40, RUNNING_AND_WRAPPED, closest)
-    assert named.config.goal_selection_strategy == "closest"
+    named, _ = filled(1, 40, RUNNING_AND_WRAPPED, nearby)
+    assert named.config.goal_selection_strategy == "nearby"
     later, _ = filled(1, 40, RUNNING_AND_WRAPPED, "future")
     distances = []
     for buffer in (named, later):

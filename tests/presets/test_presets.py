@@ -1,8 +1,13 @@
+import contextlib
 import dataclasses
 
+import numpy as np
 import pytest
 
+import rejeu
 from rejeu import AGENTS, presets, validation
+from rejeu.agents.registry import find_preset
+from tests.tiers import exhaustive
 
 
 @pytest.mark.parametrize("preset", presets.ALL, ids=lambda preset: f"{preset.env_id}-{preset.algorithm}")
@@ -39,9 +44,46 @@ def test_a_preset_cannot_be_changed():
     assert hash(preset)
 
 
-def test_every_preset_has_a_result_and_every_result_a_preset():
+def test_every_result_has_a_preset_and_every_preset_a_result_or_says_that_it_is_not_tuned():
     found = {(result.env_id, result.algorithm) for result in presets.results()}
-    assert found == {(preset.env_id, preset.algorithm) for preset in presets.ALL}
+    untuned = {(preset.env_id, preset.algorithm) for preset in presets.ALL if preset.source.endswith("not tuned")}
+    known = {(preset.env_id, preset.algorithm) for preset in presets.ALL}
+    as_it_is = {(result.env_id, result.algorithm) for result in presets.results() if not result.setting}
+    assert as_it_is <= known <= found | untuned
+
+
+def test_a_preset_with_a_name_is_for_any_environment():
+    assert presets.named("Rainbow", "CartPole-v1").hyperparameters["distribution"] == "categorical"
+    assert presets.named("BTR", "MinAtar/Breakout-v1").algorithm == "IQN"
+    assert presets.named("", "CartPole-v1") is None
+    assert presets.named("Rainbw", "CartPole-v1") is None
+    with pytest.raises(ValueError, match="the preset Rainbow is for DQN, not for PPO"):
+        find_preset("CartPole-v1", "PPO", "Rainbow")
+    assert find_preset("CartPole-v1", None, "Rainbow") == presets.named("Rainbow", "CartPole-v1")
+
+
+GOALS = [
+    preset.env_id
+    for preset in presets.ALL
+    if preset.hyperparameters.get("replay_buffer_class") == "HerReplayBuffer" and preset.algorithm == "SAC"
+]
+
+
+@exhaustive
+@pytest.mark.parametrize("env_id", GOALS)
+def test_a_preset_of_a_goal_task_learns_with_the_backend_it_names(env_id):
+    """2,000 steps with updates from step 1,800 on; every weight moves and stays finite."""
+    preset = presets.find(env_id)
+    with contextlib.closing(rejeu.make_vector(env_id, 2, preset.backend, seed=0)) as env:
+        settings = {**preset.hyperparameters, "learning_starts": 1_800, "buffer_size": 2_000}
+        agent = AGENTS[preset.algorithm]("MultiInputPolicy", env, seed=0, **settings)
+        before = agent.get_parameters()
+        agent.learn(2_000)
+        assert agent.num_timesteps == 2_000
+        assert agent.n_updates > 0
+        after = agent.get_parameters()
+        assert all(np.isfinite(value).all() for value in after.values())
+        assert any((after[name] != before[name]).any() for name in before if name.startswith("actor."))
 
 
 def test_result_shows_mean_interval_and_seeds():

@@ -141,19 +141,19 @@ def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
 
 
 def find_preset(env_id: str, algorithm: str | None, path: str | Path | None) -> Preset | None:
-    """Returns the preset of a file, else that of the environment and the algorithm, None if there is none.
+    """Returns the preset of a name or a file, else that of the environment and the algorithm, None if there is none.
 
     Raises:
         CheckpointError: if the algorithm of the file is not registered.
-        ValueError: if the file is a preset of another algorithm.
+        ValueError: if it is a preset of another algorithm.
     """
     if path is None:
         return all_presets.find(env_id, algorithm)
-    preset = all_presets.read(path)
+    preset = all_presets.named(str(path), env_id) or all_presets.read(path)
     agent_of_file(preset.algorithm, path)
     if algorithm not in (None, preset.algorithm):
         raise ValueError(f"the preset {path} is for {preset.algorithm}, not for {algorithm}; leave out one of them")
-    if preset.env_id != env_id:
+    if preset.env_id != env_id and not preset.name:
         warnings.warn(f"the preset {path} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
     return preset
 

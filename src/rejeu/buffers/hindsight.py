@@ -7,6 +7,10 @@ drawn: the share ``k / (k + 1)`` of every batch gets, in place of its own goal, 
 - ``final``: the episode's last moment,
 - ``episode``: any moment of the same episode,
 - ``random``: any moment in the buffer,
+- ``closest``: of some later moments of the same episode the one whose achieved goal is closest to the goal (proximity, of
+  Fang et al. 2019, "Curriculum-guided Hindsight Experience Replay"),
+- ``next_future``: of every four, one the very next moment, which succeeds in one step, and three as ``future`` (Ozgur et al.
+  2025, "Next-Future", arXiv 2504.11247),
 
 and the environment's reward for that goal. Of episodes that still run, or whose beginning was overwritten, the stored
 part is used. ``terminated`` is recomputed if the environment has ``compute_terminated``, and kept otherwise: a crash
@@ -31,6 +35,11 @@ from rejeu.buffers.uniform import BaseReplayBuffer, NewGoals
 from rejeu.core import Transition
 from rejeu.envs.goals import GoalFunctions
 
+N_CANDIDATES = 8
+"""Later moments of which ``closest`` takes one. All of an episode would always choose the same."""
+N_GOALS = 4
+"""Goals of a transition of which ``next_future`` takes one from the next moment; those of the paper."""
+
 
 @dataclass(frozen=True)
 class HindsightSteps:
@@ -46,7 +55,7 @@ class HindsightSteps:
     """Times of the observations; ``time + 1`` is that of the next ones."""
     first: Any
     """The first times of the same episodes that may be chosen: those after the oldest observations that are stored. None for
-    ``future`` and ``final``."""
+    strategies of :data:`FROM_LATER` on the host."""
     last: Any
     """The last times that may be chosen: those of the newest observations."""
     achieved: Callable[[Any], Any]
@@ -109,7 +118,24 @@ def episode(steps: HindsightSteps) -> Any:
     return steps.integers(steps.first, steps.last + 1)
 
 
-BUILT_IN = {"future": future, "final": final, "episode": episode}
+def closest(steps: HindsightSteps) -> Any:
+    """Returns the time, of :data:`N_CANDIDATES` later ones, whose achieved goal has the least distance to the goal."""
+    np = steps.np
+    times = steps.integers(np.repeat(steps.time[:, None] + 1, N_CANDIDATES, axis=1), steps.last[:, None] + 1)
+    difference = steps.achieved(times).astype("float32") - steps.desired().astype("float32")[:, None]
+    distance = np.square(difference).reshape(*times.shape, -1).sum(axis=-1)
+    return np.take_along_axis(times, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
+
+
+def next_future(steps: HindsightSteps) -> Any:
+    """Returns the next time for one of :data:`N_GOALS` transitions, chosen at random, and later times for the others."""
+    nothing = steps.np.zeros_like(steps.time)
+    is_next = steps.integers(nothing, nothing + N_GOALS) == 0
+    return steps.np.where(is_next, steps.time + 1, future(steps))
+
+
+FROM_LATER = {"future": future, "final": final, "closest": closest, "next_future": next_future}
+BUILT_IN = {**FROM_LATER, "episode": episode}
 """Without ``random``, which takes the goals of other episodes."""
 STRATEGIES: dict[str, GoalStrategy] = dict(BUILT_IN)
 """All strategies that have a name."""
@@ -152,6 +178,8 @@ class GoalSelectionStrategy(str, Enum):
     FINAL = "final"
     EPISODE = "episode"
     RANDOM = "random"
+    CLOSEST = "closest"
+    NEXT_FUTURE = "next_future"
 
 
 @dataclass(frozen=True)
@@ -161,8 +189,8 @@ class HindsightConfig:
     n_sampled_goal: int = 4
     """Relabeled transitions per original one. Raising it learns more from failures and less from the real goals."""
     goal_selection_strategy: str | GoalStrategy = "future"
-    """``future``, ``final``, ``episode`` or ``random``, a ``GoalSelectionStrategy``, or a strategy of your own: a function
-    ``(steps) -> times``, or its registered name (see ``rejeu.buffers.hindsight.GoalStrategy``)."""
+    """``future``, ``final``, ``episode``, ``random``, ``closest``, ``next_future``, a ``GoalSelectionStrategy``, or a strategy
+    of your own: a function ``(steps) -> times``, or its registered name (see ``rejeu.buffers.hindsight.GoalStrategy``)."""
     copy_info_dict: bool = False
     """Give ``compute_reward`` the info of each step, row by row, instead of an empty one. Files of the buffer and checkpoints
     do not contain infos: after loading, those of earlier steps are empty."""
@@ -193,7 +221,7 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     strategy = None if config is None else config.goal_selection_strategy
     if strategy is None or strategy == "random":
         return ()
-    return ("until_end",) if strategy in ("future", "final") else ("since_start", "until_end")
+    return ("until_end",) if strategy in (*FROM_LATER,) else ("since_start", "until_end")
 
 
 class HerReplayBuffer(BaseReplayBuffer):

@@ -31,7 +31,8 @@ def show(algorithms: Mapping[str, str]) -> None:
     for one in presets.every():
         result = presets.find_result(one.env_id, one.algorithm) or one.source
         of_env = rows.setdefault(one.env_id, [])
-        of_env.append(("" if of_env else one.env_id, one.algorithm, f"{one.total_steps:,} steps", str(result)))
+        algorithm = f"{one.algorithm} ({one.name})" if one.name else one.algorithm
+        of_env.append(("" if of_env else one.env_id, algorithm, f"{one.total_steps:,} steps", str(result)))
     print(columns([row for of_env in rows.values() for row in of_env]))
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
@@ -55,7 +56,16 @@ def described(is_extended: bool) -> dict[str, str]:
 
 def as_dict(preset: Preset) -> dict[str, Any]:
     """Returns a preset with its measured result, which is None if there is none."""
-    names = ("env_id", "algorithm", "n_envs", "total_steps", "evaluate_every", "evaluate_episodes", "hyperparameters")
+    names = (
+        "env_id",
+        "algorithm",
+        "name",
+        "n_envs",
+        "total_steps",
+        "evaluate_every",
+        "evaluate_episodes",
+        "hyperparameters",
+    )
     known = {name: getattr(preset, name) for name in (*names, "source")}
     return {**known, "result": presets.find_result(preset.env_id, preset.algorithm)}
 

@@ -19,6 +19,8 @@ if "rejeu/CartPoleNoVelocity-v0" not in gym.registry:
         max_episode_steps=500,
         reward_threshold=475.0,
     )
+if "rejeu/ParkingHard-v0" not in gym.registry:
+    gym.register("rejeu/ParkingHard-v0", "rejeu.envs.parking_hard:ParkingHard")
 
 functional.register_with_gymnasium()
 

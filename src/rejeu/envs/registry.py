@@ -46,6 +46,8 @@ PROVIDERS: dict[tuple[str, ...], Provider] = {
         "lane-keeping-",
     ): Provider("highway_env", "highway-env", "parking"),
     ("ALE/",): Provider("ale_py", "ale-py", ""),
+    ("MinAtar/",): Provider("minatar", "MinAtar", ""),
+    ("rejeu/ParkingHard-",): Provider("highway_env", "highway-env", "parking"),
     ("Fetch", "Hand", "PointMaze", "AntMaze", "Adroit", "FrankaKitchen"): Provider(
         "gymnasium_robotics", "gymnasium-robotics", "robotics"
     ),
@@ -81,6 +83,8 @@ def register(env_id: str) -> bool:
         if source.module == "gymnasium_robotics":
             gym.register_envs(module)
             _compare_joints()
+        elif source.module == "minatar" and env_id not in gym.registry:
+            importlib.import_module("minatar.gym").register_envs()
     return env_id in gym.registry or ":" in env_id
 
 

@@ -44,6 +44,8 @@ class Preset:
     """Hyperparameters that differ from the algorithm's defaults, as keyword arguments of the agent; read-only."""
     n_envs: EnvCount
     """Number of parallel environments."""
+    name: Annotated[str, Meta(max_length=200)] = ""
+    """What the settings are known as, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none."""
     total_steps: Positive
     """Environment steps of a full run, over all environments."""
     evaluate_every: Positive
@@ -205,6 +207,16 @@ def every() -> tuple[Preset, ...]:
     return (*ALL, *(preset for presets in registered.values() for preset in presets))
 
 
+def named(name: str, env_id: str) -> Preset | None:
+    """Returns the preset of that name, the one of this environment if there are several, or None if there is none.
+
+    >>> named("Rainbow", "Acrobot-v1").algorithm
+    'DQN'
+    """
+    known = [preset for preset in every() if preset.name == name != ""]
+    return next((preset for preset in known if preset.env_id == env_id), known[0] if known else None)
+
+
 def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = MappingProxyType({})) -> Preset:
     """Returns a preset of the algorithm's defaults and ``hyperparameters``, for an environment that has no preset."""
     return Preset(
@@ -243,6 +255,7 @@ __all__ = [
     "every",
     "find",
     "find_result",
+    "named",
     "read",
     "register",
     "results",

@@ -1,0 +1,29 @@
+"""The environment ``rejeu/ParkingHard-v0``: highway-env's parking-v0 with many parked cars and narrow slots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from highway_env.envs.parking_env import ParkingEnv
+from highway_env.road.lane import StraightLane
+
+SLOTS, WIDTH = 18, 3.0
+"""Slots of each of the two rows, and their width in meters; 14 of 4 m in parking-v0. A car is 2 m wide and 5 m long."""
+
+
+class ParkingHard(ParkingEnv):
+    """Park in the one slot that is asked for, of 36 narrow ones of which 24 are taken.
+
+    Observations, actions, rewards, walls and the end of episodes are those of parking-v0, whose ``config`` it takes as well.
+    """
+
+    def __init__(self, config: dict[str, Any] | None = None, render_mode: str | None = None) -> None:
+        super().__init__({"vehicles_count": 24, **(config or {})}, render_mode)
+
+    def _create_road(self, spots: int = SLOTS) -> None:
+        super()._create_road(spots)
+        network = self.road.network
+        for (start, end, i), lane in network.lanes_dict().items():
+            x = (i + 0.5 - spots / 2) * WIDTH
+            ends = [x, lane.start[1]], [x, lane.end[1]]
+            network.graph[start][end][i] = StraightLane(*ends, width=WIDTH, line_types=lane.line_types)
