@@ -60,6 +60,7 @@ def td3_case(**settings: Any) -> Case:
 
 
 FIXED = {"ent_coef": 0.2, "target_update_interval": 2}
+REDQ = {"n_critics": 5, "target_subset": 3, "policy_delay": 2}
 QUANTILES = {**TEMPERATURE, "n_quantiles": 5}
 CASES = {
     "DDPG": Case(ddpg, references.DDPG, {}),
@@ -74,13 +75,16 @@ CASES = {
     "SAC": Case(sac, references.SAC, {**TEMPERATURE, "n_critics": 3}),
     "SAC, fixed": Case(sac, references.SAC, {**FIXED, "n_critics": 3}, weighted=True),
     "SAC, target entropy": Case(sac, references.SAC, {**TEMPERATURE, "target_entropy": -0.5, "n_critics": 3}),
+    "SAC, REDQ": Case(sac, references.SAC, {**TEMPERATURE, **REDQ}, weighted=True),
     "SAC, Discrete": Case(sac, references.DiscreteSAC, TEMPERATURE, discrete=True),
+    "SAC, Discrete, REDQ": Case(sac, references.DiscreteSAC, {**TEMPERATURE, **REDQ}, discrete=True),
     "SAC, Discrete, fixed": Case(sac, references.DiscreteSAC, FIXED, discrete=True, weighted=True),
     "SAC, Discrete, target entropy": Case(  # more than four actions can have
         sac, references.DiscreteSAC, {**TEMPERATURE, "target_entropy": 2.0}, discrete=True
     ),
     "TQC": Case(tqc, references.TQC, {**QUANTILES, "top_quantiles_to_drop_per_net": 1}),
     "TQC, nothing dropped": Case(tqc, references.TQC, {**QUANTILES, "top_quantiles_to_drop_per_net": 0}),
+    "TQC, REDQ": Case(tqc, references.TQC, {**QUANTILES, **REDQ, "top_quantiles_to_drop_per_net": 1}),
     "TQC, fixed": Case(tqc, references.TQC, {**FIXED, "n_quantiles": 5}, weighted=True),
 }
 
