@@ -26,7 +26,7 @@ from rejeu import cli, validation
 from rejeu.algorithms import ppo, sac
 from rejeu.experiments import process
 from rejeu.experiments.plan import read_plan
-from rejeu.runs import values
+from rejeu.runs.config import apply
 from rejeu.sb3 import load_zip
 from tests.sb3_models import MadeUp
 
@@ -259,7 +259,7 @@ def test_the_settings_of_the_page_on_rl_zoo_exist():
     assert len(spans) > 8
     for span in spans:
         words = shlex.split(span)
-        given = values.apply(words[words.index("--set") + 1 :], {})
+        given = apply(words[words.index("--set") + 1 :], {})
         config = ppo.Config if "clip_range" in given or "vf" in span else sac.Config
         hindsight = {"replay_buffer_class": "HerReplayBuffer"} if "replay_buffer_kwargs" in given else {}
         validation.build(config, given | hindsight)

@@ -18,7 +18,7 @@ from rejeu.callbacks import Evaluate
 from rejeu.cli import main, one_line
 from rejeu.reporting.logging import CsvFile
 from rejeu.reporting.report.page import plotly_script
-from rejeu.runs import folder, values
+from rejeu.runs import config, folder
 from tests.full_disk import FullDisk
 from tests.tiers import exhaustive
 
@@ -298,7 +298,7 @@ def test_python_m_rejeu_is_the_same_command():
 
 def test_set_takes_dotted_names_numbers_lists_and_words():
     argv = ['train_freq=[1,"episode"]', "learning_rate=1e-3", "policy_kwargs.net_arch=[64,64]", "ent_coef=auto_0.1"]
-    assert values.apply(argv, {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
+    assert config.apply(argv, {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
         "policy_kwargs": {"layer_norm": True, "net_arch": [64, 64]},
         "gamma": 0.9,
         "train_freq": [1, "episode"],
@@ -308,12 +308,12 @@ def test_set_takes_dotted_names_numbers_lists_and_words():
 
 
 def test_set_understands_pythons_false_as_false():
-    assert values.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
+    assert config.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
 
 
 def test_set_leaves_the_preset_as_it_was():
     preset = rejeu.presets.find("parking-v0")
-    values.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
+    config.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
 
 

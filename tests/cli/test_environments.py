@@ -22,8 +22,7 @@ from rejeu.cli.commands import COMMANDS, Train
 from rejeu.cli.environment import Environment
 from rejeu.errors import WorkerError
 from rejeu.experiments.folder import Job, again
-from rejeu.runs.config import RunConfig
-from rejeu.runs.values import quoted
+from rejeu.runs.config import RunConfig, quoted
 from tests.cli.test_cli import FEWER_FILES, TINY, error_of
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")

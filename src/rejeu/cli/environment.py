@@ -22,9 +22,8 @@ from rejeu.envs.registry import are_plain, maker, register
 from rejeu.envs.rendering import make_rendering_env
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
-from rejeu.runs.config import EnvironmentOptions, RunConfig
+from rejeu.runs.config import EnvironmentOptions, RunConfig, merged
 from rejeu.runs.folder import RunFolder, read_config
-from rejeu.runs.values import merged
 
 DEFAULT_WORKERS = WorkerOptions()
 """All environments step together; lost workers are not restarted."""

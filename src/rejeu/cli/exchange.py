@@ -9,7 +9,7 @@ from rejeu.cli import environment
 from rejeu.cli.commands import Import, Pull, Push
 from rejeu.cli.output import echo
 from rejeu.reporting.formatting import counted
-from rejeu.runs.values import quoted
+from rejeu.runs.config import quoted
 
 
 def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:

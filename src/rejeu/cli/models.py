@@ -15,8 +15,8 @@ from rejeu.cli.output import echo
 from rejeu.errors import CheckpointError
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.video import record_video
+from rejeu.runs.config import value
 from rejeu.runs.folder import RunFolder, find_model
-from rejeu.runs.values import value
 
 if TYPE_CHECKING:
     from rejeu.play import Game

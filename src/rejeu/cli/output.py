@@ -21,9 +21,8 @@ from rejeu.interrupt import NAMES
 from rejeu.io import atomic
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Sink
-from rejeu.runs.config import DecidedRun
+from rejeu.runs.config import DecidedRun, quoted
 from rejeu.runs.folder import RunFolder
-from rejeu.runs.values import quoted
 
 echo = partial(print, flush=True)
 

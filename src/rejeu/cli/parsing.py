@@ -14,8 +14,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
-from rejeu.runs.config import Option, options
-from rejeu.runs.values import assigned
+from rejeu.runs.config import Option, assigned, options
 from rejeu.validation import field_docs, number, whole
 
 OLDER = {"--film-every": "--video-every"}

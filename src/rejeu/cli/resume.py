@@ -23,9 +23,8 @@ from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
 from rejeu.reporting.tables import read_table
 from rejeu.runs import config as configs_of_runs
-from rejeu.runs.config import DecidedRun
+from rejeu.runs.config import DecidedRun, merged, quoted
 from rejeu.runs.folder import RunFolder, read_config
-from rejeu.runs.values import merged, quoted
 
 
 def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:

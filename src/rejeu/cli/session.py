@@ -29,9 +29,8 @@ from rejeu.reporting.formatting import counted
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, check_logs, guarded, open_log, require
 from rejeu.reporting.video import ffmpeg
-from rejeu.runs.config import DecidedRun
+from rejeu.runs.config import DecidedRun, quoted
 from rejeu.runs.folder import RunFolder, write_arrivals as write_order
-from rejeu.runs.values import quoted
 
 VIDEO_EPISODES = 3
 VIDEO_STEPS = 600

@@ -32,9 +32,8 @@ from rejeu.experiments.sweep import Coordinator, Outcome, SweepResult, closing_l
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.comparison import By, Comparison, compare
 from rejeu.runs import config as configs
-from rejeu.runs.config import RunConfig
+from rejeu.runs.config import RunConfig, quoted
 from rejeu.runs.folder import RunFolder, check_free
-from rejeu.runs.values import quoted
 from rejeu.validation import choice
 
 Begin = Callable[[Train, int, ExitStack], Session]

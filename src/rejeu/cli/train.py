@@ -26,9 +26,8 @@ from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.interrupt import Interrupt
 from rejeu.presets import Preset
 from rejeu.runs import config as runs
-from rejeu.runs.config import DecidedRun
+from rejeu.runs.config import DecidedRun, merged
 from rejeu.runs.folder import RunFolder, check_free, create, read_arrivals
-from rejeu.runs.values import merged
 
 MANY = 64
 """Number of environments from which an algorithm's values for many environments are used."""

@@ -27,10 +27,8 @@ from rejeu.experiments.sweep import Row, bars
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting import notebook
 from rejeu.reporting.formatting import counted, number
-from rejeu.runs import values
-from rejeu.runs.config import RunConfig
+from rejeu.runs.config import RunConfig, apply, quoted
 from rejeu.runs.folder import check_free
-from rejeu.runs.values import quoted
 
 
 def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
@@ -97,7 +95,7 @@ def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
         "env_kwargs": made.kwargs,
         "wrappers": made.run.wrappers,
         "preset": preset,
-        "fixed": values.apply(arguments.assignments, {}),
+        "fixed": apply(arguments.assignments, {}),
         "search": read_search(arguments.search, algorithm),
         "only": arguments.only,
         "n_envs": arguments.envs,

@@ -36,9 +36,8 @@ from rejeu.io import atomic
 from rejeu.io.records import Malformed, convert, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
-from rejeu.runs.config import RENAMED, RunConfig, Task
+from rejeu.runs.config import RENAMED, RunConfig, Task, quoted, written
 from rejeu.runs.folder import newest_step
-from rejeu.runs.values import quoted, written
 from rejeu.validation import assign
 
 SWEEP, PLAN, HIDDEN = "sweep.json", "plan.toml", ".sweep"

@@ -25,8 +25,7 @@ from rejeu.envs.registry import are_plain, is_plain_id, maker, register
 from rejeu.experiments.folder import FILES, MAX_JOBS, Job, Resources, flat, job_name
 from rejeu.io.records import Seed, convert, shown
 from rejeu.reporting.logging import check_logs, require
-from rejeu.runs.config import RunConfig, options
-from rejeu.runs.values import merged
+from rejeu.runs.config import RunConfig, merged, options
 from rejeu.validation import build, check_names, choice, field_names
 
 MAX_BYTES = 2**16

@@ -35,8 +35,7 @@ from rejeu.experiments.scheduler import Launcher, Scheduler
 from rejeu.interrupt import Interrupt
 from rejeu.reporting import notebook
 from rejeu.reporting.formatting import counted
-from rejeu.runs.config import RunConfig
-from rejeu.runs.values import quoted
+from rejeu.runs.config import RunConfig, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -24,9 +24,8 @@ from rejeu import presets
 from rejeu.errors import CheckpointError
 from rejeu.io.records import Malformed, convert, is_deep, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
-from rejeu.runs.config import MAX_BYTES, RunConfig, parse
+from rejeu.runs.config import MAX_BYTES, RunConfig, parse, quoted
 from rejeu.runs.folder import RunFolder, newest_inside, newest_step
-from rejeu.runs.values import quoted
 
 RENAMED = {
     "time/seconds": "time/time_elapsed",

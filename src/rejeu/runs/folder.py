@@ -14,8 +14,7 @@ from rejeu.errors import CheckpointError
 from rejeu.io import atomic
 from rejeu.io.records import WRONG
 from rejeu.runs import config
-from rejeu.runs.config import DecidedRun
-from rejeu.runs.values import quoted
+from rejeu.runs.config import DecidedRun, quoted
 
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 """Name of a checkpoint, with its environment step."""

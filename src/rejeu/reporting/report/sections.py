@@ -23,8 +23,7 @@ from rejeu.reporting import charts as chart_data
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.runs import MAX_WORD, Run, best_row, flat
 from rejeu.reporting.tables import read_bytes
-from rejeu.runs.config import RunConfig
-from rejeu.runs.values import quoted
+from rejeu.runs.config import RunConfig, quoted
 
 LAST = 100
 """Training episodes that stand in for a final evaluation."""
