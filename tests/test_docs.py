@@ -241,7 +241,7 @@ def test_a_link_to_a_definition_that_does_not_exist_is_found():
 def test_the_home_page_links_to_every_page_on_an_algorithm():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     pages = sorted(path.name for path in (ROOT / "docs" / "algorithms").glob("*.md"))
-    assert len(pages) == len(rejeu.agents.registry.BUILT_IN)
+    assert len(pages) == len(rejeu.agents.BUILT_IN)
     assert [page for page in pages if f"(algorithms/{page})" not in index] == []
 
 

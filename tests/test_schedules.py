@@ -19,7 +19,7 @@ from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.callbacks import Checkpoint
 from rejeu.core import TD_ERROR, Algorithm
-from rejeu.loops.training_call import TrainingCall
+from rejeu.loops.run import TrainingCall
 from rejeu.schedules import Exponential, Linear, at, parse, to_json
 from tests.environments import Counter
 from tests.helpers import small_sac

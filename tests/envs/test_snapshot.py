@@ -14,7 +14,7 @@ import pytest
 import rejeu
 from rejeu.envs.make import make_vector
 from rejeu.envs.snapshot import restore, state_of
-from rejeu.io import json_arrays
+from rejeu.io import records
 
 CARRIED = [
     "CartPole-v1",
@@ -47,9 +47,9 @@ def assert_goes_on_alike(make, n_before=13, n_after=300):
     one.reset(seed=4)
     walk(one, actions[:n_before])
     arrays = {}
-    text = json.dumps(json_arrays.encode(state_of(one), arrays, "env"), allow_nan=False)
+    text = json.dumps(records.encode(state_of(one), arrays, "env"), allow_nan=False)
     expected = walk(one, actions[n_before:])
-    restore(two, json_arrays.decode(json.loads(text), arrays))
+    restore(two, records.decode(json.loads(text), arrays))
     np.testing.assert_equal(walk(two, actions[n_before:]), expected)
     for env in (one, two):
         env.close()
@@ -153,9 +153,9 @@ def test_the_state_taken_out_does_not_move_with_the_environment():
     env = gym.make("CartPole-v1")
     env.reset(seed=0)
     state = state_of(env)
-    before = json.dumps(json_arrays.encode(state, arrays := {}, "x")), {k: v.copy() for k, v in arrays.items()}
+    before = json.dumps(records.encode(state, arrays := {}, "x")), {k: v.copy() for k, v in arrays.items()}
     walk(env, [0, 1] * 30)
-    after = json.dumps(json_arrays.encode(state, arrays := {}, "x")), arrays
+    after = json.dumps(records.encode(state, arrays := {}, "x")), arrays
     np.testing.assert_equal(after, before)
 
 
@@ -170,7 +170,7 @@ def test_a_vector_continues_from_its_snapshot(backend, n_envs):
         obs = one.reset()
         for _ in range(5):
             obs = one.step(np.ones(n_envs, int)).obs
-        saved = json_arrays.decode(json_arrays.encode(one.snapshot(), arrays := {}, "envs"), arrays)
+        saved = records.decode(records.encode(one.snapshot(), arrays := {}, "envs"), arrays)
         assert two.restore(saved, obs.copy()) == []
         assert_vectors_continue_alike(one, two)
 

@@ -8,6 +8,7 @@ import pytest
 from rejeu import presets
 from rejeu.errors import CheckpointError
 from rejeu.experiments import study_plan as plans
+from rejeu.io.records import json_text
 from rejeu.tuning import Integers, LogUniform
 
 
@@ -87,7 +88,7 @@ def test_seeds_are_derived_from_one_seed_and_those_of_the_comparison_are_fresh()
 
 def test_what_is_written_is_read(tmp_path):
     plan = plans.make("CartPole-v1", "PPO")
-    plans.write(plan, tmp_path / "study.json")
+    (tmp_path / "study.json").write_text(json_text(plan))
     assert plans.read(tmp_path / "study.json") == plan
     assert plans.difference(plan, dataclasses.replace(plan, trials=99)) == ""
     assert plans.difference(plan, dataclasses.replace(plan, seed=9)) == "seed is 0 there, not 9"
@@ -113,7 +114,7 @@ def test_what_is_written_is_read(tmp_path):
 )
 def test_a_damaged_file_is_one_line(tmp_path, change):
     path = tmp_path / "study.json"
-    content = json.loads(plans.text(plans.make("Pendulum-v1"))) | change
+    content = json.loads(json_text(plans.make("Pendulum-v1"))) | change
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CheckpointError, match=r"study\.json is damaged: ") as error:
         plans.read(path)

@@ -167,9 +167,9 @@ class Fake:
 
 def learn(monkeypatch, fake, steps=60):
     """Trains with this tracker in the place of W&B; returns the agent and the warnings."""
-    monkeypatch.setattr(rejeu.agents.outputs, "open_log", lambda *arguments: fake)
+    monkeypatch.setattr(rejeu.agents.training, "open_log", lambda *arguments: fake)
     monkeypatch.setattr(
-        rejeu.agents.outputs,
+        rejeu.agents.training,
         "guarded",
         lambda sink, failed, closes=False: logging.RetryingSink(sink, failed, closes, in_background=True),
     )

@@ -1,10 +1,29 @@
-"""Agents: environments, a learner and a buffer behind the methods of Stable-Baselines3."""
+"""Agents: environments, a learner and a buffer behind the methods of Stable-Baselines3, found by the names of algorithms."""
 
+from __future__ import annotations
+
+import difflib
+import sys
+import warnings
+from collections.abc import Iterable
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import gymnasium as gym
+
+from rejeu import presets as all_presets
+from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
 from rejeu.agents.off_policy import DDPG, DQN, IQL, IQN, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
 from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
-from rejeu.agents.registry import AGENTS, agent_of_file, find_agent, load, modules_of, register
+from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import Callback
+from rejeu.errors import CheckpointError
+from rejeu.io import checkpoint
+from rejeu.io.records import shown
+from rejeu.presets import Preset
 from rejeu.validation import whole_seed
 
 __all__ = [
@@ -36,3 +55,163 @@ __all__ = [
     "register",
     "whole_seed",
 ]
+
+
+A = TypeVar("A", bound=type[Agent])
+
+KINDS = (SAC, DDPG, TD3, DQN, QRDQN, IQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO, PQN, TRPO, ARS, IQL)
+BUILT_IN: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
+
+AGENTS: dict[str, type[Agent]] = dict(BUILT_IN)
+"""Every agent by the name of its algorithm; :func:`register` adds to it."""
+
+ENTRY_POINTS = "rejeu.algorithms"
+"""Group of entry points by which an installed package offers algorithms to ``rejeu train --algo NAME``."""
+
+
+def register(agent: A, presets: Iterable[Preset] = ()) -> A:
+    """Makes an agent of your own known by the name of its algorithm, and returns it.
+
+    :func:`rejeu.load` and the commands then find it, and ``rejeu train`` uses its presets. A later registration of the same
+    name replaces the earlier one, as when a notebook cell is run again.
+
+    Args:
+        agent: a subclass of :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`.
+        presets: tuned settings of this algorithm for some environments.
+
+    Raises:
+        ValueError: if the agent has no configuration with a name, rejeu has an algorithm of this name, or a preset is for
+            another algorithm.
+    """
+    config = getattr(getattr(agent, "algorithm", None), "Config", None)
+    if not getattr(config, "name", "") or "__dataclass_fields__" not in vars(config):
+        raise ValueError(
+            f"{agent.__name__} needs a class attribute algorithm = SimpleNamespace(Config=Config, make=make), in which Config "
+            "is a @dataclass(frozen=True, kw_only=True) with name: ClassVar[str] = NAME"
+        )
+    name = agent.algorithm.Config.name
+    if name in BUILT_IN and agent is not BUILT_IN[name]:
+        raise ValueError(f"rejeu has an algorithm {name!r}; choose another Config.name")
+    given = tuple(presets)
+    for preset in given:
+        if preset.algorithm != name:
+            raise ValueError(f"the preset of {preset.env_id} is for {preset.algorithm!r}, not {name!r}")
+    AGENTS[name] = agent
+    if name not in BUILT_IN:
+        configs.registered[name] = config
+    all_presets.register(name, given)
+    return agent
+
+
+def find_agent(name: str, is_typed: bool = True) -> type[Agent]:
+    """Returns the agent of a name, in any case of letters.
+
+    A name that is not registered is looked up among the entry points ``rejeu.algorithms`` of installed packages.
+
+    Args:
+        name: of the algorithm.
+        is_typed: whether the user typed it. A name in a file imports nothing: only what is imported already is found.
+
+    Raises:
+        ValueError: if there is no such algorithm, with the nearest name or what to import.
+    """
+    known = {key.lower(): key for key in AGENTS}
+    if name.lower() in known:
+        return AGENTS[known[name.lower()]]
+    if (found := entry_point(name)) is not None:
+        if not (is_typed or found.module in sys.modules):
+            raise ValueError(f"{name} is not registered, and no file may name what is imported; {advice(found)}")
+        agent = found.load()
+        return agent if agent in AGENTS.values() else register(agent)
+    near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
+    hint = f"did you mean {known[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
+    raise ValueError(f"no algorithm is called {name!r}; {hint}; --import MODULE imports one that registers others")
+
+
+def agent_of_file(name: Any, path: str | Path) -> type[Agent]:
+    """Returns the agent that a file names. Imports nothing: an agent that is not registered is an error.
+
+    Raises:
+        CheckpointError: if it is not registered; the message says what to import.
+    """
+    if isinstance(name, str):
+        with suppress(ValueError):
+            return find_agent(name, is_typed=False)
+    hint = advice(entry_point(name) if isinstance(name, str) else None)
+    raise CheckpointError(
+        f"{path} contains an agent of {str(name)[:40]!r}, which is not registered; {hint}; there are {', '.join(AGENTS)}"
+    )
+
+
+def advice(found: metadata.EntryPoint | None) -> str:
+    """Returns what to import for an algorithm that is not registered."""
+    if found is None:
+        return "import the module that registers it (--import MODULE)"
+    return f"import {found.module} (--import {found.module})"
+
+
+def entry_point(name: str) -> metadata.EntryPoint | None:
+    """Returns the entry point of an algorithm that an installed package offers, without importing it."""
+    offered = metadata.entry_points(group=ENTRY_POINTS)
+    return next((one for one in offered if one.name.lower() == name.lower()), None)
+
+
+def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
+    """Returns the modules that another process must import to know an algorithm: ``imports``, else that of its entry point.
+
+    Raises:
+        ValueError: if it is not registered, or in this process only, such as one of a notebook.
+    """
+    given = tuple(imports)
+    if given or find_agent(algorithm, is_typed=False) in BUILT_IN.values():
+        return given
+    if (found := entry_point(algorithm)) is not None:
+        return (found.module,)
+    raise ValueError(
+        f"{algorithm} is registered in this program only, and each run is a process of its own; write the algorithm into a "
+        "file, and name that: imports=['my_algorithm.py'], or --import my_algorithm.py"
+    )
+
+
+def find_preset(env_id: str, algorithm: str | None, path: str | Path | None) -> Preset | None:
+    """Returns the preset of a name or a file, else that of the environment and the algorithm, None if there is none.
+
+    Raises:
+        CheckpointError: if the algorithm of the file is not registered.
+        ValueError: if it is a preset of another algorithm.
+    """
+    if path is None:
+        return all_presets.find(env_id, algorithm)
+    preset = all_presets.named(str(path), env_id) or all_presets.read(path)
+    agent_of_file(preset.algorithm, path)
+    if algorithm not in (None, preset.algorithm):
+        raise ValueError(f"the preset {path} is for {preset.algorithm}, not for {algorithm}; leave out one of them")
+    if preset.env_id != env_id and not preset.name:
+        warnings.warn(f"the preset {path} was made for {shown(preset.env_id)}", UserWarning, stacklevel=2)
+    return preset
+
+
+def choose_algorithm(preset: Preset | None, env_id: str, actions: gym.Space) -> str:
+    """Returns the algorithm of a preset, else the default for a space of actions.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if preset is not None:
+        return preset.algorithm
+    kind = type(actions).__name__
+    if kind not in all_presets.ALGORITHM_FOR:
+        known = ", ".join(f"{name} takes {space}" for space, name in all_presets.ALGORITHM_FOR.items())
+        raise ValueError(f"{env_id} has the actions {actions}, which no algorithm here takes; {known}")
+    return all_presets.ALGORITHM_FOR[kind]
+
+
+def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
+    """Returns the agent of a model file or a run folder, whatever its algorithm; see :meth:`Agent.load`.
+
+    Raises:
+        CheckpointError: also if the algorithm is not registered; the message says what to import.
+    """
+    path = model_files.find(path)
+    agent = agent_of_file(checkpoint.read_header(path, "agent").get("algorithm"), path)
+    return agent.load(path, env, **changes)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from rejeu import core, devices, spaces
-from rejeu.agents import exporting, model_files, outputs, policy, resume, training
+from rejeu.agents import exporting, model_files, policy, resume, training
 from rejeu.agents.base import BaseAgent
 from rejeu.agents.exporting import Exported, Target
 from rejeu.agents.run_files import RunFolder, run_folder
@@ -95,7 +95,7 @@ class Agent(BaseAgent):
 
     def statistics(self) -> dict[str, float]:
         """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
-        return outputs.statistics_row(self)
+        return training.statistics_row(self)
 
     def predict(
         self,
@@ -183,7 +183,7 @@ class Agent(BaseAgent):
             MissingExtra: if plotly or jinja2 is not installed.
         """
         path = Path(path)
-        return write_page([outputs.record(self, path, [*evaluations])], path)
+        return write_page([training.record(self, path, [*evaluations])], path)
 
     def save(self, path: str | Path) -> Path:
         """Writes the model to one safetensors file, without the replay buffer, and returns its path.

@@ -31,8 +31,7 @@ from rejeu.io.failed_writes import FailedWrites
 from rejeu.loops import nonfinite
 from rejeu.loops.device.chunks import Stops
 from rejeu.loops.learner import Learner, PackedState
-from rejeu.loops.run import Progress, Run, initial_run
-from rejeu.loops.training_call import TrainingCall
+from rejeu.loops.run import Progress, Run, TrainingCall, initial_run
 from rejeu.normalization import normalized
 from rejeu.reporting.formatting import counted, html_table
 from rejeu.reporting.history import History

@@ -24,8 +24,7 @@ from rejeu.loops.device.off_policy import most_updates
 from rejeu.loops.device.program import MAX_TURNS
 from rejeu.loops.device.trainer import vector_of
 from rejeu.loops.learner import Learner
-from rejeu.loops.run import Progress, Run
-from rejeu.loops.training_call import TrainingCall
+from rejeu.loops.run import Progress, Run, TrainingCall
 
 GIB = 2**30
 COPIES = 3

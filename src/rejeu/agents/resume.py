@@ -36,12 +36,11 @@ from rejeu.envs import seeds
 from rejeu.envs.base import DivergedError
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint, json_arrays
+from rejeu.io import checkpoint, records
 from rejeu.io.records import MAX_ENVS, WRONG, brief, convert
 from rejeu.loops.checks import is_finite
 from rejeu.loops.learner import Readings
-from rejeu.loops.run import Run
-from rejeu.loops.training_call import TrainingCall
+from rejeu.loops.run import Run, TrainingCall
 from rejeu.runs.folder import run_files
 from rejeu.validation import number, whole_seed
 
@@ -109,7 +108,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     agent = model_files.load(cls, file, make_env, changes, header.threads, "state.")
     try:
         check_specs(agent, file)
-        saved = convert(json_arrays.decode(header.run, file.read("run.")), SavedRun)
+        saved = convert(records.decode(header.run, file.read("run.")), SavedRun)
         best = checkpoint.within(file.read("best."), "best.")
         parts = [read_rows(path.parent / name, agent) for name in header.rows]
         with devices.chosen(agent.device):

@@ -38,7 +38,7 @@ from rejeu.buffers.ring import Ring
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
-from rejeu.io import atomic, checkpoint, json_arrays
+from rejeu.io import atomic, checkpoint, records
 from rejeu.io.records import Count, Positive, Seconds
 from rejeu.loops import nonfinite
 from rejeu.loops.run import Run
@@ -224,7 +224,7 @@ def copy_run(source: Path, target: Path, seed: int) -> None:
     path = run_files(source)[0]
     with checkpoint.opened(path, "run") as file:
         header, arrays = file.header, file.read()
-    saved = json_arrays.decode(header["run"], arrays)
+    saved = records.decode(header["run"], arrays)
     saved |= {
         "rng": np.random.default_rng(seed).bit_generator.state,
         "seed": seed,
@@ -235,7 +235,7 @@ def copy_run(source: Path, target: Path, seed: int) -> None:
     if "state.key" in kept:  # of the updates
         kept["state.key"] = np.random.SeedSequence(seed).generate_state(2).astype(kept["state.key"].dtype)
     header = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
-    header |= {"seed": seed, "run_id": secrets.token_hex(8), "run": json_arrays.encode(saved, kept, "run")}
+    header |= {"seed": seed, "run_id": secrets.token_hex(8), "run": records.encode(saved, kept, "run")}
     atomic.make_folder(target)
     for name in header["rows"]:
         shutil.copy(source / name, target / name)
@@ -255,7 +255,7 @@ class RunHeader(msgspec.Struct):
     n_envs: Positive
     run_id: str
     run: Any
-    """A :class:`SavedRun`, encoded by :mod:`rejeu.io.json_arrays`."""
+    """A :class:`SavedRun`, encoded by :mod:`rejeu.io.records`."""
     env_id: Any = None
     backend: Any = None
     wait_for: Positive | None = None
@@ -357,7 +357,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "threads": xla.threads(),
         "n_together": agent.n_together,
         "versions": versions(),
-        "run": json_arrays.encode(everything, arrays, "run"),
+        "run": records.encode(everything, arrays, "run"),
     }
     return header, arrays
 

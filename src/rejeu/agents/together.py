@@ -30,7 +30,7 @@ from rejeu.loops import nonfinite
 from rejeu.loops.device import chunks
 from rejeu.loops.device.chunks import Stops
 from rejeu.loops.nonfinite import NonFiniteUpdate
-from rejeu.loops.training_call import TrainingCall
+from rejeu.loops.run import TrainingCall
 from rejeu.reporting.logging import Sink
 from rejeu.validation import whole, whole_seed
 

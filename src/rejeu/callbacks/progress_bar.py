@@ -9,9 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from rejeu.callbacks.base import TrainingCallback, step_before
-from rejeu.loops.run import Progress, time_shares
-from rejeu.loops.training_call import TrainingCall
-from rejeu.reporting import notebook
+from rejeu.loops.run import Progress, TrainingCall, time_shares
+from rejeu.reporting import formatting
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,8 +66,8 @@ class ProgressBar(TrainingCallback):
         from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
 
         self.n_steps, self.seconds = n_steps, seconds
-        self._console = notebook.console() if console is None else console
-        self._display = notebook.Display() if self._console.is_jupyter else None
+        self._console = formatting.console() if console is None else console
+        self._display = formatting.Display() if self._console.is_jupyter else None
         self._animated = self._console.is_terminal and not self._console.is_dumb_terminal
         self._period = (
             NOTEBOOK_SECONDS if self._display is not None else REFRESH_SECONDS if self._animated else LINE_SECONDS

@@ -68,10 +68,7 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
         arguments.language,
         echo,
     )
-    text = formats[out.suffix](board)
-    with atomic.replacing(out) as file:
-        file.write(text.encode())
-    echo(out)
+    echo(atomic.write(out, formats[out.suffix](board)))
     return 0, {**leaderboard.to_dict(board), "file": out}
 
 

@@ -1,28 +1,35 @@
-"""``rejeu runs``, ``status`` and ``compare``: lists of runs, how far one is, and groups of runs side by side."""
+"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
 
 from __future__ import annotations
 
 import math
 import webbrowser
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rejeu.cli.commands import Compare, Runs, Status
+from rejeu.cli.commands import Compare, Report, Runs, Status
+from rejeu.interrupt import leaving
+from rejeu.io import atomic
 from rejeu.io.records import shown
-from rejeu.reporting import notebook, run_list
+from rejeu.reporting import formatting, run_list
 from rejeu.reporting.comparison import Comparison, compare
 from rejeu.reporting.formatting import counted
+from rejeu.reporting.report import write_report
+from rejeu.reporting.report.live import make_server
 from rejeu.reporting.runs import Run, best_row
+from rejeu.runs.folder import RunFolder, find_model
+from rejeu.validation import whole
 
 WINDOW = 100
-"""Last episodes that are averaged."""
+"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
 EXIT = {"running": 0, "finished": 0, "unknown": 0, "interrupted": 3, "crashed": 4}
-"""Exit status by the state of the run."""
+"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
 WIDE = 10_000
-"""Columns of what is no terminal, such as a pipe: nothing is folded, so that ``grep`` finds whole names."""
+"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
 
 
 def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
@@ -222,7 +229,67 @@ def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) 
         table.add_column(name, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text)
     for row in rows:
         table.add_row(*map(escape, row))
-    console = notebook.console(highlight=False)
+    console = formatting.console(highlight=False)
     if not console.is_terminal:
-        console = notebook.console(highlight=False, width=WIDE)
+        console = formatting.console(highlight=False, width=WIDE)
     console.print(table)
+
+
+SUFFIXES = (".html", ".htm")
+
+
+def run_report(arguments: Report) -> tuple[int, None]:
+    """Writes the page, or serves it until Ctrl-C.
+
+    Raises:
+        ValueError: for ``--out`` or ``--replay`` with ``--live``, or for a file that is no page.
+    """
+    if arguments.live:
+        if arguments.out is not None:
+            raise ValueError("--live serves the page and writes no file; leave out --out, or --live")
+        if arguments.replay is not None:
+            raise ValueError("--replay plays the trained agent; leave out --replay, or --live")
+        follow(arguments)
+        return 0, None
+    if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
+    for path in arguments.runs if arguments.replay is not None else ():
+        replay(path, arguments)
+    path = write_report(arguments.runs, arguments.out)
+    print(path, flush=True)
+    if arguments.open:
+        webbrowser.open(path.absolute().as_uri())
+    return 0, None
+
+
+def replay(path: Path, arguments: Report) -> None:
+    """Lets the best model of a run play episodes from the seeds 0, 1, 2 ..., and writes them to its folder.
+
+    Each is what ``rejeu watch`` and ``rejeu record`` show with ``--seed`` and ``--episodes 1``.
+
+    Raises:
+        FileNotFoundError: if the folder holds no model.
+        ValueError: if the environment cannot be made.
+    """
+    from rejeu.agents import load  # JAX takes longer than all that rejeu status needs
+    from rejeu.cli.environment import environment_of
+
+    assert arguments.replay is not None
+    model = find_model(path, "best")
+    agent = load(model)
+    rows = ["seed,return,length,success"]
+    with closing(environment_of(model, arguments).make()) as env:
+        for seed in range(whole("--replay", arguments.replay, least=1)):
+            played = agent.evaluate(1, env=env, seed=seed)
+            rows.append(f"{seed},{played.mean_return},{played.mean_length:.0f},{played.success_rate}")
+    atomic.write(RunFolder(path).replays, "\n".join(rows) + "\n")
+
+
+def follow(arguments: Report) -> None:
+    """Serves the page until Ctrl-C or SIGTERM ends the process."""
+    server, address = make_server(arguments.runs)
+    print(f"{address} (Ctrl-C ends it)", flush=True)
+    if arguments.open:
+        webbrowser.open(address)
+    with server, leaving("the page is no longer served"):
+        server.serve_forever()

@@ -15,7 +15,7 @@ import numpy as np
 
 from rejeu import errors
 from rejeu.agents import Agent, load
-from rejeu.agents.outputs import run_name, tracker_id
+from rejeu.agents.training import run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
 from rejeu.callbacks.base import restore
 from rejeu.cli.commands import Train

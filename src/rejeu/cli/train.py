@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu import devices, presets, validation
-from rejeu.agents import AGENTS, find_agent
-from rejeu.agents.registry import choose_algorithm, find_preset
+from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset
 from rejeu.algorithms import config as configs
 from rejeu.cli import check, environment, sweep
 from rejeu.cli.commands import Train

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rejeu.agents import AGENTS, find_agent, modules_of
-from rejeu.agents.registry import find_preset
+from rejeu.agents import AGENTS, find_agent, find_preset, modules_of
 from rejeu.algorithms.search import Dimension
 from rejeu.cli import environment
 from rejeu.cli.commands import Pbt, Resume, Tune
@@ -25,7 +24,7 @@ from rejeu.experiments.study import Outcome, Study, StudyFolder
 from rejeu.experiments.study_plan import Plan
 from rejeu.experiments.sweep import Row, bars
 from rejeu.interrupt import NAMES, Interrupt
-from rejeu.reporting import notebook
+from rejeu.reporting import formatting
 from rejeu.reporting.formatting import counted, number
 from rejeu.runs.config import RunConfig, apply, quoted
 from rejeu.runs.folder import check_free
@@ -137,7 +136,7 @@ def common(made: Environment, algorithm: str) -> RunConfig:
 @contextmanager
 def display(study: Study) -> Iterator[Watch]:
     """Returns a function that prints a line for each trial that has ended and, on a terminal, shows those that run."""
-    lines, console = tuning.lines(echo, study), notebook.console()
+    lines, console = tuning.lines(echo, study), formatting.console()
     if not console.is_terminal:
         yield lines
         return

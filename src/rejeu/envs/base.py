@@ -185,7 +185,7 @@ class VectorEnv(ABC):
         return False
 
     def snapshot(self) -> Any:
-        """Returns the state of the running environments as plain data (see :mod:`rejeu.io.json_arrays`).
+        """Returns the state of the running environments as plain data (see :mod:`rejeu.io.records`).
 
         None where the backend or an environment does not offer it.
         """

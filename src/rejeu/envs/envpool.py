@@ -119,7 +119,7 @@ class ActionLog:
             self._open = bytearray()
 
     def to_plain(self) -> dict[str, Any]:
-        """Returns the log as plain data (see :mod:`rejeu.io.json_arrays`)."""
+        """Returns the log as plain data (see :mod:`rejeu.io.records`)."""
         return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
 
     def operations(self, saved: dict[str, Any]) -> Iterator[Operation]:

@@ -15,12 +15,11 @@ The state of each job follows from its files, so several processes and machines 
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -33,7 +32,7 @@ from rejeu.errors import CheckpointError
 from rejeu.experiments.process import LOST
 from rejeu.experiments.scheduler import Work
 from rejeu.io import atomic
-from rejeu.io.records import Malformed, convert, read_json, shown
+from rejeu.io.records import Malformed, convert, json_text, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
 from rejeu.runs.config import RENAMED, RunConfig, Task, quoted, written
@@ -242,8 +241,7 @@ class JobWork(Work):
 
     def write_exit(self, status: int) -> None:
         """Writes that it is done or has failed."""
-        with atomic.replacing(self.exit) as file:
-            file.write(f"{status}\n".encode())
+        atomic.write(self.exit, f"{status}\n")
 
     def state(self) -> State:
         """Returns its state, by its files."""
@@ -351,12 +349,10 @@ def open_folder(path: Path, sweep: Sweep, text: str | None, typed: RunConfig) ->
             found = read_folder(path, typed)
             check_same(found, sweep)
             return found
-        content = json.dumps(asdict(sweep), indent=1, allow_nan=False) + "\n"
+        content = json_text(sweep)
         if text is not None:
-            with atomic.replacing(path / PLAN) as file:
-                file.write(text.encode())
-        with atomic.replacing(path / SWEEP) as file:
-            file.write(content.encode())
+            atomic.write(path / PLAN, text)
+        atomic.write(path / SWEEP, content)
     return read_folder(path, typed)
 
 

@@ -37,11 +37,7 @@ def write(study: Study, outcomes: Sequence[Outcome], final: Final | None) -> Pat
     Raises:
         MissingExtra: if plotly or jinja2 is not installed.
     """
-    path = study.folder.page
-    text = render(study, outcomes, final)
-    with atomic.replacing(path) as file:
-        file.write(text.encode())
-    return path
+    return atomic.write(study.folder.page, render(study, outcomes, final))
 
 
 def render(study: Study, outcomes: Sequence[Outcome], final: Final | None) -> str:

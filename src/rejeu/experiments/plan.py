@@ -18,8 +18,7 @@ import gymnasium as gym
 from msgspec import Meta
 
 from rejeu import devices, presets, spaces
-from rejeu.agents import AGENTS, find_agent
-from rejeu.agents.registry import choose_algorithm, find_preset
+from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
 from rejeu.experiments.folder import FILES, MAX_JOBS, Job, Resources, flat, job_name

@@ -42,7 +42,7 @@ from rejeu.experiments.search import begin_or_resume
 from rejeu.experiments.study_plan import Plan
 from rejeu.interrupt import Interrupt
 from rejeu.io import atomic
-from rejeu.io.records import Count, Malformed, convert, read_json, shown
+from rejeu.io.records import Count, Malformed, convert, json_text, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS
 from rejeu.reporting.tables import read_table
 from rejeu.runs.config import RunConfig, Task
@@ -267,7 +267,7 @@ class Members:
         found = decide(scores, self.values(number), self.population.plan.search_space, rng)
         if number + 1 == self.population.rounds:  # nobody trains on
             found = [dataclasses.replace(one, parent=None, next_values=one.values) for one in found]
-        write([dataclasses.asdict(one) for one in found], self.decisions_file(number))
+        atomic.write(self.decisions_file(number), json_text([dataclasses.asdict(one) for one in found]))
         self.write_history()
         return found
 
@@ -285,7 +285,7 @@ class Members:
                 shutil.copy(source.parent / "config.json", target.parent / "config.json")
             shutil.rmtree(target, ignore_errors=True)
             copied.replace(target)
-            write(number, marker)
+            atomic.write(marker, json_text(number))
 
     def history(self) -> list[dict[str, Any]]:
         """Returns a row for each member and round that was decided."""
@@ -304,8 +304,7 @@ class Members:
         writer.writeheader()
         for row in rows:
             writer.writerow({key: json.dumps(one) if isinstance(one, list) else one for key, one in row.items()})
-        with atomic.replacing(self.path / "history.csv") as file:
-            file.write(text.getvalue().encode())
+        atomic.write(self.path / "history.csv", text.getvalue())
 
     def lock(self) -> FileLock:
         """Locks the folder for this process.
@@ -367,14 +366,8 @@ class MemberWork(Work):
 
 def create(path: Path, population: Population) -> Members:
     """Returns the members of a new folder."""
-    write(dataclasses.asdict(population), path / FILE)
+    atomic.write(path / FILE, json_text(population))
     return Members(path, population)
-
-
-def write(content: Any, path: Path) -> None:
-    """Writes JSON."""
-    with atomic.replacing(path) as file:
-        file.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read(path: Path) -> Members:

@@ -32,6 +32,7 @@ from rejeu.experiments.process import hold
 from rejeu.experiments.scheduler import release
 from rejeu.experiments.study_plan import Plan
 from rejeu.io import atomic
+from rejeu.io.records import json_text
 from rejeu.presets import Preset
 from rejeu.runs.folder import File
 
@@ -228,7 +229,7 @@ def create(folder: StudyFolder, plan: Plan) -> Study:
         if not study.get_trials(deepcopy=False):
             values = plans.default_values(plan)
             study.enqueue_trial(spaces.encoded(plan.search_space, values), user_attrs={INDEX: 0})
-        plans.write(plan, folder.plan)
+        atomic.write(folder.plan, json_text(plan, 2))
     return Study(folder, plan, study)
 
 
@@ -248,7 +249,7 @@ def join(folder: StudyFolder, plan: Plan | None = None) -> Study:
             if differs := plans.difference(there, plan):
                 raise ValueError(f"{folder.path} is another study: {differs}; name another folder with --out")
             if there != plan:
-                plans.write(plan, folder.plan)
+                atomic.write(folder.plan, json_text(plan, 2))
                 there = plan
         return Study(folder, there, connect(folder, there))
 

@@ -18,8 +18,7 @@ from rejeu.algorithms import config as configs
 from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
 from rejeu.errors import CheckpointError
 from rejeu.experiments import space as spaces
-from rejeu.io import atomic
-from rejeu.io.records import EnvCount, Positive, Seed, convert, read_json, shown
+from rejeu.io.records import EnvCount, Positive, Seed, convert, json_text, read_json, shown
 from rejeu.presets import Preset
 from rejeu.runs.config import RunConfig
 
@@ -175,7 +174,7 @@ def make(
             f"final_seeds={plan.final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
         )
     try:  # as it is read again, so that a study begins and goes on with the same
-        return convert(json.loads(text(plan)), Plan)
+        return convert(json.loads(json_text(plan)), Plan)
     except CheckpointError as error:
         raise ValueError(str(error)) from None
     except TypeError as error:
@@ -232,19 +231,8 @@ def is_set(fixed: Mapping[str, Any], name: str) -> bool:
     return head in fixed and (not rest or not isinstance(inner, Mapping) or is_set(inner, rest))
 
 
-def text(plan: Plan) -> str:
-    """Returns a plan as JSON, the content of ``study.json``."""
-    return json.dumps(dataclasses.asdict(plan), indent=2, allow_nan=False) + "\n"
-
-
-def write(plan: Plan, path: Path) -> None:
-    """Writes ``study.json``."""
-    with atomic.replacing(path) as file:
-        file.write(text(plan).encode())
-
-
 def read(path: Path) -> Plan:
-    """Returns what :func:`write` wrote; the file is untrusted.
+    """Returns the plan of a ``study.json``, which is untrusted.
 
     Raises:
         FileNotFoundError: if it is not there.

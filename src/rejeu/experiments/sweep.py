@@ -33,7 +33,7 @@ from rejeu.experiments.plan import read_plan
 from rejeu.experiments.process import LocalLauncher, default_workers, threads_of
 from rejeu.experiments.scheduler import Launcher, Scheduler
 from rejeu.interrupt import Interrupt
-from rejeu.reporting import notebook
+from rejeu.reporting import formatting
 from rejeu.reporting.formatting import counted
 from rejeu.runs.config import RunConfig, quoted
 
@@ -269,7 +269,7 @@ class Row(NamedTuple):
 @contextmanager
 def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]]:
     """Context in which progress is shown; returns a function to call often, and one to call with each event."""
-    console = notebook.console()
+    console = formatting.console()
     if not progress:
         yield (lambda coordinator: None), (lambda text: None)
     elif not console.is_terminal:

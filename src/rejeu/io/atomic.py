@@ -67,6 +67,13 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     _sync_folder(path.parent)
 
 
+def write(path: Path, content: bytes | str) -> Path:
+    """Writes a file, as :func:`replacing` does, and returns its path; text as UTF-8."""
+    with replacing(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+    return path
+
+
 def make_folder(path: Path) -> None:
     """Creates a folder with its missing parents and syncs their names to disk; an existing folder is not changed.
 

@@ -81,10 +81,7 @@ def write(preset: Preset, path: str | Path) -> Path:
         text = json.dumps({**fields, "hyperparameters": dict(preset.hyperparameters)}, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise TypeError(f"the preset of {preset.env_id} has hyperparameters that a file cannot hold: {error}") from None
-    path = Path(path)
-    with atomic.replacing(path) as file:
-        file.write(f"{text}\n".encode())
-    return path
+    return atomic.write(Path(path), f"{text}\n")
 
 
 def read(path: str | Path) -> Preset:

@@ -236,14 +236,14 @@ class Comparison:
         suffix = path.suffix.lower().removeprefix(".")
         if path.is_dir() or not suffix:
             paths = [one for suffix in FORMATS for one in self.save(path / f"compare.{suffix}")]
-            return [*paths, write_text(path / "curves.csv", self.curves_csv())]
+            return [*paths, atomic.write(path / "curves.csv", self.curves_csv())]
         if suffix == "png":
             self.plot(path)
             return [path]
         texts = {"md": self.to_markdown, "csv": self.to_csv, "json": self.to_json, "html": self.to_html}
         if suffix not in texts:
             raise ValueError(f"{path.name!r} must end in {', '.join(FORMATS)}, or be a folder")
-        return [write_text(path, texts[suffix]())]
+        return [atomic.write(path, texts[suffix]())]
 
     def __repr__(self) -> str:
         lines = [
@@ -463,13 +463,6 @@ def compared(one: Key, other: Key, finals: Any, draws: Any) -> Improvement:
     samples = [statistics.resampled(finals[key], draws[key]) for key in (one, other)]
     low, high = statistics.interval(statistics.improvement(*samples))
     return Improvement(one[1], other[1], one[0], probability, float(low), float(high))
-
-
-def write_text(path: Path, content: str) -> Path:
-    """Writes a text file atomically, and returns its path."""
-    with atomic.replacing(path) as file:
-        file.write(content.encode())
-    return path
 
 
 def page_of(comparison: Comparison) -> str:

@@ -142,8 +142,7 @@ class History:
 
     def write_csv(self, path: str | Path) -> None:
         """Writes the table with a header line, atomically."""
-        with atomic.replacing(Path(path)) as file:
-            file.write(csv_lines([COLUMNS, *self.episodes]))
+        atomic.write(Path(path), csv_lines([COLUMNS, *self.episodes]))
 
     def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
         """Returns a matplotlib figure of returns and, if known, success; notebooks display it.

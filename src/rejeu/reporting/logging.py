@@ -27,8 +27,8 @@ from rejeu.errors import MissingExtra
 from rejeu.io import atomic
 from rejeu.io.failed_writes import MAX_ROWS, RETRY_SECONDS, FailedWrites
 from rejeu.reporting import trackers
+from rejeu.reporting.formatting import Display
 from rejeu.reporting.history import csv_lines
-from rejeu.reporting.notebook import Display
 from rejeu.reporting.runs import flat
 from rejeu.reporting.tables import read_bytes
 from rejeu.reporting.trackers import MLflow, Tracker, Trackio, WandB
@@ -143,9 +143,8 @@ class CsvFile:
         columns = [*self._columns, *new]
         line = csv_lines([[row.get(name, "") for name in columns]])
         if new:
-            rows = read_log(self.path).splitlines()[1:]
-            with atomic.replacing(self.path) as file:
-                file.write(csv_lines([columns]) + b"".join(one + b"," * len(new) + b"\r\n" for one in rows) + line)
+            rows = [one + b"," * len(new) + b"\r\n" for one in read_log(self.path).splitlines()[1:]]
+            atomic.write(self.path, b"".join([csv_lines([columns]), *rows, line]))
             self._columns = columns
         else:
             atomic.append(self.path, line)
@@ -205,8 +204,7 @@ def restart(path: Path, lines: Sequence[bytes], up_to: int | None) -> None:
     """Writes the lines of a log that are kept, unless the file has these and no others, or starts an empty file."""
     content = b"".join(lines)
     if up_to is None or not path.exists() or read_log(path) != content:
-        with atomic.replacing(path) as file:
-            file.write(content)
+        atomic.write(path, content)
 
 
 def read_log(path: Path) -> bytes:

@@ -26,7 +26,7 @@ from msgspec import Meta
 
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
-from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, read_json, shown
+from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, json_text, read_json, shown
 from rejeu.validation import with_value
 
 
@@ -385,15 +385,12 @@ def read(path: Path) -> DecidedRun:
 
 def write(path: Path, config: DecidedRun) -> None:
     """Writes ``config.json``, with the versions of what ran."""
-    content = {**dataclasses.asdict(config), "versions": versions()}
-    with atomic.replacing(path) as file:
-        file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    atomic.write(path, json_text({**dataclasses.asdict(config), "versions": versions()}, 2))
 
 
 def write_task(path: Path, task: Task) -> None:
     """Writes the file of a task."""
-    with atomic.replacing(path) as file:
-        file.write(json.dumps(dataclasses.asdict(task), allow_nan=False).encode())
+    atomic.write(path, json_text(task))
 
 
 def read_task(path: Path) -> Task:

@@ -19,9 +19,9 @@ import msgspec
 import numpy as np
 
 from rejeu import core, normalization, spaces
+from rejeu.agents import BUILT_IN
 from rejeu.agents.agent import Agent
 from rejeu.agents.model_files import check_depths
-from rejeu.agents.registry import BUILT_IN
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.io.records import Malformed, brief, shown

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.outputs import record
+from rejeu.agents.training import record
 from rejeu.cli import main
 from rejeu.errors import MissingExtra
 from rejeu.loops.run import Episode

@@ -40,10 +40,7 @@ def write_report(runs: str | Path | Sequence[str | Path], out: str | Path | None
 
 def write_page(runs: Sequence[Run], out: Path) -> Path:
     """Writes the page of runs that were read or made, and returns its path."""
-    text = render(runs, out.absolute().parent)
-    with atomic.replacing(out) as file:
-        file.write(text.encode())
-    return out
+    return atomic.write(out, render(runs, out.absolute().parent))
 
 
 def render(runs: Sequence[Run], folder: Path | None, live: bool = False) -> str:

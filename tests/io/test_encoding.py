@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rejeu.errors import CheckpointError
-from rejeu.io import json_arrays
+from rejeu.io import records
 
 NUMBERS = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 ARRAYS = hnp.arrays(
@@ -40,13 +40,13 @@ def same(one, two):
 @given(DATA)
 def test_everything_comes_back_as_what_it_was(value):
     arrays = {}
-    text = json.dumps(json_arrays.encode(value, arrays, "x"), allow_nan=False)
-    assert same(json_arrays.decode(json.loads(text), arrays), value)
+    text = json.dumps(records.encode(value, arrays, "x"), allow_nan=False)
+    assert same(records.decode(json.loads(text), arrays), value)
 
 
 def test_arrays_are_copies():
     array, arrays = np.zeros(3), {}
-    json_arrays.encode([array], arrays, "x")
+    records.encode([array], arrays, "x")
     array[0] = 1
     assert arrays["x.0"].tolist() == [0, 0, 0]
 
@@ -54,7 +54,7 @@ def test_arrays_are_copies():
 @pytest.mark.parametrize("value", [object(), {1: 2}, {"a": {3}}, np.array(["text"]), np.array([None]), 1j, b"bytes"])
 def test_other_things_are_refused_with_their_place(value):
     with pytest.raises(TypeError, match=r"^x\.1.* expected numbers, strings"):
-        json_arrays.encode([0, value], {}, "x")
+        records.encode([0, value], {}, "x")
 
 
 def nested(depth):
@@ -80,4 +80,4 @@ def nested(depth):
 )
 def test_what_encode_never_returns_is_refused(value):
     with pytest.raises(CheckpointError):
-        json_arrays.decode(value, {})
+        records.decode(value, {})
