@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import numpy as np
 
 from rejeu import core, devices, spaces
-from rejeu.agents import exporting, model_files, policy, resume, training
+from rejeu.agents import model_files, policy, resume, training
 from rejeu.agents.base import BaseAgent
-from rejeu.agents.exporting import Exported, Target
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
 from rejeu.envs import seeds
@@ -22,8 +21,10 @@ from rejeu.reporting import summary
 from rejeu.reporting.evaluation import Evaluation, evaluate
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Logger, Sink
-from rejeu.reporting.report import write_page
 from rejeu.validation import number, whole
+
+if TYPE_CHECKING:
+    from rejeu.agents.exporting import Exported, Target
 
 
 class Agent(BaseAgent):
@@ -182,6 +183,8 @@ class Agent(BaseAgent):
         Raises:
             MissingExtra: if plotly or jinja2 is not installed.
         """
+        from rejeu.reporting.report import write_page  # here and in export: what few programs use
+
         path = Path(path)
         return write_page([training.record(self, path, [*evaluations])], path)
 
@@ -235,6 +238,8 @@ class Agent(BaseAgent):
             MissingExtra: if ``onnx`` is not installed.
             OSError: if the file cannot be written.
         """
+        from rejeu.agents import exporting
+
         with devices.chosen(self.device):
             return exporting.export(self, path, to, noise, batch, frame_stack=frame_stack)
 
