@@ -16,7 +16,7 @@ from safetensors.numpy import load_file, save_file
 
 import rejeu
 from rejeu.errors import CheckpointError
-from rejeu.io import atomic, checkpoint, tensors
+from rejeu.io import atomic, checkpoint
 from tests import hostile_files
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, small_sac
@@ -129,7 +129,9 @@ def test_a_file_may_be_read_by_whoever_may_read_new_files(trained):
 @given(
     st.dictionaries(
         st.text(st.characters(exclude_categories=["Cs"]), max_size=20).filter(lambda name: name != "__metadata__"),
-        npst.arrays(st.sampled_from(sorted(set(tensors.DTYPES.values()))), npst.array_shapes(min_dims=0, min_side=0)),
+        npst.arrays(
+            st.sampled_from(sorted(set(checkpoint.DTYPES.values()))), npst.array_shapes(min_dims=0, min_side=0)
+        ),
         max_size=5,
     ),
     st.dictionaries(

@@ -16,7 +16,7 @@ import rejeu
 from rejeu.agents.resume import like, restore_buffer
 from rejeu.callbacks import Checkpoint
 from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint, tensors
+from rejeu.io import checkpoint
 from rejeu.runs.folder import run_files
 from tests import hostile_files
 from tests.agents.test_resume import BALL, OFF, SMALL, vector
@@ -193,9 +193,9 @@ def test_a_hostile_file_of_a_run_is_refused_by_our_own_error_alone(run, tmp_path
 @pytest.mark.parametrize("run", ["replay", "rollout"], indirect=True)
 def test_no_array_is_read_that_the_run_does_not_have(run, tmp_path, monkeypatch):
     """Six GiB in a hole of a few KiB are refused at once, by names and shapes."""
-    sizes, read = [], tensors.TensorFile.read
+    sizes, read = [], checkpoint.TensorFile.read
     monkeypatch.setattr(
-        tensors.TensorFile, "read", lambda file, name: sizes.append(file.specs[name].nbytes) or read(file, name)
+        checkpoint.TensorFile, "read", lambda file, name: sizes.append(file.specs[name].nbytes) or read(file, name)
     )
     monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**40)
     for path in files_of(run[1]):

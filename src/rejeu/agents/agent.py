@@ -14,7 +14,7 @@ from rejeu.agents import model_files, policy, resume, training
 from rejeu.agents.base import BaseAgent
 from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
-from rejeu.envs import seeds
+from rejeu.envs.base import seed_of_run
 from rejeu.envs.masks import split
 from rejeu.io import checkpoint
 from rejeu.reporting import summary
@@ -328,7 +328,7 @@ class Agent(BaseAgent):
                 "set_env was called while the agent learns; stop training first (a callback that returns False), then "
                 "call set_env and learn(..., reset_num_timesteps=False)"
             )
-        vector = self.make_envs(env, 1, seed=seeds.of_run(self.seed))
+        vector = self.make_envs(env, 1, seed=seed_of_run(self.seed))
         self.check_spaces(vector, "the new environment")
         self.made_from_id = isinstance(env, str)
         run = self.run

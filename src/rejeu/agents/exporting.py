@@ -85,17 +85,10 @@ def export(
     source: str = "",
     frame_stack: int | None = None,
 ) -> Exported:
-    """Writes the policy of an agent; the arguments are those of :meth:`rejeu.SAC.export`.
+    """Writes the policy of an agent, and a card beside it; most arguments are those of :meth:`rejeu.SAC.export`.
 
-    Args:
-        agent: the agent.
-        path: of the file.
-        to: the format; None goes by the suffix.
-        noise: sample from the policy instead of taking its mode, with the random numbers as inputs.
-        batch: observations at once.
-        make_env: makes an environment in which observations are recorded; None for that of the agent.
-        source: the run or model it is from, for the card.
-        frame_stack: frames of an observation; None for those of the agent's setting of that name.
+    ``make_env`` makes an environment in which observations are recorded, None for that of the agent; ``source`` is the run
+    or model that the policy is from, for the card.
     """
     path = Path(path)
     target = target_of(path, to)

@@ -32,8 +32,7 @@ from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.core import PyTree
-from rejeu.envs import seeds
-from rejeu.envs.base import DivergedError
+from rejeu.envs.base import DivergedError, seed_of_run
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint, records
@@ -88,14 +87,14 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
 
     def make_env(agent: BaseAgent) -> VectorEnv:
         if env is not None:
-            vector = agent.make_envs(env, seed=seeds.of_run(agent.seed))
+            vector = agent.make_envs(env, seed=seed_of_run(agent.seed))
             if vector.n_envs != header.n_envs:
                 raise CheckpointError(f"the run had {header.n_envs} environments, and {vector.n_envs} are given")
             return vector
         env_id, backend = environment(path, header)
         try:
             several = {} if header.wait_for is None else {"wait_for": header.wait_for}
-            vector = agent.make_envs(env_id, header.n_envs, backend, seeds.of_run(agent.seed), **several)
+            vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.seed), **several)
             made.callback(vector.close)
             agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:

@@ -1,6 +1,7 @@
 """The command ``rejeu``: the arguments are in :mod:`rejeu.cli.commands`, and what each command does in a module of its name.
 
-That module is imported when the command runs, so that help and errors in the arguments are quick.
+That module is imported when the command runs, so that help and errors in the arguments are quick. With ``--json`` a result is
+one document on standard output, and nothing else is there.
 """
 
 from __future__ import annotations
@@ -14,9 +15,12 @@ import sys
 import sysconfig
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 import rejeu
 from rejeu import errors, hardware, interrupt
@@ -66,11 +70,9 @@ def run_command(argv: Sequence[str]) -> int:
         )
         check_options(arguments)
         for name in getattr(arguments, "imports", ()):
-            importlib.import_module("rejeu.cli.importing").import_source(name)
-        from rejeu.cli import jsonout  # NumPy takes longer than all that --help needs
-
+            importlib.import_module("rejeu.cli.environment").import_source(name)
         module = importlib.import_module(f"rejeu.cli.{MODULES.get(command, command)}")
-        with jsonout.messages(getattr(arguments, "json", False)) as emit:
+        with messages(getattr(arguments, "json", False)) as emit:
             status, result = getattr(module, f"run_{command}")(arguments)
             emit(result)
         return status
@@ -122,3 +124,41 @@ def one_line(error: Exception | Warning | str) -> str:
     ('two lines', 'MemoryError')
     """
     return " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(error)).split()) or type(error).__name__
+
+
+@contextmanager
+def messages(is_json: bool) -> Iterator[Callable[[Any], None]]:
+    """Context that yields a function to call with the result, which prints it with ``is_json`` and else does nothing.
+
+    With ``is_json``, what is printed otherwise goes to standard error.
+    """
+    if not is_json:
+        yield lambda result: None
+        return
+    output = sys.stdout
+    with redirect_stdout(sys.stderr):
+        yield lambda result: print(dumps(result), file=output, flush=True)
+
+
+def dumps(value: Any) -> str:
+    """Returns a value as indented JSON text. NaN and infinities become null, since JSON has none.
+
+    >>> import math, pathlib
+    >>> import numpy as np
+    >>> print(dumps({"steps": np.int64(3), "return": math.nan, "path": pathlib.PurePosixPath("runs/a")}))
+    {
+      "steps": 3,
+      "return": null,
+      "path": "runs/a"
+    }
+    """
+    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=2).decode()
+
+
+def plain(value: Any) -> Any:
+    """Returns a NumPy array or number as Python's, a mapping as a dict, and anything else as text."""
+    import numpy as np  # takes longer than all that --help needs
+
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -14,8 +14,7 @@ import numpy as np
 
 from rejeu.cli import environment
 from rejeu.cli.commands import Check
-from rejeu.cli.environment import Environment
-from rejeu.cli.importing import module_of
+from rejeu.cli.environment import Environment, module_of
 from rejeu.errors import BadEnvironmentError
 
 

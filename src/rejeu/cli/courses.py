@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rejeu.cli import environment, jsonout
+from rejeu.cli import dumps, environment
 from rejeu.cli.commands import Class, Course
 from rejeu.cli.output import echo
 from rejeu.courses import grading, leaderboard, write
@@ -74,4 +74,4 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
 
 def as_json(board: leaderboard.Leaderboard) -> str:
     """Returns a leaderboard as JSON text."""
-    return jsonout.dumps(leaderboard.to_dict(board)) + "\n"
+    return dumps(leaderboard.to_dict(board)) + "\n"

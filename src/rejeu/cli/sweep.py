@@ -18,7 +18,7 @@ from rejeu.agents import find_agent, training
 from rejeu.agents.device import reason_against, require_memory
 from rejeu.agents.together import learn_together, sibling, start_device
 from rejeu.cli.commands import Resume, Sweep, Train
-from rejeu.cli.importing import find_id
+from rejeu.cli.environment import find_id
 from rejeu.cli.output import Stopwatch, echo, header
 from rejeu.cli.session import Session, installed_logs, make_evaluation_env
 from rejeu.envs.functional import is_functional

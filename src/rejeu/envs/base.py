@@ -1,4 +1,4 @@
-"""The interface of vector environments, which all backends implement.
+"""The interface of vector environments, which all backends implement, and their seeds.
 
 The contract hides nothing: after a step the observation is the true successor, also where the episode ended, and ended
 environments stay ended until :meth:`VectorEnv.reset_done` is called.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -16,8 +16,53 @@ import jax
 import numpy as np
 
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.seeds import Seed
 from rejeu.errors import BadEnvironmentError
+
+Seed = int | Sequence[int] | None
+"""A number ``seed``, so that environment i is seeded with ``seed + i``; one number for each environment; or None."""
+SEEDS_END = 2**31 - 1
+"""Exclusive upper bound of the seeds of single environments, because EnvPool uses 31 bits."""
+OF_ENVIRONMENTS = 0x454E
+"""Added to the seed of a run, so that the seeds of its environments differ from all others."""
+
+
+def checked_seed(seed: Any, n_envs: int) -> Seed:
+    """Validates a seed for ``n_envs`` environments and returns it, a sequence as a tuple of ints.
+
+    Raises:
+        ValueError: if a sequence does not contain one integer from 0 to 2**31 - 2 for each environment.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, int | np.integer):
+        return int(seed)
+    seeds = np.asarray(seed)
+    if seeds.shape != (n_envs,):
+        raise ValueError(f"seed={seed!r} must be a number, or a sequence of {n_envs} numbers, one for each environment")
+    if seeds.dtype.kind not in "iu" or seeds.min() < 0 or seeds.max() >= SEEDS_END:
+        raise ValueError(f"seed={seed!r} must have whole numbers from 0 to 2**31 - 2")
+    return tuple(seeds.tolist())
+
+
+def seed_of_run(seed: int) -> int:
+    """Returns the seed of a run's environments, from 0 to 2**31 - 1, for the seed of the run.
+
+    Environment i takes the i-th number after it. Without this, runs with the seeds 0 and 1 would share all their
+    environments but one.
+    """
+    return int(np.random.SeedSequence([seed, OF_ENVIRONMENTS]).generate_state(1)[0] >> 1)
+
+
+def each_seed(seed: Seed, n_envs: int) -> list[int | None]:
+    """Returns the seed of each environment.
+
+    >>> each_seed(5, 3), each_seed((7, 7, 1), 3), each_seed(None, 2)
+    ([5, 6, 7], [7, 7, 1], [None, None])
+    """
+    if seed is None:
+        return [None] * n_envs
+    return [seed + i for i in range(n_envs)] if isinstance(seed, int) else list(seed)
+
 
 SUCCESS_KEYS = ("is_success", "success")
 """Keys of an info that say whether the goal was reached, in order of precedence."""

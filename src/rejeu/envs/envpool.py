@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from rejeu.envs import goals as goals_module
-from rejeu.envs.base import SUCCESS_KEYS, DivergedError, Step, VectorEnv, replaced
+from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, DivergedError, Seed, Step, VectorEnv, checked_seed, replaced
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.registry import (
     import_envpool,
@@ -30,7 +30,6 @@ from rejeu.envs.registry import (
     register,
     unknown_environment,
 )
-from rejeu.envs.seeds import END, Seed, checked
 from rejeu.spaces import action_scaler, cast, check_env_actions, leaves, random_action
 from rejeu.validation import whole
 
@@ -317,7 +316,7 @@ def next_seed(seed: int | Sequence[int]) -> int | Sequence[int]:
     """Returns the seed of the next pool."""
     if isinstance(seed, int):
         return int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
-    return tuple(int(np.random.SeedSequence([one, 1]).generate_state(1)[0]) % END for one in seed)
+    return tuple(int(np.random.SeedSequence([one, 1]).generate_state(1)[0]) % SEEDS_END for one in seed)
 
 
 def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
@@ -326,7 +325,7 @@ def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
     Raises:
         ValueError: if it is invalid.
     """
-    several = checked(seed, n_envs) if isinstance(seed, list) else None
+    several = checked_seed(seed, n_envs) if isinstance(seed, list) else None
     return whole("seed", seed, least=0) if several is None else several
 
 

@@ -12,9 +12,8 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from rejeu.envs import goals as goals_module, validation
-from rejeu.envs.base import SUCCESS_KEYS, Step, VectorEnv, describe_spec, step_whole
+from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.seeds import Seed, for_each
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.spaces import leaves, plain
 
@@ -57,7 +56,7 @@ class GymnasiumVector(VectorEnv):
         seed = self._seed if seed is None else seed
         self._seed = None
         # Other classes of vector environments may not accept a list.
-        given = seed if seed is None or isinstance(seed, int) else for_each(seed, self.n_envs)
+        given = seed if seed is None or isinstance(seed, int) else each_seed(seed, self.n_envs)
         self._obs = self._after_reset = self._reset(seed=given)
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         self._desynced = np.zeros(self.n_envs, bool)

@@ -10,9 +10,8 @@ import jax
 import numpy as np
 
 from rejeu.envs import goals as goals_module, snapshot, validation
-from rejeu.envs.base import Step, VectorEnv, describe_spec, success_of
+from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.validation import convert_step
 from rejeu.errors import BadEnvironmentError
 from rejeu.spaces import leaves, rows, structure
@@ -66,7 +65,7 @@ class InProcess(VectorEnv):
     def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed
         self._seed = None
-        for i, own_seed in enumerate(for_each(seed, self.n_envs)):
+        for i, own_seed in enumerate(each_seed(seed, self.n_envs)):
             self._reset(i, own_seed)
         return self._obs
 

@@ -13,15 +13,14 @@ from typing import Any, Literal, NamedTuple
 import gymnasium as gym
 
 from rejeu import validation
-from rejeu.envs import functional, seeds
-from rejeu.envs.base import Step, VectorEnv
+from rejeu.envs import functional
+from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.registry import maker, register
-from rejeu.envs.seeds import Seed
 from rejeu.envs.workers.pool import TIMEOUT, check_options
 from rejeu.envs.workers.remote import Actors
 from rejeu.envs.workers.vector import InWorkers
@@ -131,7 +130,7 @@ def make_vector(
     check_workers(env, n_envs, backend, workers)
     if isinstance(env, VectorEnv | gym.vector.VectorEnv) or adapter_of(env) is not None:
         n_envs = env.n_envs if isinstance(env, VectorEnv) else env.num_envs
-    seed = seeds.checked(seed, n_envs)
+    seed = checked_seed(seed, n_envs)
     vector = _made(env, n_envs, backend, seed, workers, env_kwargs)
     if isinstance(seed, tuple):
         vector.seeds = seed

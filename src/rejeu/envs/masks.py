@@ -20,12 +20,12 @@ from jax import Array
 
 from rejeu.core import Masked
 from rejeu.envs import functional, snapshot
+from rejeu.envs.base import Seed
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, goal_functions
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, adapter_of, check_workers, make_vector
 from rejeu.envs.registry import maker
-from rejeu.envs.seeds import Seed
 from rejeu.envs.validation import id_of
 from rejeu.envs.workers.pool import TIMEOUT
 from rejeu.errors import BadEnvironmentError

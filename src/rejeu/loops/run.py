@@ -19,8 +19,7 @@ from jax import Array
 
 from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree
-from rejeu.envs import seeds
-from rejeu.envs.base import Step, VectorEnv
+from rejeu.envs.base import Step, VectorEnv, seed_of_run
 from rejeu.io.records import Count, Duration, Positive, Seconds, convert
 from rejeu.loops.learner import Learner, PackedState, is_finite
 from rejeu.loops.nonfinite import NonFiniteMonitor
@@ -212,7 +211,7 @@ def initial_run(
         carry=learner.initial_carry(1 if env is None else env.n_envs),
         monitor=NonFiniteMonitor(learner.copy, is_finite, learner.skips),
         learn_from=learn_from,
-        seed=seeds.of_run(seed),
+        seed=seed_of_run(seed),
     )
 
 

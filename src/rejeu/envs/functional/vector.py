@@ -17,11 +17,10 @@ import numpy as np
 from jax import Array
 
 from rejeu import prng
-from rejeu.envs.base import Step, VectorEnv, success_of
+from rejeu.envs.base import Seed, Step, VectorEnv, success_of
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
 from rejeu.envs.functional.validation import check
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.seeds import Seed
 from rejeu.spaces import cast, leaves
 
 

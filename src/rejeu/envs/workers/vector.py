@@ -16,9 +16,8 @@ import numpy as np
 from msgspec import Meta
 
 from rejeu.envs import goals as goals_module, snapshot, validation
-from rejeu.envs.base import SUCCESS_KEYS, Step, VectorEnv, describe_spec, success_of
+from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.seeds import Seed, for_each
 from rejeu.envs.workers import process
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, Restarted, Starter, Workers
 from rejeu.envs.workers.process import Failure, ToSharedMemory
@@ -184,7 +183,7 @@ class InWorkers(VectorEnv):
         seed = self._seed if seed is None else seed
         self._seed = None
         self._results, self._begun, self._pending = {}, {}, set()
-        return self._reset(dict(enumerate(for_each(seed, self.n_envs))))
+        return self._reset(dict(enumerate(each_seed(seed, self.n_envs))))
 
     def reset_done(self, done: np.ndarray) -> Any:
         rest = []

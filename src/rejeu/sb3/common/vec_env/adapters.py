@@ -15,11 +15,10 @@ import jax
 import numpy as np
 
 from rejeu.envs import goals as goals_module, validation
-from rejeu.envs.base import Step, VectorEnv, step_whole, success_of
+from rejeu.envs.base import Seed, Step, VectorEnv, step_whole, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.make import register_adapter
-from rejeu.envs.seeds import Seed
 from rejeu.errors import BadEnvironmentError
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
