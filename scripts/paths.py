@@ -26,7 +26,7 @@ import numpy as np
 
 import rejeu
 from rejeu import cli
-from rejeu.loops.device.chunks import Stops, train_one
+from rejeu.loops.device import Stops, train_one
 from rejeu.loops.off_policy import off_policy
 from rejeu.loops.on_policy import on_policy
 

@@ -23,7 +23,7 @@ from rejeu.core import EXPLAINED_VARIANCE, TD_ERROR, Rollout
 from rejeu.envs.make import InProcess
 from rejeu.errors import BadEnvironmentError, CheckpointError, NonFiniteError
 from rejeu.io.checkpoint import read
-from rejeu.loops import finite, learner, nonfinite
+from rejeu.loops import finite, learner
 from rejeu.loops.learner import Readings
 from rejeu.normalization import merged, no_moments
 from rejeu.spaces import Leaf
@@ -211,7 +211,7 @@ LEAVES = {
 def test_a_bad_weight_between_wide_layers_is_found(monkeypatch, tmp_path):
     """Arrays of more than 8,192 numbers are not packed, but checked like all others."""
     monkeypatch.setattr(sac, "make", broken_at(lambda s: s.critics.torso.layers[1].weight))
-    for which in (4, nonfinite.MAX_CALLS - 1):  # between two copies of the state, and just before one
+    for which in (4, finite.MAX_CALLS - 1):  # between two copies of the state, and just before one
         agent = rejeu.SAC("MlpPolicy", box(), **{**OFF, "policy_kwargs": {"net_arch": [100, 100]}})
         agent.report_folder = tmp_path
         poison(agent, which, 100.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rejeu.core import Clock, Transition
-from rejeu.loops.nonfinite import MAX_CALLS, NonFiniteMonitor, NonFiniteUpdate
+from rejeu.loops.finite import MAX_CALLS, NonFiniteMonitor, NonFiniteUpdate
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0))
 

@@ -28,8 +28,8 @@ from rejeu.envs.masks import mask_leaf, n_choices
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.io.failed_writes import FailedWrites
-from rejeu.loops import nonfinite
-from rejeu.loops.device.chunks import Stops
+from rejeu.loops import finite
+from rejeu.loops.device import Stops
 from rejeu.loops.learner import Learner, PackedState
 from rejeu.loops.run import Progress, Run, TrainingCall, initial_run
 from rejeu.normalization import normalized
@@ -157,7 +157,7 @@ class BaseAgent(ABC):
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
     report_folder: Path | None = None
-    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.nonfinite.folder_of`."""
+    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
     made_from_id: bool = False
     """Whether the environments were made from an id."""
     trained_on: tuple[str, Mapping[str, Any]] | None = None
@@ -353,7 +353,7 @@ class BaseAgent(ABC):
     @property
     def state(self) -> Any:
         """A copy of the algorithm's state. Waits for pending updates."""
-        nonfinite.settle(self)
+        finite.settle(self)
         return self.learner.state(self.run.state)
 
     @property

@@ -19,7 +19,7 @@ from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.envs.functional.vector import reset_all
 from rejeu.envs.masks import functional_vector
-from rejeu.loops.device.chunks import Stops
+from rejeu.loops.device import Stops
 from rejeu.loops.device.off_policy import most_updates
 from rejeu.loops.device.program import MAX_TURNS
 from rejeu.loops.device.trainer import vector_of

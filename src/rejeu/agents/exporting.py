@@ -26,7 +26,7 @@ from rejeu.export import c_file, check, stablehlo_file, web_file
 from rejeu.export.check import Check, Recording, Run
 from rejeu.export.contract import CARD, FrameStack, Policy, frame_stack_of, policy_of
 from rejeu.io import atomic
-from rejeu.loops import nonfinite
+from rejeu.loops import finite
 
 Target = Literal["onnx", "c", "stablehlo", "web"]
 SUFFIXES: dict[str, str] = {"onnx": ".onnx", "c": ".c", "stablehlo": ".stablehlo", "web": ".html"}
@@ -190,7 +190,7 @@ def policy_for(agent: BaseAgent, noise: bool, batch: int | None, stack: FrameSta
 
 def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
     """Returns the contract of a policy in JSON values."""
-    nonfinite.settle(agent)
+    finite.settle(agent)
     weights = hashlib.sha256()
     for array in jax.tree.leaves(agent.learner.algorithm.actor(agent.state)):
         weights.update(np.ascontiguousarray(array).tobytes())

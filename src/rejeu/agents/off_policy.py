@@ -27,7 +27,7 @@ from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
 from rejeu.io.records import brief
-from rejeu.loops.device import chunks
+from rejeu.loops.device import train_one
 from rejeu.loops.off_policy import begin_episodes, off_policy
 from rejeu.loops.run import Progress
 
@@ -108,7 +108,7 @@ class OffPolicyAgent(Agent):
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
-            return chunks.train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
+            return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:

@@ -18,8 +18,8 @@ from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.envs.masks import make_masked, split
 from rejeu.exploration.noise import Noise
-from rejeu.loops import nonfinite
-from rejeu.loops.device import chunks
+from rejeu.loops import finite
+from rejeu.loops.device import train_one
 from rejeu.loops.on_policy import begin_episodes, on_policy
 from rejeu.loops.run import Progress
 
@@ -60,7 +60,7 @@ class OnPolicyAgent(Agent):
         n = len(jax.tree.leaves(obs)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
         with devices.chosen(self.device):
-            nonfinite.settle(self)
+            finite.settle(self)
             memory = policy.memory_of(self, state, n)
             values = np.asarray(self.learner.state_value(self.run.state, memory, obs, ended))
         return values[0] if single else values
@@ -87,7 +87,7 @@ class OnPolicyAgent(Agent):
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
-            return chunks.train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
+            return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
         return on_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:

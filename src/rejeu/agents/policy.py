@@ -16,7 +16,7 @@ from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
-from rejeu.loops import nonfinite
+from rejeu.loops import finite
 from rejeu.loops.run import clock_of
 
 CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -40,7 +40,7 @@ def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.
     Raises:
         ValueError: if the shapes of ``memory`` do not match.
     """
-    nonfinite.settle(agent)
+    finite.settle(agent)
     run, learner, n = agent.run, agent.learner, len(ended)
     has_memory = learner.algorithm.recall is not None
     if deterministic and not has_memory:
@@ -102,7 +102,7 @@ def q_values(
         raise ValueError(f"q_values needs actions of {space}; only for Discrete actions it returns the values of all")
     given = None if action is None else _actions(space, action, single, n)
     with devices.chosen(agent.device):
-        nonfinite.settle(agent)
+        finite.settle(agent)
         values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
     if is_discrete and given is not None:
         values = values[:, np.arange(n), given]

@@ -40,7 +40,7 @@ from rejeu.core import PyTree
 from rejeu.errors import CheckpointError, RunInUseError
 from rejeu.io import atomic, checkpoint, records
 from rejeu.io.records import Count, Positive, Seconds
-from rejeu.loops import nonfinite
+from rejeu.loops import finite
 from rejeu.loops.run import Run
 from rejeu.runs.folder import run_files, step_of
 
@@ -143,7 +143,7 @@ class RunFolder:
             NonFiniteError: if the last update left numbers that are not finite; nothing is written then.
         """
         agent = self.agent
-        nonfinite.settle(agent)
+        finite.settle(agent)
         run = agent.run
         try:
             if not isinstance(run.replay, RolloutBuffer):

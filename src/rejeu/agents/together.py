@@ -26,10 +26,9 @@ from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
 from rejeu.interrupt import Interrupt
-from rejeu.loops import nonfinite
-from rejeu.loops.device import chunks
-from rejeu.loops.device.chunks import Stops
-from rejeu.loops.nonfinite import NonFiniteUpdate
+from rejeu.loops import finite
+from rejeu.loops.device import Stops, train
+from rejeu.loops.finite import NonFiniteUpdate
 from rejeu.loops.run import TrainingCall
 from rejeu.reporting.logging import Sink
 from rejeu.validation import whole, whole_seed
@@ -217,7 +216,7 @@ def learn_together(
         ]
         try:
             with Interrupt() as interrupt:
-                turns: Any = chunks.train(
+                turns: Any = train(
                     [agent.run for agent in agents],
                     first.learner,
                     first.config,
@@ -239,7 +238,7 @@ def learn_together(
         except NonFiniteUpdate as broken:
             which = agents[broken.which]
             values = [f"{name}={getattr(which.config, name):g}" for name in differing]
-            raise nonfinite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
+            raise finite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
 
 
 def common_stops(

@@ -20,8 +20,8 @@ from rejeu.callbacks.base import Callback, called, in_order, listed, listening, 
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.interrupt import Interrupt
-from rejeu.loops import nonfinite
-from rejeu.loops.nonfinite import NonFiniteUpdate
+from rejeu.loops import finite
+from rejeu.loops.finite import NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress, TrainingCall, checked_limits, time_shares
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
@@ -224,9 +224,9 @@ def train(
                     if record(turn) or interrupt.requested:
                         break
             agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
-            nonfinite.settle(agent)
+            finite.settle(agent)
         except NonFiniteUpdate as broken:
-            raise nonfinite.reported(agent, broken) from None
+            raise finite.reported(agent, broken) from None
 
 
 @contextmanager
@@ -318,7 +318,7 @@ def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str = 
     """
     if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
         return False
-    nonfinite.settle(agent)
+    finite.settle(agent)
     agent.best = Best(score, by, agent.run.step, agent.learner.copy(agent.run.state))
     return True
 

@@ -18,8 +18,7 @@ from rejeu.io.records import shown
 from rejeu.reporting import formatting, run_list
 from rejeu.reporting.comparison import Comparison, compare
 from rejeu.reporting.formatting import counted
-from rejeu.reporting.report import write_report
-from rejeu.reporting.report.live import make_server
+from rejeu.reporting.report import make_server, write_report
 from rejeu.reporting.runs import Run, best_row
 from rejeu.runs.folder import RunFolder, find_model
 from rejeu.validation import whole

@@ -32,8 +32,8 @@ from rejeu.core import Clock, PyTree, unmasked
 from rejeu.envs.base import Step
 from rejeu.exploration.explorer import memory_in
 from rejeu.loops.checks import check_obs, check_state, checked_reset, checked_step
+from rejeu.loops.finite import gradient_steps
 from rejeu.loops.learner import Learner
-from rejeu.loops.nonfinite import gradient_steps
 from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart, start_clock, timed
 from rejeu.spaces import action_scaler, random_action
 

@@ -21,8 +21,8 @@ from rejeu.buffers.prioritized import Draw
 from rejeu.core import Clock, PyTree
 from rejeu.envs.base import Step, VectorEnv, seed_of_run
 from rejeu.io.records import Count, Duration, Positive, Seconds, convert
+from rejeu.loops.finite import NonFiniteMonitor
 from rejeu.loops.learner import Learner, PackedState, is_finite
-from rejeu.loops.nonfinite import NonFiniteMonitor
 from rejeu.validation import number, whole
 
 F = TypeVar("F", bound=Callable[..., Any])

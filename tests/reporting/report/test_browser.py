@@ -7,8 +7,7 @@ import time
 import pytest
 
 from rejeu.reporting.comparison import compare
-from rejeu.reporting.report import write_report
-from rejeu.reporting.report.live import make_server
+from rejeu.reporting.report import make_server, write_report
 from tests.reporting.report.folders import write, write_hostile
 from tests.reporting.test_comparison import write_run
 

@@ -9,8 +9,7 @@ import time
 
 import pytest
 
-from rejeu.reporting.report import page
-from rejeu.reporting.report.live import make_server
+from rejeu.reporting.report import make_server, page
 from tests.reporting.report.folders import write
 
 

@@ -34,8 +34,8 @@ from rejeu.core import (
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
 from rejeu.envs.masks import FunctionalMask, masked
+from rejeu.loops.finite import MAX_SKIPPED
 from rejeu.loops.learner import FINITE, Packing, check, td_error_of, undo
-from rejeu.loops.nonfinite import MAX_SKIPPED
 from rejeu.loops.run import Run
 from rejeu.prng import below
 

@@ -23,8 +23,8 @@ from rejeu.envs.functional.vector import JaxVector, joined, split
 from rejeu.envs.masks import functional_vector
 from rejeu.loops.checks import check_bounds, check_finite, check_obs
 from rejeu.loops.device.program import Carry, EpisodeLog, EpisodeState, Limits, Program, Report
+from rejeu.loops.finite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.loops.learner import Learner, Readings
-from rejeu.loops.nonfinite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress, Run
 from rejeu.xla import for_runs
 
