@@ -84,12 +84,9 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
         backend = "gymnasium"
     backend = arguments.backend or backend
     order = None if arguments.arrivals is None else read_arrivals(Path(arguments.arrivals))
-    ray = None
+    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order)
     if backend == "ray" or arguments.ray is not None:
-        ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus}
-    workers = WorkerOptions(
-        restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order, ray=ray
-    )
+        workers = workers._replace(ray={"address": arguments.ray, "num_cpus": arguments.env_cpus})
     return made.vector(n_envs, backend, seed, workers)
 
 

@@ -267,7 +267,7 @@ class Members:
         found = decide(scores, self.values(number), self.population.plan.search_space, rng)
         if number + 1 == self.population.rounds:  # nobody trains on
             found = [dataclasses.replace(one, parent=None, next_values=one.values) for one in found]
-        atomic.write(self.decisions_file(number), json_text([dataclasses.asdict(one) for one in found]))
+        atomic.write(self.decisions_file(number), json_text(found))
         self.write_history()
         return found
 

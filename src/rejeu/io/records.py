@@ -83,13 +83,12 @@ def read_json(path: Path, most: int) -> Any:
 
 
 def json_text(value: Any, indent: int = 1) -> str:
-    """Returns JSON values, or a dataclass of them, as the text of a file.
+    """Returns JSON values, also in dataclasses, as the text of a file.
 
     Raises:
         TypeError, ValueError: if a value is not one of JSON, or not finite.
     """
-    content = dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[arg-type]
-    return json.dumps(content, indent=indent, allow_nan=False) + "\n"
+    return json.dumps(value, indent=indent, allow_nan=False, default=dataclasses.asdict) + "\n"
 
 
 def convert(value: Any, kind: type[T]) -> T:
