@@ -331,7 +331,7 @@ class Case:
 
     def agent(self) -> Any:
         import rejeu
-        from rejeu.agents.registry import choose_algorithm
+        from rejeu.agents import choose_algorithm
         from rejeu.algorithms.config import OffPolicyConfig
 
         vector = self.group.vector(self.env_id)

@@ -366,6 +366,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         crossq,
         ddpg,
         dqn,
+        iql,
         iqn,
         maskable_ppo,
         ppo,
@@ -378,7 +379,24 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         trpo,
     )
 
-    modules: Any = (a2c, ars, crossq, ddpg, dqn, iqn, maskable_ppo, ppo, pqn, qrdqn, recurrent_ppo, sac, td3, tqc, trpo)
+    modules: Any = (
+        a2c,
+        ars,
+        crossq,
+        ddpg,
+        dqn,
+        iql,
+        iqn,
+        maskable_ppo,
+        ppo,
+        pqn,
+        qrdqn,
+        recurrent_ppo,
+        sac,
+        td3,
+        tqc,
+        trpo,
+    )
     kinds = {module.Config.name: module.Config for module in modules} | config.registered
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
 
