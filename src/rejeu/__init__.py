@@ -33,7 +33,9 @@ if TYPE_CHECKING:
         TD3 as TD3,
         TQC as TQC,
         TRPO as TRPO,
+        XQC as XQC,
         CrossQ as CrossQ,
+        FlashSAC as FlashSAC,
         MaskablePPO as MaskablePPO,
         OffPolicyAgent as OffPolicyAgent,
         OnPolicyAgent as OnPolicyAgent,
@@ -80,8 +82,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL IQN PPO PQN QRDQN SAC TD3 TQC TRPO CrossQ MaskablePPO OffPolicyAgent "
-    "OnPolicyAgent RecurrentPPO load register",
+    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL IQN PPO PQN QRDQN SAC TD3 TQC TRPO XQC CrossQ FlashSAC MaskablePPO "
+    "OffPolicyAgent OnPolicyAgent RecurrentPPO load register",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",

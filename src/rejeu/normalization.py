@@ -4,7 +4,9 @@ A :func:`normalized` algorithm takes raw observations and rewards, in training a
 state and hence of its file; they change only in training. Observations are standardized,
 ``clip((x - mean) / sqrt(variance + epsilon), -clip_obs, clip_obs)``. Rewards are divided by the standard deviation of the
 running discounted sum of rewards of each environment (Engstrom et al. 2020, "Implementation Matters in Deep Policy
-Gradients", arXiv 2005.12729), ``clip(r / sqrt(variance + epsilon), -clip_reward, clip_reward)``, and not shifted.
+Gradients", arXiv 2005.12729), ``clip(r / sqrt(variance + epsilon), -clip_reward, clip_reward)``, and not shifted. With
+``max_return`` the divisor is ``max(sqrt(variance + epsilon), largest / max_return)``, where ``largest`` is the largest of
+these sums so far in size, so that none exceeds ``max_return`` (SimbaV2, Lee et al. 2025, arXiv 2502.15280).
 
 Moments are merged as in Chan, Golub and LeVeque 1983, "Algorithms for Computing the Sample Variance". Off-policy
 algorithms add every observation to the statistics when it is made; batches from the buffer are normalized by the newest
@@ -45,10 +47,14 @@ class NormalizationConfig:
     """Maximum magnitude of a normalized reward."""
     epsilon: float = 1e-8
     """Added to variances."""
+    max_return: float | None = None
+    """Limit on the discounted sums of normalized rewards, for critics with fixed values: rewards are divided by at least the
+    largest sum in size over it. None: no limit."""
 
     def __post_init__(self) -> None:
         coerce(self, ("norm_obs", "norm_reward"), flag)
         coerce(self, ("clip_obs", "clip_reward", "epsilon"), number, above=0)
+        coerce(self, "max_return", number, above=0, optional=True)
 
 
 def parse(value: Any) -> NormalizationConfig | None:
@@ -111,6 +117,8 @@ class Statistics(NamedTuple):
     """By group of leaves; see :func:`groups`."""
     returns: Moments
     """Of the discounted sum of rewards, ``float32[]`` each."""
+    largest: Array | None = None
+    """The largest discounted sum of rewards in size, ``float32[]``, with ``max_return``."""
 
 
 class State(eqx.Module):
@@ -133,7 +141,8 @@ class Normalizer(NamedTuple):
 
     def init(self) -> Statistics:
         """Returns the statistics before the first step."""
-        return Statistics(tuple(no_moments(self.shapes[g]) for g in sorted(self.shapes)), no_moments(()))
+        largest = None if self.config.max_return is None else jnp.float32(0.0)
+        return Statistics(tuple(no_moments(self.shapes[g]) for g in sorted(self.shapes)), no_moments(()), largest)
 
     def obs(self, statistics: Statistics, obs: PyTree) -> PyTree:
         """Returns normalized observations ``(..., *shape)``."""
@@ -159,13 +168,25 @@ class Normalizer(NamedTuple):
         if not self.config.norm_reward:
             return reward
         limit = self.config.clip_reward * scale
-        scaled = reward * jax.lax.rsqrt(statistics.returns.variance + self.config.epsilon)
+        factor = jax.lax.rsqrt(statistics.returns.variance + self.config.epsilon)
+        if statistics.largest is not None:
+            assert self.config.max_return is not None
+            factor = jnp.minimum(factor, self.config.max_return / jnp.maximum(statistics.largest, 1e-8))
+        scaled = reward * factor
         return jnp.where(statistics.returns.n_seen > 0, jnp.clip(scaled, -limit, limit), reward)
 
     def n_step_reward(self, statistics: Statistics, rewards: Array) -> Array:
         """Returns the sum of ``gamma^i r_i`` ``(batch, n)``, with each ``r_i`` normalized and clipped."""
         scale = self.gamma ** jnp.arange(rewards.shape[1], dtype=jnp.float32)[None]
         return jnp.sum(self.reward(statistics, rewards, scale), axis=1)
+
+    def with_returns(self, statistics: Statistics, returns: Array, weight: Array) -> Statistics:
+        """Returns the statistics after discounted sums of rewards ``(n,)`` whose weights are 0 or 1."""
+        moments, largest = merged(statistics.returns, returns, weight), statistics.largest
+        if largest is not None:
+            sizes = jnp.where((weight > 0) & jnp.isfinite(returns), jnp.abs(returns), 0.0)
+            largest = jnp.maximum(largest, jnp.max(sizes))
+        return statistics._replace(returns=moments, largest=largest)
 
     def with_obs(self, statistics: Statistics, obs: PyTree, weight: Array) -> Statistics:
         """Returns the statistics after observations whose weights ``(n,)`` are 0 or 1."""
@@ -192,10 +213,10 @@ class Normalizer(NamedTuple):
         Its observations are normalized by the statistics from before, except those of the first rollout.
         """
         weight = rollout.valid.reshape(-1).astype(jnp.float32)
-        returns = merged(before.returns, rollout.running_return.reshape(-1), weight)
-        after = self.with_obs(before._replace(returns=returns), rollout.obs, weight)
+        scaled = self.with_returns(before, rollout.running_return.reshape(-1), weight)
+        after = self.with_obs(scaled, rollout.obs, weight)
         is_first = before.returns.n_seen == 0
-        used = jax.tree.map(lambda old, new: jnp.where(is_first, new, old), before._replace(returns=returns), after)
+        used = jax.tree.map(lambda old, new: jnp.where(is_first, new, old), scaled, after)
         normalized = rollout._replace(
             obs=self.obs(used, rollout.obs),
             next_obs=self.obs(used, rollout.next_obs),
@@ -240,7 +261,7 @@ def normalized(
     def observe(state: State, obs: PyTree, returns: Array) -> State:
         weight = jnp.ones_like(returns)
         statistics = normalizer.with_obs(state.statistics, obs, weight)
-        return State(state.learner, statistics._replace(returns=merged(statistics.returns, returns, weight)))
+        return State(state.learner, normalizer.with_returns(statistics, returns, weight))
 
     return acting_normalized(algorithm, explorer, normalizer)._replace(
         init=lambda key: State(algorithm.init(key), normalizer.init()), update=update, observe=observe

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rejeu import xla
 from rejeu.algorithms.categorical import cross_entropy, make_atoms, mean_of, project
 
 V_MIN, V_MAX, N_ATOMS = -3.0, 5.0, 9
@@ -35,8 +36,10 @@ def distributions(shape: tuple[int, ...], n: int, scale: float, seed: int = 0) -
 
 
 @pytest.mark.usefixtures("strict_dtypes")
+@pytest.mark.parametrize("platform", ["cpu", "gpu"])
 @pytest.mark.parametrize("n", [1, 6, 20])
-def test_projection_equals_the_loops_of_the_paper(n):
+def test_projection_equals_the_loops_of_the_paper_on_every_platform(n, platform, monkeypatch):
+    monkeypatch.setattr(xla, "platform", lambda: platform)
     values, probabilities = distributions((2, 4), n, 4.0)
     given = np.asarray(project(jnp.asarray(values), jnp.asarray(probabilities), make_atoms(V_MIN, V_MAX, N_ATOMS)))
     if n > 1:

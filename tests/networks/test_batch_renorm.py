@@ -144,9 +144,8 @@ def test_a_torso_renormalises_its_input_and_each_layer_after_the_nonlinearity():
 
 def test_with_statistics_takes_the_statistics_of_one_network_and_the_weights_of_the_other():
     leaf = Leaf("", "continuous", (WIDTH,), "float32")
-    one, other = (
-        RenormalizedNetwork(jax.random.PRNGKey(seed), (leaf,), None, 2, (4,), "relu", warm_up=0) for seed in (0, 1)
-    )
+    torso = lambda key, n_inputs: RenormalizedMLP(key, n_inputs, (4,), "relu", warm_up=0)  # noqa: E731
+    one, other = (RenormalizedNetwork(jax.random.PRNGKey(seed), (leaf,), None, 2, torso) for seed in (0, 1))
     _, other = other.train(batch(0, mean=3.0))
     joined = with_statistics(one, other)
     for own, norm, trained in zip(one.torso.norms, joined.torso.norms, other.torso.norms, strict=True):

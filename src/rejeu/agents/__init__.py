@@ -16,7 +16,7 @@ import gymnasium as gym
 from rejeu import presets as all_presets
 from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
-from rejeu.agents.off_policy import DDPG, DQN, IQL, IQN, QRDQN, SAC, TD3, TQC, CrossQ, OffPolicyAgent
+from rejeu.agents.off_policy import DDPG, DQN, IQL, IQN, QRDQN, SAC, TD3, TQC, XQC, CrossQ, FlashSAC, OffPolicyAgent
 from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import Callback
@@ -41,9 +41,11 @@ __all__ = [
     "TD3",
     "TQC",
     "TRPO",
+    "XQC",
     "Agent",
     "Callback",
     "CrossQ",
+    "FlashSAC",
     "MaskablePPO",
     "OffPolicyAgent",
     "OnPolicyAgent",
@@ -59,7 +61,26 @@ __all__ = [
 
 A = TypeVar("A", bound=type[Agent])
 
-KINDS = (SAC, DDPG, TD3, DQN, QRDQN, IQN, TQC, CrossQ, PPO, A2C, RecurrentPPO, MaskablePPO, PQN, TRPO, ARS, IQL)
+KINDS = (
+    SAC,
+    DDPG,
+    TD3,
+    DQN,
+    QRDQN,
+    IQN,
+    TQC,
+    CrossQ,
+    FlashSAC,
+    XQC,
+    PPO,
+    A2C,
+    RecurrentPPO,
+    MaskablePPO,
+    PQN,
+    TRPO,
+    ARS,
+    IQL,
+)
 BUILT_IN: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
 
 AGENTS: dict[str, type[Agent]] = dict(BUILT_IN)

@@ -1,4 +1,4 @@
-"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC, CrossQ and IQL."""
+"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC, CrossQ, FlashSAC, XQC and IQL."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
-from rejeu.algorithms import crossq, ddpg, dqn, iql, iqn, qrdqn, sac, td3, tqc
+from rejeu.algorithms import crossq, ddpg, dqn, flashsac, iql, iqn, qrdqn, sac, td3, tqc, xqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import ring_io
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
@@ -236,6 +236,18 @@ class CrossQ(OffPolicyAgent):
     """SAC with batch renormalization instead of target networks (Bhatt et al. 2024), for continuous actions."""
 
     algorithm: ClassVar[ModuleType] = crossq
+
+
+class FlashSAC(OffPolicyAgent):
+    """SAC through normalized, projected networks and categorical critics (Kim et al. 2026), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = flashsac
+
+
+class XQC(OffPolicyAgent):
+    """SAC through batch-normalized, projected layers and categorical critics (Palenicek et al. 2026), likewise."""
+
+    algorithm: ClassVar[ModuleType] = xqc
 
 
 class IQL(OffPolicyAgent):

@@ -44,8 +44,9 @@ from rejeu.algorithms.sac.continuous import (
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core import Algorithm, Clock, Metrics, Optimizer, PyTree, Transition, ensemble, minimize, weighted_mean
 from rejeu.distributions import TanhNormal
+from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import PolicyConfig, Widths, action_values, values_by_critics
-from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
+from rejeu.networks.batch_renorm import RenormalizedMLP, RenormalizedNetwork, with_statistics
 from rejeu.prng import nth
 from rejeu.schedules import Schedule, at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
@@ -84,7 +85,7 @@ class Config(EntropyConfig):
         EntropyConfig.__post_init__(self)
         coerce(self, "policy_delay", whole, least=1)
         coerce(self, "renorm_warmup_steps", whole, least=0)
-        check_shape(self.policy_kwargs)
+        check_shape(self.policy_kwargs, self.name)
 
 
 class State(eqx.Module):
@@ -115,7 +116,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is not an array.
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, target_entropy = leaves(observation_space), config.entropy_target(-float(action_dim))
+    obs_leaves, target_entropy = leaves(observation_space), config.entropy_target(-float(action_dim), action_dim)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm, b1=ADAM_B1)
 
     def init(key: Array) -> State:
@@ -160,7 +161,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             critic_loss, state.actor_loss, alpha, state.entropy, values, target, target_entropy, config
         )
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, action_values=values_by_critics)
+    policy = lambda actor, obs: distribution(actor(obs))  # noqa: E731
+    explorer = held_explorer(policy, action_dim, config.noise_repeat) if config.noise_repeat > 1 else None
+    return Algorithm(
+        init, lambda state: state.actor, explore, exploit, update, explorer, action_values=values_by_critics
+    )
 
 
 def initial_state(
@@ -175,8 +180,9 @@ def initial_state(
     shape = config.policy_kwargs
 
     def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalizedNetwork:
-        warm_up = config.renorm_warmup_steps
-        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, widths, shape.activation_fn, warm_up)
+        settings = widths, shape.activation_fn, config.renorm_warmup_steps
+        torso = lambda key, n_inputs: RenormalizedMLP(key, n_inputs, *settings)  # noqa: E731
+        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, torso)
 
     actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(ACTOR_LAYERS))
     widths = shape.critic_widths(CRITIC_LAYERS)
@@ -196,8 +202,8 @@ def initial_state(
     )
 
 
-def check_shape(shape: PolicyConfig) -> None:
-    """Raises ``ValueError`` for network shapes other than plain layers: CrossQ puts its normalization between them."""
+def check_shape(shape: PolicyConfig, name: str) -> None:
+    """Raises ``ValueError`` for network shapes other than widths: the algorithm ``name`` has normalized layers of its own."""
     given = {
         "layer_norm": shape.layer_norm,
         "cnn_layer_norm": shape.cnn_layer_norm,
@@ -211,7 +217,7 @@ def check_shape(shape: PolicyConfig) -> None:
     }
     if refused := [key for key, present in given.items() if present]:
         raise ValueError(
-            f"CrossQ renormalizes layers of its own; its policy_kwargs take net_arch and activation_fn, not "
+            f"{name} normalizes layers of its own; its policy_kwargs take net_arch and activation_fn, not "
             f"{', '.join(refused)}: leave that out, or use SAC or TQC"
         )
 

@@ -84,7 +84,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, shape = leaves(observation_space), config.policy_kwargs
-    target_entropy = config.entropy_target(-float(action_dim))
+    target_entropy = config.entropy_target(-float(action_dim), action_dim)
     n_pooled = config.target_subset or config.n_critics
     n_kept = n_pooled * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
@@ -121,7 +121,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
     actor = lambda state: state.actor  # noqa: E731
-    algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values)
+    algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config, action_dim), action_values=values)
     return remembering(algorithm, shape, networks)
 
 

@@ -31,11 +31,13 @@ from jax import Array
 from rejeu.core import Algorithm, Clock, PyTree
 from rejeu.networks import LayerNorm
 from rejeu.networks.batch_renorm import BatchRenorm
+from rejeu.networks.layers import RMSNorm
 from rejeu.validation import coerce, number, whole
 
 NORMALIZATION_LAYERS: tuple[type[eqx.Module], ...] = (
     LayerNorm,
     BatchRenorm,
+    RMSNorm,
     eqx.nn.LayerNorm,
     eqx.nn.RMSNorm,
     eqx.nn.GroupNorm,

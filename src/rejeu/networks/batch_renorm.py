@@ -21,7 +21,7 @@ the output and the network with updated statistics. Because an optimizer's step 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -30,7 +30,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from rejeu.core import PyTree
-from rejeu.networks import ACTIVATIONS, Encoder, Linear
+from rejeu.networks.encoder import Encoder
+from rejeu.networks.layers import ACTIVATIONS, Linear
 from rejeu.spaces import Leaf
 
 Network = TypeVar("Network")
@@ -43,6 +44,8 @@ R_MAX = 3.0
 """Maximum ratio of the batch's and the running standard deviation."""
 D_MAX = 5.0
 """Maximum difference of their means, in running standard deviations."""
+NEVER = 2**31 - 1
+"""A warm-up that does not end: plain batch normalization."""
 
 
 class BatchRenorm(eqx.Module):
@@ -61,19 +64,20 @@ class BatchRenorm(eqx.Module):
     the warm-up."""
     warm_up: int = eqx.field(static=True)
     """Training steps of plain batch normalization at the beginning."""
+    epsilon: float = eqx.field(static=True)
 
-    def __init__(self, width: int, warm_up: int) -> None:
+    def __init__(self, width: int, warm_up: int, epsilon: float = EPSILON) -> None:
         self.scale = jnp.ones((width,), jnp.float32)
         self.offset = jnp.zeros((width,), jnp.float32)
         self.mean = jnp.zeros((width,), jnp.float32)
         self.variance = jnp.ones((width,), jnp.float32)
         self.n_batches = jnp.zeros((), jnp.float32)
-        self.warm_up = warm_up
+        self.warm_up, self.epsilon = warm_up, epsilon
 
     def __call__(self, x: Array) -> Array:
         """Normalizes ``(batch, width)`` by the running statistics."""
         mean, variance = lax.stop_gradient((self.mean, self.variance))
-        factor = self.scale * lax.rsqrt(variance + EPSILON)
+        factor = self.scale * lax.rsqrt(variance + self.epsilon)
         return x * factor[None] + (self.offset - mean * factor)[None]
 
     def train(self, x: Array) -> tuple[Array, BatchRenorm]:
@@ -81,7 +85,7 @@ class BatchRenorm(eqx.Module):
         batch_mean = jnp.mean(x, axis=0)
         centered = x - batch_mean[None]
         batch_variance = jnp.mean(jnp.square(centered), axis=0)
-        batch_deviation = jnp.sqrt(batch_variance + EPSILON)
+        batch_deviation = jnp.sqrt(batch_variance + self.epsilon)
         ratio, shift = lax.stop_gradient(self._correction(batch_mean, batch_deviation))
         factor = self.scale * ratio / batch_deviation
         y = centered * factor[None] + (self.scale * shift + self.offset)[None]
@@ -96,7 +100,9 @@ class BatchRenorm(eqx.Module):
 
     def _correction(self, batch_mean: Array, batch_deviation: Array) -> tuple[Array, Array]:
         """Returns ``r`` and ``d`` of the paper, ``(width,)`` each."""
-        deviation = jnp.sqrt(self.variance + EPSILON)
+        if self.warm_up == NEVER:
+            return jnp.ones_like(self.scale), jnp.zeros_like(self.scale)
+        deviation = jnp.sqrt(self.variance + self.epsilon)
         ratio = jnp.clip(batch_deviation / deviation, 1.0 / R_MAX, R_MAX)
         shift = jnp.clip((batch_mean - self.mean) / deviation, -D_MAX, D_MAX)
         warm = self.n_batches >= self.warm_up
@@ -118,8 +124,13 @@ class RenormalizedMLP(eqx.Module):
         self.norms = tuple(BatchRenorm(size, warm_up) for size in sizes)
         self.activation = activation
 
+    @property
+    def n_outputs(self) -> int:
+        """Width of the last layer."""
+        return self.norms[-1].scale.shape[-1]
+
     def __call__(self, x: Array) -> Array:
-        """Maps ``(batch, n_inputs)`` to ``(batch, widths[-1])`` by the running statistics."""
+        """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)`` by the running statistics."""
         x = self.norms[0](x)
         for layer, norm in zip(self.layers, self.norms[1:], strict=True):
             x = norm(ACTIVATIONS[self.activation](layer(x)))
@@ -136,11 +147,11 @@ class RenormalizedMLP(eqx.Module):
 
 
 class RenormalizedNetwork(eqx.Module):
-    """Observation, and for a critic the action, to numbers: encoder, renormalized hidden layers, one linear head."""
+    """Observation, and for a critic the action, to numbers: encoder, normalized hidden layers, one linear head."""
 
     encoder: Encoder
-    torso: RenormalizedMLP
-    head: Linear
+    torso: Any
+    head: Any
 
     def __init__(
         self,
@@ -148,16 +159,23 @@ class RenormalizedNetwork(eqx.Module):
         leaves: tuple[Leaf, ...],
         action_dim: int | None,
         n_outputs: int,
-        widths: Sequence[int],
-        activation: str,
-        warm_up: int,
+        make_torso: Callable[[Array, int], Any],
+        make_head: Callable[[Array, int, int], Any] = Linear,
     ) -> None:
-        """Draws the weights; ``action_dim`` is None for a network that is given no action."""
+        """Draws the weights.
+
+        Args:
+            key: for the weights.
+            leaves: those of the observations.
+            action_dim: None for a network that is given no action.
+            n_outputs: how many numbers come out.
+            make_torso: ``make_torso(key, n_inputs)`` returns hidden layers with ``n_outputs`` and ``train``.
+            make_head: ``make_head(key, n_inputs, n_outputs)`` returns the last layer.
+        """
         encoder_key, torso_key, head_key = jax.random.split(key, 3)
         self.encoder = Encoder(leaves, encoder_key)
-        sizes = (self.encoder.n_features + (action_dim or 0), *widths)
-        self.torso = RenormalizedMLP(torso_key, sizes[0], widths, activation, warm_up)
-        self.head = Linear(head_key, sizes[-1], n_outputs)
+        self.torso = make_torso(torso_key, self.encoder.n_features + (action_dim or 0))
+        self.head = make_head(head_key, self.torso.n_outputs, n_outputs)
 
     def __call__(self, obs: PyTree, action: Array | None = None) -> Array:
         """Maps observations ``(batch, ...)`` to ``(batch, n_outputs)`` by the running statistics.

@@ -104,6 +104,21 @@ class LayerNorm(eqx.Module):
         return centered * jax.lax.rsqrt(variance + 1e-5) * scale + offset
 
 
+class RMSNorm(eqx.Module):
+    """Root mean square normalization over the last axis (Zhang and Sennrich 2019, arXiv 1910.07467): no mean, no offset."""
+
+    scale: Array
+    """``(width,)``."""
+
+    def __init__(self, width: int) -> None:
+        self.scale = jnp.ones((width,), jnp.float32)
+
+    def __call__(self, x: Array) -> Array:
+        """Returns ``x``, ``(..., width)``, divided by the root of the mean square along its last axis, times the scale."""
+        scale = self.scale.reshape((1,) * (x.ndim - 1) + (-1,))
+        return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + 1e-6) * scale
+
+
 class Dropout(eqx.Module):
     """Sets each number to 0 with probability ``rate`` and divides the others by ``1 - rate`` (Srivastava et al. 2014).
 

@@ -366,6 +366,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         crossq,
         ddpg,
         dqn,
+        flashsac,
         iql,
         iqn,
         maskable_ppo,
@@ -377,6 +378,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         td3,
         tqc,
         trpo,
+        xqc,
     )
 
     modules: Any = (
@@ -385,6 +387,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         crossq,
         ddpg,
         dqn,
+        flashsac,
         iql,
         iqn,
         maskable_ppo,
@@ -396,6 +399,7 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         td3,
         tqc,
         trpo,
+        xqc,
     )
     kinds = {module.Config.name: module.Config for module in modules} | config.registered
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}

@@ -60,6 +60,7 @@ from rejeu.core import (
     without_gradient,
 )
 from rejeu.distributions import TanhNormal
+from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import (
     Network,
     QNetwork,
@@ -100,18 +101,32 @@ class EntropyConfig(OffPolicyConfig):
     value explores more."""
     target_entropy: float | str = "auto"
     """Target entropy in nats for learning the temperature. ``"auto"`` is minus the number of action dimensions; for n
-    Discrete actions 0.3 log n (the paper's 0.98 log n keeps the policy nearly uniform)."""
+    Discrete actions 0.3 log n (the paper's 0.98 log n keeps the policy nearly uniform). ``"std_0.15"`` is that of normal
+    distributions with this standard deviation, the range of an action being [-1, 1]."""
     n_critics: int = 2
     """Number of critics."""
+    noise_repeat: int = 1
+    """Most steps for which the noise of an action stays the same; most spells are short (FlashSAC). A larger number explores
+    further from where the policy is. Box actions only, without ``action_noise``. 1: fresh noise in every step."""
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
         initial_temperature(self.ent_coef)
-        coerce(self, "target_entropy", lambda key, value: value if value == "auto" else number(key, value))
+        coerce(self, "target_entropy", entropy_target)
+        coerce(self, "noise_repeat", whole, least=1)
+        for key, given in (("action_noise", self.action_noise is not None), ("lstm_hidden_size", self.has_memory)):
+            if self.noise_repeat > 1 and given:
+                raise ValueError(f"noise_repeat={self.noise_repeat} is not available with {key}; leave one of them out")
         coerce(self, "n_critics", whole, least=1)
 
-    def entropy_target(self, automatic: float) -> float:
-        """Returns the target entropy in nats, ``automatic`` for ``"auto"``."""
+    def entropy_target(self, automatic: float, action_dim: int = 0) -> float:
+        """Returns the target entropy in nats, ``automatic`` for ``"auto"``.
+
+        That of a standard deviation ``std`` is ``n log(2 pi e std^2) / 2`` for ``n`` components of a Box.
+        """
+        if isinstance(self.target_entropy, str) and self.target_entropy != "auto":
+            std = float(self.target_entropy.removeprefix("std_"))
+            return 0.5 * action_dim * math.log(2 * math.pi * math.e * std**2)
         return automatic if self.target_entropy == "auto" else float(self.target_entropy)
 
     @property
@@ -155,8 +170,8 @@ class Config(EntropyConfig):
         coerce(self, "sde_log_std_init", number)
         if self.sde_sample_freq == 0:
             raise ValueError("sde_sample_freq=0 would sample no noise; use 1 or more, or -1 for once per episode")
-        if self.use_sde and self.action_noise is not None:
-            raise ValueError("use_sde=True explores by itself; leave action_noise out")
+        if self.use_sde and (self.action_noise is not None or self.noise_repeat > 1):
+            raise ValueError("use_sde=True explores by itself; leave action_noise and noise_repeat out")
         if self.use_sde and self.has_memory:
             raise ValueError("use_sde=True is not available for policies with memory; leave it or lstm_hidden_size out")
 
@@ -212,7 +227,8 @@ class SdeActor(eqx.Module):
 class State(eqx.Module):
     """Everything that SAC learns; every leaf is an array."""
 
-    actor: Network | SdeActor
+    actor: Any
+    """A :class:`Network`, with gSDE an :class:`SdeActor`."""
     critics: Any
     """All critics, stacked along a leading axis."""
     target_critics: Any = eqx.field(metadata=AVERAGED)
@@ -234,7 +250,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     """Returns SAC for Box actions."""
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, shape = leaves(observation_space), config.policy_kwargs
-    target_entropy = config.entropy_target(-float(action_dim))
+    target_entropy = config.entropy_target(-float(action_dim), action_dim)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
@@ -266,7 +282,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, target, target_entropy, config)
 
     actor = lambda state: state.actor  # noqa: E731
-    algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config), action_values=values_by_critics)
+    explorer = explorer_of(config, action_dim)
+    algorithm = Algorithm(init, actor, explore, exploit, update, explorer, action_values=values_by_critics)
     return remembering(algorithm, shape, networks)
 
 
@@ -275,9 +292,22 @@ def networks(state: State) -> tuple[Any, ...]:
     return state.actor, state.critics
 
 
-def explorer_of(config: Config) -> Explorer | None:
-    """Returns exploration by state-dependent noise if the configuration uses it, else None."""
+def explorer_of(config: Config, action_dim: int) -> Explorer | None:
+    """Returns exploration by state-dependent or held noise if the configuration uses it, else None."""
+    if config.noise_repeat > 1:
+        return held_explorer(policy, action_dim, config.noise_repeat)
     return sde_explorer(config.sde_sample_freq) if config.use_sde else None
+
+
+def check_discrete(config: Config) -> None:
+    """Raises ``ValueError`` for exploration and entropies that only Box actions have."""
+    given = {
+        "use_sde=True": config.use_sde,
+        f"noise_repeat={config.noise_repeat}": config.noise_repeat > 1,
+        f"target_entropy={config.target_entropy!r}": str(config.target_entropy).startswith("std_"),
+    }
+    if wrong := [setting for setting, is_given in given.items() if is_given]:
+        raise ValueError(f"{wrong[0]} needs Box actions: noise cannot be added to discrete actions; leave it out")
 
 
 def initial_state(
@@ -420,6 +450,18 @@ def actor_loss(
     action, log_prob = policy(actor, obs).sample_and_log_prob(key)
     value = judged_by(action_values(critics, obs, action), axis=0)
     return jnp.mean(alpha * log_prob - value), log_prob
+
+
+def entropy_target(key: str, value: Any) -> float | str:
+    """Returns a target entropy: ``"auto"``, ``"std_"`` and a positive number, or a number."""
+    if isinstance(value, str) and value != "auto":
+        try:
+            good = value.startswith("std_") and 0 < float(value.removeprefix("std_")) < math.inf
+        except ValueError:
+            good = False
+        if not good:
+            raise ValueError(f"{key}={value!r} must be 'auto', 'std_0.15' or a number")
+    return value if isinstance(value, str) else number(key, value)
 
 
 def initial_temperature(ent_coef: float | str) -> float:

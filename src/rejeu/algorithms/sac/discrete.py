@@ -31,6 +31,7 @@ from rejeu.algorithms.sac.continuous import (
     State,
     after_actor,
     after_critics,
+    check_discrete,
     every,
     initial_state,
     metrics_of,
@@ -64,8 +65,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     Raises:
         ValueError: with gSDE.
     """
-    if config.use_sde:
-        raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
+    check_discrete(config)
     obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 

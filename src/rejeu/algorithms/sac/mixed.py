@@ -36,6 +36,7 @@ from rejeu.algorithms.sac.continuous import (
     State,
     after_actor,
     after_critics,
+    check_discrete,
     every,
     initial_state,
 )
@@ -67,8 +68,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: with gSDE or memory, for a Box without finite bounds, and for more than :data:`MOST_COMBINATIONS`.
     """
-    if config.use_sde:
-        raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
+    check_discrete(config)
     if config.has_memory:
         raise ValueError(
             "lstm_hidden_size is not available for Dict and Tuple actions; leave it out, or use RecurrentPPO"

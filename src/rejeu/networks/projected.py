@@ -1,0 +1,188 @@
+"""Hidden layers whose weights are scaled to a fixed norm after each gradient step, with batch normalization between them.
+
+Batch normalization makes the scale of the weights before it irrelevant, but as they grow the steps of the optimizer count for
+less. :func:`projected` scales them back: each unit's weights to the norm 1, and on request the ``d`` gains of each
+normalization to ``sqrt(d)``. So the effective learning rate stays the same (Palenicek et al. 2025, arXiv 2502.07523).
+
+The normalization is :class:`rejeu.networks.batch_renorm.BatchRenorm` without renormalization. ``train`` returns what these
+layers compute by the statistics of the batch, and the layers with updated running statistics; a call goes by the running ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rejeu.networks.batch_renorm import NEVER, BatchRenorm
+from rejeu.networks.layers import ACTIVATIONS, RMSNorm, product
+
+Network = TypeVar("Network")
+EXPANSION = 4
+"""How many times wider a block is inside."""
+FINE = 1e-5
+"""What FlashSAC adds to variances."""
+
+
+class UnitLinear(eqx.Module):
+    """A linear map whose units have weights of norm 1 after :func:`projected`, and a bias only as a network's head."""
+
+    weight: Array
+    """``(n_inputs, n_outputs)``."""
+    bias: Array | None
+    """``(n_outputs,)``."""
+
+    def __init__(self, key: Array, n_inputs: int, n_outputs: int, bias: bool = False) -> None:
+        """Draws an orthogonal matrix, its columns scaled to norm 1; the bias is 0."""
+        weight = jax.nn.initializers.orthogonal()(key, (n_inputs, n_outputs), jnp.float32)
+        self.weight = unit(weight, axis=0)
+        self.bias = jnp.zeros((n_outputs,), jnp.float32) if bias else None
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)``."""
+        y = product(x, self.weight)
+        return y if self.bias is None else y + self.bias[None]
+
+
+def head(key: Array, n_inputs: int, n_outputs: int) -> UnitLinear:
+    """Returns the last layer of a network."""
+    return UnitLinear(key, n_inputs, n_outputs, bias=True)
+
+
+class NormalizedMLP(eqx.Module):
+    """A normalization of the input, then layers, each a linear map, a normalization and a nonlinearity (XQC)."""
+
+    layers: tuple[UnitLinear, ...]
+    norms: tuple[BatchRenorm, ...]
+    """Of the input, then of what each linear map gives: one more than layers."""
+    activation: str = eqx.field(static=True)
+
+    def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str) -> None:
+        sizes = (n_inputs, *widths)
+        keys = jax.random.split(key, max(len(widths), 1))
+        self.layers = tuple(UnitLinear(k, i, o) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=False))
+        self.norms = tuple(BatchRenorm(size, NEVER) for size in sizes)
+        self.activation = activation
+
+    @property
+    def n_outputs(self) -> int:
+        """Width of the last layer."""
+        return self.norms[-1].scale.shape[-1]
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)`` by the running statistics."""
+        x = self.norms[0](x)
+        for layer, norm in zip(self.layers, self.norms[1:], strict=True):
+            x = ACTIVATIONS[self.activation](norm(layer(x)))
+        return x
+
+    def train(self, x: Array) -> tuple[Array, NormalizedMLP]:
+        """Does the same by the batch's statistics; also returns the layers with updated statistics."""
+        x, norm = self.norms[0].train(x)
+        norms = [norm]
+        for layer, norm in zip(self.layers, self.norms[1:], strict=True):
+            x, norm = norm.train(layer(x))
+            norms.append(norm)
+            x = ACTIVATIONS[self.activation](x)
+        return x, eqx.tree_at(lambda torso: torso.norms, self, tuple(norms))
+
+
+class InvertedBlock(eqx.Module):
+    """``x + f(BN(W2 f(BN(W1 x))))``, wider inside than outside by :data:`EXPANSION`: an inverted residual block."""
+
+    expand: UnitLinear
+    inner: BatchRenorm
+    contract: UnitLinear
+    outer: BatchRenorm
+    activation: str = eqx.field(static=True)
+
+    def __init__(self, key: Array, width: int, activation: str) -> None:
+        expand_key, contract_key = jax.random.split(key)
+        self.expand = UnitLinear(expand_key, width, EXPANSION * width)
+        self.inner = BatchRenorm(EXPANSION * width, NEVER, FINE)
+        self.contract = UnitLinear(contract_key, EXPANSION * width, width)
+        self.outer = BatchRenorm(width, NEVER, FINE)
+        self.activation = activation
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, width)`` to ``(batch, width)`` by the running statistics."""
+        f = ACTIVATIONS[self.activation]
+        return x + f(self.outer(self.contract(f(self.inner(self.expand(x))))))
+
+    def train(self, x: Array) -> tuple[Array, InvertedBlock]:
+        """Does the same by the batch's statistics; also returns the block with updated statistics."""
+        f = ACTIVATIONS[self.activation]
+        hidden, inner = self.inner.train(self.expand(x))
+        y, outer = self.outer.train(self.contract(f(hidden)))
+        return x + f(y), eqx.tree_at(lambda block: (block.inner, block.outer), self, (inner, outer))
+
+
+class InvertedResidual(eqx.Module):
+    """A normalization of the input, a linear embedding, inverted residual blocks, an RMS norm (FlashSAC).
+
+    The stream between the blocks is not normalized by batches; the RMS norm at the end bounds what reaches the head.
+    """
+
+    norm: BatchRenorm
+    embedding: UnitLinear
+    blocks: tuple[InvertedBlock, ...]
+    last: RMSNorm
+
+    def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str) -> None:
+        """Builds ``len(widths)`` blocks of the one width that ``widths`` repeats."""
+        embedding_key, *block_keys = jax.random.split(key, 1 + len(widths))
+        self.norm = BatchRenorm(n_inputs, NEVER, FINE)
+        self.embedding = UnitLinear(embedding_key, n_inputs, widths[0])
+        self.blocks = tuple(InvertedBlock(k, width, activation) for k, width in zip(block_keys, widths, strict=True))
+        self.last = RMSNorm(widths[-1])
+
+    @property
+    def n_outputs(self) -> int:
+        """Width of the stream."""
+        return self.last.scale.shape[-1]
+
+    def __call__(self, x: Array) -> Array:
+        """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)`` by the running statistics."""
+        x = self.embedding(self.norm(x))
+        for block in self.blocks:
+            x = block(x)
+        return self.last(x)
+
+    def train(self, x: Array) -> tuple[Array, InvertedResidual]:
+        """Does the same by the batch's statistics; also returns the layers with updated statistics."""
+        x, norm = self.norm.train(x)
+        x, blocks = self.embedding(x), []
+        for block in self.blocks:
+            x, block = block.train(x)
+            blocks.append(block)
+        return self.last(x), eqx.tree_at(lambda torso: (torso.norm, torso.blocks), self, (norm, tuple(blocks)))
+
+
+def projected(network: Network, gains: bool = False) -> Network:
+    """Returns a network, or several stacked, with the weights of each unit of its :class:`UnitLinear` scaled to norm 1.
+
+    With ``gains`` the ``d`` gains of each normalization, with its offsets if it has any, are scaled to the norm ``sqrt(d)``.
+    """
+
+    def scaled(node: Any) -> Any:
+        if isinstance(node, UnitLinear):
+            return eqx.tree_at(lambda layer: layer.weight, node, unit(node.weight, axis=-2))
+        if gains and isinstance(node, RMSNorm):
+            return eqx.tree_at(lambda norm: norm.scale, node, unit(node.scale) * math.sqrt(node.scale.shape[-1]))
+        if gains and isinstance(node, BatchRenorm):
+            n = node.scale.shape[-1]
+            both = unit(jnp.concatenate([node.scale, node.offset], axis=-1)) * math.sqrt(n)
+            return eqx.tree_at(lambda norm: (norm.scale, norm.offset), node, (both[..., :n], both[..., n:]))
+        return node
+
+    return jax.tree.map(scaled, network, is_leaf=lambda node: isinstance(node, UnitLinear | RMSNorm | BatchRenorm))
+
+
+def unit(x: Array, axis: int = -1) -> Array:
+    """Returns ``x`` divided by its Euclidean norms along an axis."""
+    return x / jnp.sqrt(jnp.sum(jnp.square(x), axis=axis, keepdims=True) + 1e-12)
