@@ -44,7 +44,7 @@ from rejeu.algorithms.sac.continuous import (
     initial_alpha,
     metrics_of,
 )
-from rejeu.algorithms.search import Integers, SearchSpace
+from rejeu.algorithms.search import Choice, Integers, SearchSpace
 from rejeu.core import (
     Algorithm,
     Clock,
@@ -102,7 +102,11 @@ class Config(EntropyConfig):
     """Share of a target entropy of ``"auto"`` that each action dimension has, in nats."""
     reads_both: ClassVar[bool] = True
     """Whether the actor normalizes by the observations of both halves, and gains are projected; not so in XQC."""
-    search_space: ClassVar[SearchSpace] = {**search.OFF_POLICY, "policy_delay": Integers(1, 4)}
+    search_space: ClassVar[SearchSpace] = {
+        **search.OFF_POLICY,
+        "policy_kwargs.net_arch": Choice(([32, 32], [64, 64], [128, 128])),
+        "policy_delay": Integers(1, 4),
+    }
     hidden_layers: ClassVar[Widths] = Widths(ACTOR_LAYERS, CRITIC_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
 
