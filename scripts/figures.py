@@ -219,7 +219,7 @@ def supported() -> str:
     rows: dict[tuple[str, ...], list[str]] = {}
     for page in sorted((ROOT / "docs" / "algorithms").glob("*.md")):
         title = page.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
-        row = options_of(AGENTS[title.replace("-", "")])
+        row = options_of(AGENTS[title.replace("-", "").replace("+", "")])
         rows.setdefault(row, []).append(f"[{title}](algorithms/{page.name})")
     header = ("", "actions", "HER, prioritized, n-step", "masks", "memory", "modules")
     return table(header, [(", ".join(names), *row) for row, names in sorted(rows.items())])

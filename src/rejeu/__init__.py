@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         QRDQN as QRDQN,
         SAC as SAC,
         TD3 as TD3,
+        TD3BC as TD3BC,
         TQC as TQC,
         TRPO as TRPO,
         XQC as XQC,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
         MaskablePPO as MaskablePPO,
         OffPolicyAgent as OffPolicyAgent,
         OnPolicyAgent as OnPolicyAgent,
+        ReBRAC as ReBRAC,
         RecurrentPPO as RecurrentPPO,
         load as load,
         register as register,
@@ -82,8 +84,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL IQN PPO PQN QRDQN SAC TD3 TQC TRPO XQC CrossQ FlashSAC MaskablePPO "
-    "OffPolicyAgent OnPolicyAgent RecurrentPPO load register",
+    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL IQN PPO PQN QRDQN SAC TD3 TD3BC TQC TRPO XQC CrossQ FlashSAC MaskablePPO "
+    "OffPolicyAgent OnPolicyAgent ReBRAC RecurrentPPO load register",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",

@@ -46,6 +46,9 @@ class Transition(NamedTuple):
     rewards: Any = None
     """The discounted rewards that ``reward`` is the sum of, ``(batch, n)``, where normalization clips each; None
     elsewhere. Algorithms do not see them."""
+    next_action: Any = None
+    """The action that was taken at ``next_obs``, as ``action``, NaN where there was none; None unless the algorithm's
+    configuration has ``needs_next_action``."""
 
 
 class Masked(NamedTuple):

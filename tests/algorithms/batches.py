@@ -25,6 +25,13 @@ def box_batch(seed: int, size: int) -> Transition:
     return Transition(obs, action, reward, normal(rng, size, OBS_DIM), discounts(size))
 
 
+def with_next_action(batch: Transition, seed: int) -> Transition:
+    """Returns transitions with next actions, which every fourth does not have."""
+    rng = np.random.default_rng(seed + 1000)
+    action = np.tanh(normal(rng, *batch.action.shape))
+    return batch._replace(next_action=np.where(np.arange(len(action))[:, None] % 4 == 1, np.float32(np.nan), action))
+
+
 def discrete_batch(seed: int, size: int) -> Transition:
     """Returns transitions with every action equally often; the MDP terminated in every third."""
     rng = np.random.default_rng(seed)

@@ -172,6 +172,44 @@ class TD3(DDPG):
         return {"actor_loss": self.last_loss}
 
 
+class TD3BC(TD3):
+    """Values over their mean size, and the mean squared distance from recorded actions."""
+
+    def improve(self, batch: Transition) -> dict[str, float]:
+        values = action_value(self.critics[0], batch.obs, self.act(self.actor, batch.obs))
+        self.scale = self.config.alpha / np.abs(values).mean()
+        return super().improve(batch)
+
+    def actor_loss(self, batch: Transition) -> float:
+        return self.scale * super().actor_loss(batch) + np.square(self.act(self.actor, batch.obs) - batch.action).mean()
+
+
+class ReBRAC(TD3):
+    """Penalties on the actor and on the target; the actor follows the smallest of the critics."""
+
+    def target(self, batch: Transition) -> np.ndarray:
+        noise, limit = noise_of(self.keys, len(batch.reward)), self.config.target_noise_clip
+        kick = np.clip(self.config.target_policy_noise * noise, -limit, limit)
+        action = np.clip(self.act(self.target_actor, batch.next_obs) + kick, -1.0, 1.0)
+        penalty = [
+            0.0 if np.isnan(recorded).any() else np.sum((one - recorded) ** 2)
+            for one, recorded in zip(action, np.float64(batch.next_action), strict=True)
+        ]
+        return super().target(batch) - batch.discount * self.config.critic_bc * np.array(penalty)
+
+    def improve(self, batch: Transition) -> dict[str, float]:
+        self.scale = 1.0 / np.abs(self.values(batch)).mean()
+        return super().improve(batch)
+
+    def values(self, batch: Transition) -> np.ndarray:
+        action = self.act(self.actor, batch.obs)
+        return self.smallest([action_value(critic, batch.obs, action) for critic in self.critics])
+
+    def actor_loss(self, batch: Transition) -> float:
+        distance = np.square(self.act(self.actor, batch.obs) - batch.action).sum(axis=1)
+        return np.mean(self.config.actor_bc * distance - self.scale * self.values(batch))
+
+
 class DiscreteDDPG(DDPG):
     """Classifier as actor, and a critic with one value for each action."""
 

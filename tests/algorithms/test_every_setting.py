@@ -36,7 +36,17 @@ from rejeu.core import GRADIENT_STEPS, TD_ERROR, Clock, Rollout, names
 from rejeu.io.checkpoint import tree_to_arrays
 from rejeu.normalization import NormalizationConfig
 from rejeu.schedules import at
-from tests.algorithms.batches import ACTION_DIM, BOX, DISCRETE, N_ACTIONS, OBS_DIM, OBS_SPACE, box_batch, discrete_batch
+from tests.algorithms.batches import (
+    ACTION_DIM,
+    BOX,
+    DISCRETE,
+    N_ACTIONS,
+    OBS_DIM,
+    OBS_SPACE,
+    box_batch,
+    discrete_batch,
+    with_next_action,
+)
 from tests.tiers import only
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +54,10 @@ SIZE, N_STEPS, N_ENVS = 8, 8, 2
 PROGRESS = 0.25
 LAST = 1 - PROGRESS
 KINDS = {
-    **dict.fromkeys(("SAC", "DDPG", "TD3", "TQC", "CrossQ", "IQL", "PPO", "A2C", "TRPO", "RecurrentPPO", "ARS"), BOX),
+    **dict.fromkeys(
+        ("SAC", "DDPG", "TD3", "TQC", "CrossQ", "IQL", "TD3BC", "ReBRAC", "PPO", "A2C", "TRPO", "RecurrentPPO", "ARS"),
+        BOX,
+    ),
     **dict.fromkeys(("FlashSAC", "XQC"), BOX),
     **dict.fromkeys(("SAC, Discrete", "DDPG, Discrete", "DQN", "QRDQN", "IQN", "PQN", "MaskablePPO"), DISCRETE),
 }
@@ -170,7 +183,8 @@ class Case(NamedTuple):
     def batch(self, made: Any, state: Any) -> Any:
         """Returns a batch of transitions or a rollout."""
         if self.off_policy:
-            return (box_batch if self.space is BOX else discrete_batch)(0, SIZE)
+            batch = (box_batch if self.space is BOX else discrete_batch)(0, SIZE)
+            return with_next_action(batch, 0) if self.kind == "ReBRAC" else batch
         rng = np.random.default_rng(0)
         shape = (N_STEPS, N_ENVS)
         how = rng.integers(4, size=shape)
@@ -336,6 +350,42 @@ def targets_move_the_share_tau_of_the_way_once_an_interval(case: Case) -> None:
 
 def is_q(case: Case) -> bool:
     return case.kind in ("DQN", "QRDQN", "IQN")
+
+
+@shows("alpha", "actor_bc")
+def the_actor_is_pulled_to_recorded_actions(case: Case) -> None:
+    """Its step is one part by the values, and one that is proportional to the weight of the distance from actions."""
+    if case.kind == "TD3BC":
+        none, one, two = (case.update(alpha=alpha).moved for alpha in (0.0, 1.0, 2.0))
+    else:
+        none, one, two = (case.update(actor_bc=weight).moved for weight in (0.0, 1.0, 2.0))
+    both = {name: none[name] + 2 * (one[name] - none[name]) for name in none if name.startswith("actor.")}
+    close({name: two[name] for name in both}, both)
+    assert differ(none, one)
+
+
+@shows("critic_bc")
+def next_actions_far_from_recorded_ones_are_worth_less(case: Case) -> None:
+    made, (none, one, two) = case.make(), (case.update(critic_bc=weight) for weight in (0.0, 1.0, 2.0))
+    state = case.state(made)
+    batch = case.batch(made, state)
+    taken = np.asarray(made.exploit(state.target_actor, batch.next_obs))
+    distance = np.where(np.isnan(batch.next_action), 0.0, taken - batch.next_action)
+    penalty = batch.discount * np.square(distance).sum(axis=1)
+    changed = case.update(lambda batch: batch._replace(reward=batch.reward - penalty), critic_bc=0.0)
+    close(one.first, changed.first)
+    assert differ(one.first, none.first)
+    assert differ(one.first, two.first)
+
+
+@shows("critic_layer_norm")
+def critics_alone_have_layer_norm(case: Case) -> None:
+    shapes = lambda on: jax.eval_shape(case.make(critic_layer_norm=on).init, jax.random.PRNGKey(0))  # noqa: E731
+    state = case.make(critic_layer_norm=False, policy_kwargs={"net_arch": [5], "layer_norm": True})
+    state = jax.eval_shape(state.init, jax.random.PRNGKey(0))
+    assert names(shapes(True).critics) == names(state.critics)
+    assert names(shapes(True).actor) == names(shapes(False).actor)
+    assert names(shapes(True).critics) != names(shapes(False).critics)
 
 
 @shows("policy_delay")
@@ -724,14 +774,23 @@ RELATIONS = [
 ]
 
 
-DERIVED = ("RecurrentPPO", "MaskablePPO", "QRDQN", "IQN")
-"""They have the functions of PPO and of DQN; by default few of their relations are checked, and none
-of :data:`PROJECTED`, which take long."""
+DERIVED = ("RecurrentPPO", "MaskablePPO", "QRDQN", "IQN", "TD3BC", "ReBRAC")
+"""They have the functions of PPO, DQN or TD3; by default few of their relations are checked, and
+none of :data:`PROJECTED`, which take long."""
+OWN = (
+    the_actor_is_pulled_to_recorded_actions,
+    next_actions_far_from_recorded_ones_are_worth_less,
+    critics_alone_have_layer_norm,
+)
+"""Relations that are checked for these too."""
 
 
 @pytest.mark.parametrize(
     "pair",
-    only([pair for pair in RELATIONS if pair[1].name not in (*DERIVED, *PROJECTED)], RELATIONS),
+    only(
+        [p for p in RELATIONS if p[0] in OWN or p[1].name not in (*DERIVED, *PROJECTED)],
+        RELATIONS,
+    ),
     ids=[f"{relation.__name__}-{case.name}" for relation, case in RELATIONS],
 )
 def test_a_setting_does_what_its_definition_says(pair: tuple[Relation, Case]) -> None:
@@ -815,6 +874,7 @@ ELSEWHERE = {
     "n_steps": "tests/buffers/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept",
     "priorities": f"{PRIORITIZED}::test_steps_are_drawn_in_proportion_to_their_priorities",
     "demonstrations": "tests/test_demonstrations.py::test_a_run_with_demonstrations_resumes_equal",
+    "offline": "tests/test_offline.py::test_an_offline_run_steps_no_environment_and_resumes_equal",
     "demonstration_share": "tests/test_demonstrations.py::test_every_batch_has_its_share",
     **dict.fromkeys(
         ("distribution", "v_min", "v_max", "n_atoms"),

@@ -1,4 +1,4 @@
-"""Whole updates of DDPG, TD3, SAC and TQC against float64 NumPy: losses, gradients, targets, temperature, metrics."""
+"""Whole updates of DDPG, TD3, TD3+BC, ReBRAC, SAC and TQC against float64 NumPy: losses, gradients, targets, metrics."""
 
 from __future__ import annotations
 
@@ -12,12 +12,21 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.algorithms import ddpg, sac, td3, tqc
+from rejeu.algorithms import ddpg, rebrac, sac, td3, td3_bc, tqc
 from rejeu.algorithms.ddpg import discrete as ddpg_discrete
 from rejeu.algorithms.sac import discrete as sac_discrete
 from rejeu.core import TD_ERROR
 from tests.algorithms import references
-from tests.algorithms.batches import BOX, CLOCK, DISCRETE, OBS_DIM, OBS_SPACE, box_batch, discrete_batch
+from tests.algorithms.batches import (
+    BOX,
+    CLOCK,
+    DISCRETE,
+    OBS_DIM,
+    OBS_SPACE,
+    box_batch,
+    discrete_batch,
+    with_next_action,
+)
 from tests.environments import Sampled
 from tests.numpy_networks import assert_equal_layers, forward, layers
 from tests.tiers import only
@@ -51,11 +60,16 @@ class Case(NamedTuple):
 
     def batch(self, seed: int) -> Any:
         batch = (discrete_batch if self.discrete else box_batch)(seed, BATCH)
+        if self.module is rebrac:
+            batch = with_next_action(batch, seed)
         return batch._replace(weight=np.linspace(0.1, 1.0, BATCH, dtype=np.float32)) if self.weighted else batch
 
 
+NOISY = {"target_policy_noise": 0.6, "target_noise_clip": 0.5, "n_critics": 3}
+
+
 def td3_case(**settings: Any) -> Case:
-    settings = {"target_policy_noise": 0.6, "target_noise_clip": 0.5, "n_critics": 3, **settings}
+    settings = {**NOISY, **settings}
     return Case(td3, references.TD3, settings, weighted=settings.get("policy_delay") == 3)
 
 
@@ -72,6 +86,8 @@ CASES = {
     "TD3": td3_case(),
     "TD3, every update": td3_case(policy_delay=1, target_policy_noise=0.0),
     "TD3, weights and a longer delay": td3_case(policy_delay=3),
+    "TD3BC": Case(td3_bc, references.TD3BC, {**NOISY, "normalize": None}),
+    "ReBRAC": Case(rebrac, references.ReBRAC, {**NOISY, "actor_bc": 0.3, "critic_bc": 0.4, "critic_layer_norm": False}),
     "SAC": Case(sac, references.SAC, {**TEMPERATURE, "n_critics": 3}),
     "SAC, fixed": Case(sac, references.SAC, {**FIXED, "n_critics": 3}, weighted=True),
     "SAC, target entropy": Case(sac, references.SAC, {**TEMPERATURE, "target_entropy": -0.5, "n_critics": 3}),

@@ -16,7 +16,22 @@ import gymnasium as gym
 from rejeu import presets as all_presets
 from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
-from rejeu.agents.off_policy import DDPG, DQN, IQL, IQN, QRDQN, SAC, TD3, TQC, XQC, CrossQ, FlashSAC, OffPolicyAgent
+from rejeu.agents.off_policy import (
+    DDPG,
+    DQN,
+    IQL,
+    IQN,
+    QRDQN,
+    SAC,
+    TD3,
+    TD3BC,
+    TQC,
+    XQC,
+    CrossQ,
+    FlashSAC,
+    OffPolicyAgent,
+    ReBRAC,
+)
 from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import Callback
@@ -39,6 +54,7 @@ __all__ = [
     "QRDQN",
     "SAC",
     "TD3",
+    "TD3BC",
     "TQC",
     "TRPO",
     "XQC",
@@ -49,6 +65,7 @@ __all__ = [
     "MaskablePPO",
     "OffPolicyAgent",
     "OnPolicyAgent",
+    "ReBRAC",
     "RecurrentPPO",
     "agent_of_file",
     "find_agent",
@@ -80,6 +97,8 @@ KINDS = (
     TRPO,
     ARS,
     IQL,
+    TD3BC,
+    ReBRAC,
 )
 BUILT_IN: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
 

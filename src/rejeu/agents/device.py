@@ -150,6 +150,8 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
         return "networks with memory learn from replay on the host only"
     if config.demonstrations is not None:
         return "demonstrations are on the host"
+    if config.needs_next_action:
+        return f"{config.name} learns from next actions, which batches of the host have"
     strategy = None if config.hindsight is None else config.hindsight.goal_selection_strategy
     if type(buffer) not in (ReplayBuffer, HerReplayBuffer):
         return f"the replay buffer {type(buffer).__name__} is your own"

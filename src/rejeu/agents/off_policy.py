@@ -1,4 +1,4 @@
-"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC, CrossQ, FlashSAC, XQC and IQL."""
+"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC, CrossQ, FlashSAC, XQC, IQL, TD3+BC and ReBRAC."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from rejeu import spaces
 from rejeu.agents import model_files, policy
 from rejeu.agents.agent import Agent
-from rejeu.algorithms import crossq, ddpg, dqn, flashsac, iql, iqn, qrdqn, sac, td3, tqc, xqc
+from rejeu.algorithms import crossq, ddpg, dqn, flashsac, iql, iqn, qrdqn, rebrac, sac, td3, td3_bc, tqc, xqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import ring_io
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
@@ -28,7 +28,7 @@ from rejeu.exploration.noise import Noise, for_actions
 from rejeu.io import checkpoint
 from rejeu.io.records import brief
 from rejeu.loops.device import train_one
-from rejeu.loops.off_policy import begin_episodes, off_policy
+from rejeu.loops.off_policy import begin_episodes, off_policy, offline
 from rejeu.loops.run import Progress
 
 if TYPE_CHECKING:
@@ -109,6 +109,12 @@ class OffPolicyAgent(Agent):
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
             return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
+        if self.config.offline:
+            if not self.run.n_updates and self.learner.observe is not None:
+                from rejeu import demonstrations
+
+                demonstrations.observe(self, demonstrations.read(str(self.config.demonstrations)))
+            return offline(self.run, self.learner, self.config, n_steps, progress)
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:
@@ -122,7 +128,8 @@ class OffPolicyAgent(Agent):
         from rejeu import demonstrations
 
         recorded = demonstrations.read(config.demonstrations)
-        return demonstrations.WithDemonstrations(own, self.replay_of(recorded, env), config.demonstration_share)
+        share = 1.0 if config.offline else config.demonstration_share
+        return demonstrations.WithDemonstrations(own, self.replay_of(recorded, env), share)
 
     def replay_of(self, recorded: Demonstrations, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
         """Returns a replay buffer that holds demonstrations, from which batches are drawn as from the agent's own.
@@ -161,14 +168,17 @@ class OffPolicyAgent(Agent):
         kind: Any = config.replay_buffer_class
         kind = BUFFERS[kind] if isinstance(kind, str) else kind
         if config.hindsight is not None:
-            made = kind(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, tree, each_reward)
-            made.last_infos = lambda: env.info
-            return made
-        settings: Any = config.replay_buffer_kwargs or ()
-        if config.has_memory:
-            shape = config.policy_kwargs
-            settings = {"sequence": (shape.sequence_length, shape.burn_in)}
-        return kind(ring, config.gamma, config.n_steps, tree, each_reward, **dict(settings))
+            buffer = kind(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, tree, each_reward)
+            buffer.last_infos = lambda: env.info
+        else:
+            settings: Any = config.replay_buffer_kwargs or ()
+            if config.has_memory:
+                shape = config.policy_kwargs
+                settings = {"sequence": (shape.sequence_length, shape.burn_in)}
+            buffer = kind(ring, config.gamma, config.n_steps, tree, each_reward, **dict(settings))
+        if config.needs_next_action:
+            buffer.with_next_action = True
+        return buffer
 
     def drop_rollout(self) -> None:
         """Does nothing: off-policy algorithms learn from the transitions of any policy."""
@@ -254,3 +264,15 @@ class IQL(OffPolicyAgent):
     """Implicit Q-learning from recorded episodes (Kostrikov et al. 2022), for continuous actions."""
 
     algorithm: ClassVar[ModuleType] = iql
+
+
+class TD3BC(OffPolicyAgent):
+    """TD3 with behavior cloning, from recorded episodes (Fujimoto & Gu 2021), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = td3_bc
+
+
+class ReBRAC(OffPolicyAgent):
+    """TD3 with penalties on actor and critic, from recorded episodes (Tarasov et al. 2023), for continuous actions."""
+
+    algorithm: ClassVar[ModuleType] = rebrac

@@ -140,6 +140,10 @@ def given_config(agent: BaseAgent) -> Any:
     return dataclasses.replace(config, policy_kwargs=default.policy_kwargs) if is_default else config
 
 
+STEPS_OF_A_ROW = 250
+"""Gradient steps that count as an episode for rows of statistics, where no environment is stepped."""
+
+
 def start_call(
     agent: BaseAgent,
     total_timesteps: int | None,
@@ -171,7 +175,7 @@ def start_call(
             first_step=run.step,
             first_episode=run.episode,
             log_interval=log_interval,
-            logged=len(agent.history),
+            logged=run.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.history),
             steps_before=run.step - agent.reset_step,
             episodes_before=run.episode - agent.reset_episode,
             seconds_before=run.seconds["total"] - agent.reset_seconds,
@@ -288,13 +292,19 @@ def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: S
     agent.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
     for episode in turn.episodes:
         record_episode(agent, episode)
-    if len(agent.history) - call.logged >= call.log_interval and outputs:
-        call.logged = len(agent.history)
+    counted = turn.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.history)
+    if counted - call.logged >= call.log_interval and outputs:
+        call.logged = counted
         row = statistics_row(agent) | agent.logger.take()
         for output in outputs:
             output.write(agent.num_timesteps, row)
     if ended := device.episodes_to_judge(agent, call, turn):
         note_training_return(agent, ended)
+
+
+def is_offline(agent: BaseAgent) -> bool:
+    """Returns whether an agent learns without an environment, so that no episodes end."""
+    return isinstance(agent.config, configs.OffPolicyConfig) and agent.config.offline
 
 
 def note_training_return(agent: BaseAgent, ended: int) -> None:

@@ -182,6 +182,8 @@ class OffPolicyConfig(AlgorithmConfig):
     actions must be those of the environment. None for none."""
     demonstration_share: float = 0.5
     """Share of each batch that is drawn from ``demonstrations``, in [0, 1]. A larger share stays closer to them."""
+    offline: bool = False
+    """Learn from ``demonstrations`` alone, without stepping an environment: each step of training is a gradient step."""
     frame_stack: int | None = None
     """Number of frames that observations stack along the first axis. The replay buffer then stores each frame once and
     builds the stacks when it samples. None stores observations as they are."""
@@ -196,6 +198,8 @@ class OffPolicyConfig(AlgorithmConfig):
 
     can_remember: ClassVar[bool] = False
     """Whether the networks may have a memory."""
+    needs_next_action: ClassVar[bool] = False
+    """Whether batches have :attr:`rejeu.Transition.next_action`."""
     policy_kwargs_class: ClassVar[type[PolicyConfig]] = MemoryConfig
     search_space: ClassVar[SearchSpace] = search.OFF_POLICY
 
@@ -210,11 +214,14 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "overlap", flag)
         coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
         coerce(self, "demonstration_share", number, least=0, most=1)
+        coerce(self, "offline", flag)
         assign(self, demonstrations=None if self.demonstrations is None else str(self.demonstrations))
         if self.demonstrations is not None and self.priorities is not None:
             raise ValueError(
                 "demonstrations and priorities cannot be combined: the share is drawn uniformly; leave one out"
             )
+        if self.offline and self.demonstrations is None:
+            raise ValueError("offline=True learns from demonstrations alone; give demonstrations=FOLDER too")
         assign(self, action_noise=action_noises.parse(self.action_noise))
         coerce(self, "replay_buffer_class", buffer_name)
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)

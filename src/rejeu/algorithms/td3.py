@@ -15,6 +15,7 @@ Everything else is as in :mod:`rejeu.algorithms.ddpg`, Stable-Baselines3's order
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -105,9 +106,33 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         ValueError: if the action space is not a finite Box.
         TypeError: if the observation space holds something that is not an array.
     """
+    return make_with(config, observation_space, action_space, policy_loss, td_target)
+
+
+def make_with(
+    config: Config,
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    policy_loss: Callable[[Network, QNetwork, Transition], Array],
+    td_target: Callable[[QNetwork, Transition, Array], Array],
+    critic_layer_norm: bool = False,
+) -> Algorithm:
+    """Returns TD3 with a loss of the actor and a TD target of its own; the critics of plain layers may have layer norm.
+
+    Args:
+        config: hyperparameters.
+        observation_space: as for :func:`make`.
+        action_space: as for :func:`make`.
+        policy_loss: as :func:`policy_loss`.
+        td_target: as :func:`td_target`.
+        critic_layer_norm: whether the hidden layers of critics are normalized, whatever those of the actor are.
+    """
     action_dim = action_dimension(check_box_action(action_space, config.name))
     obs_leaves, shape = network_inputs(config, observation_space)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+    critic_shape = shape
+    if critic_layer_norm and shape.architecture == "mlp" and shape.torso is None and not shape.has_branches:
+        critic_shape = dataclasses.replace(shape, layer_norm=True)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
@@ -121,7 +146,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         critics = with_memory(
             critics_key,
             obs_leaves,
-            shape,
+            critic_shape,
             lambda leaves, shape: ensemble(
                 lambda k: QNetwork(k, leaves, action_dim, widths, shape), critics_key, config.n_critics
             ),
@@ -150,13 +175,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         n_updates = state.n_updates + 1
 
         def delayed(state: State) -> State:
-            policy_loss, gradients = value_and_grad(actor_loss)(state.actor, first(critics), batch.obs)
+            loss_of_actor, gradients = value_and_grad(policy_loss)(state.actor, critics, batch)
             actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
             return dataclasses.replace(
                 state,
                 actor=actor,
                 actor_optimizer=actor_optimizer,
-                actor_loss=policy_loss,
+                actor_loss=loss_of_actor,
                 target_actor=polyak(state.target_actor, actor, config.tau),
                 target_critics=polyak(state.target_critics, critics, config.tau),
             )
@@ -168,6 +193,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     algorithm = Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values_by_critics)
     return remembering(algorithm, shape, lambda state: (state.actor, state.critics))
+
+
+def policy_loss(actor: Network, critics: QNetwork, batch: Transition) -> Array:
+    """Returns the loss of the actor by the first of the critics."""
+    return actor_loss(actor, first(critics), batch.obs)
 
 
 def smoothed_action(target_actor: Network, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:

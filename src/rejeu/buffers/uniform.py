@@ -26,6 +26,8 @@ class BaseReplayBuffer(ABC):
 
     achieved = desired = 0
     """Indices of the leaves of the two goals, where there are some."""
+    with_next_action = False
+    """Whether transitions have :attr:`Transition.next_action`."""
 
     def __init__(
         self,
@@ -117,14 +119,26 @@ class BaseReplayBuffer(ABC):
             result = Outcome(step["reward"], 1, rows.kind)
         else:
             result = outcome(np, ring, ring.index, rows, self.n_steps, goals)
-        _, next_obs = ring.read(ring.index(rows.env, rows.time + result.steps))
+        after = rows.time + result.steps
+        following, next_obs = ring.read(ring.index(rows.env, after))
         if goals is not None:
             for leaves in (obs, next_obs):
                 leaves[self.desired][goals.which] = goals.goal
-        return self.transition(shape, ring.tree(obs), step["action"], result, ring.tree(next_obs), weight)
+        next_action = None
+        if self.with_next_action:
+            was_taken = (ring.kind[ring.index(rows.env, after)] != LAST) & (after < ring.head[rows.env])
+            next_action = np.where(was_taken[:, None], following["action"], np.float32(np.nan))
+        return self.transition(shape, ring.tree(obs), step["action"], result, ring.tree(next_obs), weight, next_action)
 
     def transition(
-        self, shape: tuple[int, ...], obs: Any, action: Any, result: Outcome, next_obs: Any, weight: Any = None
+        self,
+        shape: tuple[int, ...],
+        obs: Any,
+        action: Any,
+        result: Outcome,
+        next_obs: Any,
+        weight: Any = None,
+        next_action: Any = None,
     ) -> Transition:
         """Returns transitions in ``shape``, from observations and actions ``(n, ...)`` and what they lead to."""
         rewards, steps, terminated = result
@@ -134,7 +148,7 @@ class BaseReplayBuffer(ABC):
             powers = self.gamma ** np.arange(self.n_steps)
             reward = (rewards @ powers).astype(np.float32)
             each = (rewards * powers).astype(np.float32) if self.each_reward else None
-        flat = Transition(obs, action, reward, next_obs, discount, weight, each)
+        flat = Transition(obs, action, reward, next_obs, discount, weight, each, next_action)
         split = lambda array: array.reshape(*shape[:-1], -1, *array.shape[1:])  # noqa: E731
         shaped = flat if len(shape) == 1 else jax.tree.map(split, flat)
         if weight is not None:

@@ -57,6 +57,9 @@ class Train(RunConfig):
     Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu train Pendulum-v1 --steps 20000 --set learning_rate=1e-3
     """
 
+    offline: Annotated[Path | None, Shown("DATASET")] = None
+    """Learn from the Minari dataset in this folder, without stepping the environment, which only evaluates: each step is a
+    gradient step. By default with IQL."""
     pause: Count = None
     """Pause after so many environment steps; rejeu resume continues to the goal."""
     seeds: Several = None
@@ -66,6 +69,44 @@ class Train(RunConfig):
     """With --seeds: how many are trained at once; by default half as many as there are cores."""
     out: Folder = None
     """Run folder, new or empty; by default one under runs, named after the run and the time."""
+    no_report: NoReport = False
+    no_video: NoVideo = False
+    json: Json = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clone(RunOptions):
+    """Trains an agent to act as in recorded episodes (behavior cloning), and leaves a run folder as rejeu train does.
+
+    With --expert a trained agent also says what to do where the clone comes itself (DAgger). rejeu resume RUN --steps N trains
+    the clone in the environment. Example: rejeu clone played --algo PPO
+    """
+
+    dataset: Annotated[Path, Shown("DATASET", is_positional=True)]
+    """Folder of a Minari dataset, such as rejeu play --record writes."""
+    env: Annotated[str | None, Shown("ENV")] = None
+    """Environment, as for rejeu train; by default the dataset's. One that is imported must be named."""
+    algo: Algorithm = None
+    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    """Hyperparameters of the agent, as for rejeu train."""
+    updates: Annotated[Positive, Shown("N")] = 2000
+    """Gradient steps; with --expert, in each round."""
+    learning_rate: Annotated[Annotated[float, Meta(gt=0)], Shown("RATE")] = 1e-3
+    """Step size of these gradient steps."""
+    expert: Annotated[Path | None, Shown("RUN")] = None
+    """Folder of a run, or a .safetensors file, of the agent that labels what the clone does."""
+    rounds: Annotated[Positive, Shown("N")] = 5
+    """With --expert: how often the clone acts and is trained again."""
+    round_steps: Annotated[Positive, Shown("N")] = 1000
+    """With --expert: environment steps of each round; the last episode is completed."""
+    which: Which = "best"
+    evaluate_episodes: EpisodeCount = None
+    device: Annotated[str, Shown("NAME")] = "auto"
+    """As for rejeu train."""
+    seed: SeedOrNone = None
+    """Seeds everything; by default a random one."""
+    out: Folder = None
+    """Run folder, as for rejeu train."""
     no_report: NoReport = False
     no_video: NoVideo = False
     json: Json = False
@@ -467,7 +508,7 @@ class Pull:
     json: Json = False
 
 
-OF_RUNS = (Train, Tune, Pbt, Resume, Sweep, Evaluate, Record, Export, Play, Watch)
+OF_RUNS = (Train, Clone, Tune, Pbt, Resume, Sweep, Evaluate, Record, Export, Play, Watch)
 OTHERS = (Check, List, Compare, Runs, Status, Course, Report, Class, Import, Push, Pull)
 COMMANDS: dict[str, Callable[..., Any]] = {kind.__name__.lower(): kind for kind in (*OF_RUNS, *OTHERS)}
 """The arguments of each command, by its name."""

@@ -6,6 +6,7 @@ The command line decides, then the preset of the environment, then the defaults.
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu import devices, presets, validation
-from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset
+from rejeu.agents import AGENTS, OffPolicyAgent, choose_algorithm, find_agent, find_preset
 from rejeu.algorithms import config as configs
 from rejeu.cli import check, environment, sweep
 from rejeu.cli.commands import Train
@@ -34,6 +35,7 @@ MANY = 64
 
 def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains; the exit status is 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
+    arguments = with_dataset(arguments)
     if arguments.seeds is not None:
         return sweep.train_together(arguments, begin) if sweep.fit_together(arguments) else sweep.train_all(arguments)
     stopwatch = Stopwatch()
@@ -47,6 +49,21 @@ def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
         runs.write(folder.config, session.config)
         echo(header(session.config, session.environment, session.backend, folder))
         return session.run(stop, stopwatch)
+
+
+def with_dataset(arguments: Train) -> Train:
+    """Returns the arguments with ``--offline`` as the hyperparameters that it stands for.
+
+    Raises:
+        ValueError: if the algorithm does not learn from a replay buffer.
+    """
+    if arguments.offline is None:
+        return arguments
+    name = arguments.algorithm or ("IQL" if arguments.preset is None else None)
+    if name is not None and not issubclass(find_agent(name), OffPolicyAgent):
+        raise ValueError(f"--offline needs an algorithm with a replay buffer, such as IQL; {name} has none")
+    given = {"demonstrations": str(arguments.offline), "offline": True}
+    return replace(arguments, algorithm=name, hyperparameters={**arguments.hyperparameters, **given}, offline=None)
 
 
 def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:

@@ -25,18 +25,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from gymnasium.envs.registration import EnvSpec
 
 from rejeu import interrupt, spaces
 from rejeu.core import Algorithm, PyTree, averaged_fields
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
-from rejeu.loops.off_policy import update
-from rejeu.loops.run import clock_of
+from rejeu.loops.off_policy import STEPS_OFFLINE, learn_from
 from rejeu.reporting.formatting import counted
 from rejeu.validation import number, whole
-
-MOST_IN_ONE_CALL = 100
-"""Gradient steps in one call of a compiled function."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +60,8 @@ class Demonstrations:
     episodes: tuple[Episode, ...]
     observation_space: gym.Space
     action_space: gym.Space
+    spec: EnvSpec | None = None
+    """Of the environment, if a dataset says it; nothing that it names is imported."""
 
     @property
     def n_steps(self) -> int:
@@ -74,9 +73,12 @@ class Demonstrations:
         """Mean sum of rewards of an episode."""
         return float(np.mean([episode.rewards.sum() for episode in self.episodes]))
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         n = counted(len(self.episodes), "episode")
-        return f"<Demonstrations: {n}, {counted(self.n_steps, 'step')}, mean return {self.mean_return:,.2f}>"
+        return f"{n}, {counted(self.n_steps, 'step')}, mean return {self.mean_return:,.2f}"
+
+    def __repr__(self) -> str:
+        return f"<Demonstrations: {self}>"
 
     def __add__(self, other: Demonstrations) -> Demonstrations:
         return dataclasses.replace(self, episodes=self.episodes + other.episodes)
@@ -115,7 +117,7 @@ def read(path: str | Path) -> Demonstrations:
         raise ValueError(f"{path} holds no step; play at least one episode")
     if not all(np.isfinite(a).all() for e in episodes for a in jax.tree.leaves((e.actions, e.rewards))):
         raise ValueError(f"{path} holds actions or rewards that are NaN or infinite; record it again")
-    return Demonstrations(episodes, data.observation_space, data.action_space)
+    return Demonstrations(episodes, data.observation_space, data.action_space, data.env_spec)
 
 
 def record(
@@ -259,7 +261,9 @@ def dagger(
     rounds: int = 10,
     steps: int = 500,
     updates: int = 1000,
+    learning_rate: float = 1e-3,
     seed: int = 0,
+    after_round: Callable[[int, Demonstrations], object] | None = None,
 ) -> Demonstrations:
     """Trains an agent to act as an expert in the states that it reaches itself (DAgger); returns all labeled episodes.
 
@@ -275,16 +279,19 @@ def dagger(
         rounds: how often.
         steps: least number of steps in each round; the last episode is completed.
         updates: gradient steps in each round.
+        learning_rate: step size of Adam.
         seed: of the environment and the batches.
+        after_round: called with the number of each round, 0 for the cloning before the first, and all labeled episodes.
 
     Raises:
         ValueError: if the spaces differ, or the agent has a memory.
     """
-    made = make_env(env) if isinstance(env, str) else env
+    made, say = make_env(env) if isinstance(env, str) else env, after_round or (lambda i, known: None)
     known = demonstrations
     try:
         if known is not None:
-            clone(agent, known, updates, seed=seed)
+            clone(agent, known, updates, learning_rate=learning_rate, seed=seed)
+            say(0, known)
         for i in range(whole("rounds", rounds, least=1)):
             played: list[Episode] = []
             while sum(map(len, played)) < steps:
@@ -292,7 +299,8 @@ def dagger(
                 played.append(play(made, agent, lambda obs, own: expert(obs), start))
             new = Demonstrations(tuple(played), made.observation_space, made.action_space)
             known = new if known is None else known + new
-            clone(agent, known, updates, seed=seed + i + 1)
+            clone(agent, known, updates, learning_rate=learning_rate, seed=seed + i + 1)
+            say(i + 1, known)
     finally:
         if made is not env:
             made.close()
@@ -317,14 +325,10 @@ def learn_offline(agent: Any, demonstrations: Demonstrations, updates: int) -> d
     check(agent, demonstrations)
     run, updates = agent.run, whole("updates", updates, least=1)
     replay, done = agent.replay_of(demonstrations, run.env), 0
-    if agent.learner.observe is not None:
-        pairs = [arrays_of(agent, episode)[0] for episode in demonstrations.episodes]
-        obs = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
-        run.state = agent.learner.pack(seen(agent, obs, demonstrations.episodes))
+    observe(agent, demonstrations)
     for n in chunks(updates):
-        batches = [replay.draw(run.rng, (n, agent.config.batch_size), done / updates)]
-        update(run, agent.learner, [(batch, drawn) for batch, drawn in batches], clock_of(run, done / updates))
-        run.td_errors, done = [], done + n
+        learn_from(run, agent.learner, agent.config, replay, n, done / updates)
+        done += n
         if interrupt.requested() is not None:
             break
     run.monitor.read()
@@ -337,8 +341,8 @@ def chunks(updates: int) -> Iterable[int]:
     >>> list(chunks(250))
     [100, 100, 50]
     """
-    for first in range(0, updates, MOST_IN_ONE_CALL):
-        yield min(MOST_IN_ONE_CALL, updates - first)
+    for first in range(0, updates, STEPS_OFFLINE):
+        yield min(STEPS_OFFLINE, updates - first)
 
 
 def check(agent: Any, demonstrations: Demonstrations) -> None:
@@ -366,6 +370,14 @@ def batch_of(agent: Any, observations: Any, rows: slice) -> PyTree:
     return spaces.as_batch(
         jax.tree.map(lambda leaf: np.asarray(leaf)[rows], observations), agent.observation_space, agent.obs_leaves
     )[0]
+
+
+def observe(agent: Any, demonstrations: Demonstrations) -> None:
+    """Adds demonstrations to the running statistics of an agent, if it has some."""
+    if agent.learner.observe is not None:
+        pairs = [arrays_of(agent, episode)[0] for episode in demonstrations.episodes]
+        obs = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
+        agent.run.state = agent.learner.pack(seen(agent, obs, demonstrations.episodes))
 
 
 def seen(agent: Any, obs: PyTree, episodes: Sequence[Episode]) -> PyTree:

@@ -37,6 +37,8 @@ from rejeu.loops.learner import Learner
 from rejeu.loops.run import Episode, Progress, Run, clock_of, record_step, restart, start_clock, timed
 from rejeu.spaces import action_scaler, random_action
 
+STEPS_OFFLINE = 100
+"""Gradient steps in one call, where no environment is stepped."""
 Choice = tuple[np.ndarray | Array, int]
 """Actions, which the device may still be computing, and the number of updates that were started before them."""
 
@@ -85,6 +87,33 @@ def off_policy(
         read(run, chosen, step.which)
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, n_kept, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
+
+
+def offline(
+    run: Run, learner: Learner, config: OffPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
+) -> Iterator[Progress]:
+    """Takes ``n_steps`` gradient steps on what the replay buffer holds, each of which counts as a step of training.
+
+    No environment is stepped. The arguments are those of :func:`off_policy`. Yields after every :data:`STEPS_OFFLINE` steps,
+    counted from the start of the run, so that a resumed run makes the same calls.
+    """
+    first, last = run.step, None if n_steps is None else run.step + n_steps
+    check_state(run, learner)
+    start_clock(run)
+    while last is None or run.step < last:
+        due = STEPS_OFFLINE - run.step % STEPS_OFFLINE
+        n = due if last is None else min(due, last - run.step)
+        learn_from(run, learner, config, run.replay, n, progress(run.step - first))
+        run.step += n
+        run.monitor.read()
+        yield Progress(run.step, [], run.metrics)
+
+
+def learn_from(run: Run, learner: Learner, config: OffPolicyConfig, replay: Any, n: int, progress: float) -> None:
+    """Starts ``n`` gradient steps on batches of a replay buffer, in one call."""
+    batch, drawn = replay.draw(run.rng, (n, config.batch_size), progress)
+    update(run, learner, [(batch, drawn)], clock_of(run, progress))
+    run.td_errors = []
 
 
 def begin_episodes(run: Run) -> None:

@@ -1,0 +1,109 @@
+"""``rejeu clone`` and ``rejeu train --offline``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rejeu
+from rejeu.cli import main
+from rejeu.demonstrations import record
+from rejeu.reporting.tables import read_table
+from tests.playing import error_of
+
+pytest.importorskip("minari")
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
+TINY = ["policy_kwargs.net_arch=[16]"]
+FEWER_FILES = ["--no-report", "--no-video", "--evaluate-episodes", "3"]
+
+
+class Balance:
+    """Balances the pole for a while."""
+
+    def predict(self, obs: Any, deterministic: bool = True) -> tuple[int, None]:
+        return int(obs[2] + 0.5 * obs[3] > 0), None
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "shown"
+    record(Balance(), "CartPole-v1", 3, folder, seed=0)
+    return folder
+
+
+def printed(capsys: Any, *argv: Any) -> dict[str, Any]:
+    """Returns what a command prints as JSON."""
+    assert main([*map(str, argv), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_clone_is_a_run_that_is_evaluated_and_trained_on(shown, tmp_path, capsys):
+    out = tmp_path / "clone"
+    how = ["--algo", "PPO", "--updates", 400, "--learning-rate", "1e-2", "--seed", 0, "--out", out]
+    found = printed(capsys, "clone", shown, *how, *FEWER_FILES, "--set", *TINY, "n_steps=64")
+    assert found["demonstrations"]["episodes"] == 3
+    assert found["demonstrations"]["mean_return"] > 100
+    assert found["best"]["mean_return"] > 60  # nothing learned has about 20
+    assert found["complete"]
+    assert {"agent.safetensors", "best.safetensors", "evaluations.csv", "config.json"} <= set(found["files"])
+    assert printed(capsys, "evaluate", out, "--episodes", 2)["env_id"] == "CartPole-v1"
+    resumed = printed(capsys, "resume", out, "--steps", 64, "--no-report", "--no-video")
+    assert resumed["steps"] == 64
+
+
+def test_an_expert_labels_what_the_clone_does(shown, tmp_path, capsys):
+    expert = rejeu.PPO("MlpPolicy", "CartPole-v1", seed=0).save(tmp_path / "expert")
+    how = ["--algo", "PPO", "--updates", 5, "--seed", 0, "--expert", expert, "--rounds", 2, "--round-steps", 30]
+    assert main([*map(str, ["clone", shown, *how, "--out", tmp_path / "clone", *FEWER_FILES, "--set", *TINY])]) == 0
+    text = capsys.readouterr().out
+    assert [text.count(f"round  {i} ") for i in range(4)] == [1, 1, 1, 0]
+    assert "; the demonstrations have " in text
+
+
+def test_what_does_not_fit_is_one_line(shown, tmp_path, capsys):
+    assert "holds no Minari dataset" in error_of(capsys, "clone", str(tmp_path))
+    assert "observation space" in error_of(capsys, "clone", str(shown), "--env", "MountainCar-v0")
+    other = rejeu.PPO("MlpPolicy", "Acrobot-v1", seed=0).save(tmp_path / "other")
+    assert "that agent plays Acrobot-v1" in error_of(capsys, "clone", str(shown), "--expert", str(other))
+    assert "has a memory" in error_of(
+        capsys, "clone", str(shown), "--algo", "RecurrentPPO", "--out", str(tmp_path / "r")
+    )
+    offline = ["--offline", str(shown), "--out", str(tmp_path / "o")]
+    assert "PPO has none" in error_of(capsys, "train", "CartPole-v1", "--algo", "PPO", *offline)
+    assert "IQL" in error_of(capsys, "train", "CartPole-v1", *offline)
+    assert "observation space" in error_of(capsys, "train", "Pendulum-v1", *offline)
+    assert "give demonstrations" in error_of(capsys, "train", "Pendulum-v1", "--algo", "IQL", "--set", "offline=true")
+
+
+def test_a_run_without_an_environment_is_a_run(tmp_path, capsys):
+    with_random = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=0)
+    record(with_random, "Pendulum-v1", 1, tmp_path / "shown", seed=0)
+    out = tmp_path / "run"
+    how = ["--steps", 1200, "--seed", 0, "--evaluate-every", 600, "--out", out, "--set", *TINY, "batch_size=16"]
+    paused = printed(
+        capsys, "train", "Pendulum-v1", "--offline", tmp_path / "shown", *how, *FEWER_FILES, "--pause", 400
+    )
+    assert not paused["complete"]
+    found = printed(capsys, "resume", out, "--no-report", "--no-video")
+    assert found["complete"]
+    assert (found["algorithm"], found["steps"], found["episodes"]) == ("IQL", 1200, 0)
+    assert read_table(out / "evaluations.csv", ("step",)).column("step").tolist() == [600, 1200]
+    assert "train/value_loss" in (out / "metrics.csv").read_text()
+    online = printed(
+        capsys,
+        "resume",
+        out,
+        "--no-report",
+        "--no-video",
+        "--steps",
+        210,
+        "--set",
+        "offline=false",
+        "learning_starts=0",
+    )
+    assert online["steps"] == 1410
+    assert online["episodes"] == 1

@@ -1,0 +1,76 @@
+"""Learning from recorded episodes without an environment."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.callbacks import Checkpoint
+from rejeu.demonstrations import Demonstrations, learn_offline, read, record
+from tests.sharing import shared_learners
+from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand
+
+
+@pytest.mark.parametrize("name", ["TD3BC", "ReBRAC"])
+def test_offline_relatives_of_td3_improve_on_what_was_shown(name: str) -> None:
+    env = Target()
+    mixed = record(Anywhere(env), env, 400, seed=0)
+    agent = getattr(rejeu, name)("MlpPolicy", env, learning_rate=3e-3, gamma=0.0, batch_size=256, **SMALL)
+    learn_offline(agent, mixed, 1500)
+    assert agent.evaluate(20, env=Target(), seed=0).mean_return > 0.4 * mixed.mean_return
+
+
+def test_next_actions_are_those_of_the_same_episode() -> None:
+    env = Target()
+    agent = rejeu.ReBRAC("MlpPolicy", env, n_critics=1, **SMALL)
+    episodes = []
+    for first, terminated in ((0.0, True), (10.0, False)):
+        one = by_hand(3, terminated, first)
+        actions = np.stack([one.observations[:-1, 0] / 10, np.zeros(3)], axis=1).astype(np.float32) * 4 + 2
+        episodes.append(dataclasses.replace(one, actions=actions))
+    replay = agent.replay_of(Demonstrations(tuple(episodes), env.observation_space, env.action_space), agent.run.env)
+    batch = replay.sample(np.random.default_rng(0), (2, 50))
+    x = batch.obs[..., 0]
+    np.testing.assert_allclose(batch.action[..., 0], x / 10, atol=1e-6)
+    expected = np.where(x % 10 == 2, np.nan, (x + 1) / 10)
+    np.testing.assert_allclose(batch.next_action[..., 0], expected, atol=1e-6)
+
+
+class Untouched(Target):
+    """Must not be stepped."""
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        raise AssertionError("an offline run steps no environment")
+
+
+def test_an_offline_run_steps_no_environment_and_resumes_equal(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    record(Anywhere(env := Target()), env, 20, tmp_path / "shown", seed=0)
+    settings: dict[str, Any] = {**SMALL, "demonstrations": tmp_path / "shown", "offline": True, "batch_size": 32}
+    rows: list[int] = []
+    table = SimpleNamespace(write=lambda step, row: rows.append(step), write_config=lambda c: None, in_background=False)
+    with shared_learners():
+        whole = rejeu.TD3BC("MlpPolicy", Untouched(), **settings).learn(2150, sinks=[table])
+        stop = lambda agent, turn: turn.step < 300  # noqa: E731
+        cut = rejeu.TD3BC("MlpPolicy", Untouched(), **settings)
+        cut.learn(2150, [Checkpoint(tmp_path / "run", every=10_000), stop])
+        resumed = rejeu.TD3BC.resume(tmp_path / "run", Untouched()).learn()
+    assert cut.num_timesteps == 300
+    assert whole.n_updates == whole.num_timesteps == resumed.num_timesteps == 2150
+    assert rows == [1000, 2000]
+    assert eqx.tree_equal(whole.learner.state(whole.run.state), resumed.learner.state(resumed.run.state))
+    seen = np.concatenate([episode.observations[:-1] for episode in read(tmp_path / "shown").episodes])
+    statistics = whole.learner.state(whole.run.state).statistics.obs[0]
+    np.testing.assert_allclose(statistics.mean, seen.mean(0), atol=1e-5)
+
+
+def test_offline_needs_demonstrations() -> None:
+    with pytest.raises(ValueError, match="give demonstrations=FOLDER"):
+        rejeu.IQL("MlpPolicy", Target(), offline=True)
