@@ -72,7 +72,7 @@ def shown(kind: str, episodes: int = 40) -> tuple[Target, Demonstrations]:
 
 
 IMITATORS = [
-    *((name, "Box") for name in ("PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "IQL")),
+    *((name, "Box") for name in ("PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "IQL", "TD3BC", "ReBRAC")),
     *((name, "Discrete") for name in ("PPO", "A2C", "TRPO", "SAC", "DDPG", "DQN", "QRDQN", "PQN")),
     *((name, kind) for name in ("PPO",) for kind in ("MultiDiscrete", "MultiBinary")),
 ]
@@ -143,7 +143,10 @@ def test_dagger_asks_the_expert_where_the_agent_came() -> None:
         return int(np.sign(-np.round(obs[1])) + 1)
 
     agent = rejeu.PPO("MlpPolicy", Corridor(), **SMALL)
-    labeled = dagger(agent, expert, Corridor(), rounds=3, steps=100, updates=300)
+    rounds: list[tuple[int, int]] = []
+    say = lambda i, known: rounds.append((i, len(known.episodes)))  # noqa: E731
+    labeled = dagger(agent, expert, Corridor(), rounds=3, steps=100, updates=300, after_round=say)
+    assert rounds == [(1, 2), (2, 4), (3, 6)]
     assert len(asked) == labeled.n_steps >= 300
     assert [int(a) for e in labeled.episodes for a in e.actions] == [int(np.sign(-np.round(o[1])) + 1) for o in asked]
     assert agent.evaluate(5, env=Corridor()).mean_return > 40

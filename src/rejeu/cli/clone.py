@@ -60,7 +60,7 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
         echo(f"shown         {shown}")
         echo(f"run folder    {folder.path}")
         with session.training(stop) as learning:
-            if expert is None:
+            if expert is None and not arguments.by_hand:
                 rate = arguments.learning_rate
                 demonstrations.clone(session.agent, shown, arguments.updates, learning_rate=rate, seed=seed)
             else:
@@ -77,19 +77,30 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
     return status, {**result, "demonstrations": recorded}
 
 
-def learn_from_expert(session: Session, expert: Agent, shown: Demonstrations, arguments: Clone, seed: int) -> None:
-    """Trains the agent by DAgger, and prints how good it is after each round."""
+def learn_from_expert(
+    session: Session, expert: Agent | None, shown: Demonstrations, arguments: Clone, seed: int
+) -> None:
+    """Trains the agent by DAgger, and prints how good it is after each round; without an expert a person takes over."""
 
     def say(i: int, known: Demonstrations) -> None:
         found = session.agent.evaluate(session.config.evaluate_episodes, env=session.evaluation_env, seed=seed)
         echo(f"round {i:>2}      {counted(known.n_steps, 'labeled step')}, return {found.mean_return:,.2f}")
 
-    with closing(session.environment.make()) as env:
+    with ExitStack() as stack:
+        if expert is None:
+            from rejeu.play.assist import Expert
+
+            env = stack.enter_context(closing(session.environment.rendering()))
+            answer: Any = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
+        else:
+            env = stack.enter_context(closing(session.environment.make()))
+            answer = lambda obs: expert.predict(obs, deterministic=True)[0]  # noqa: E731
         demonstrations.dagger(
             session.agent,
-            lambda obs: expert.predict(obs, deterministic=True)[0],
+            answer,
             env,
             shown,
+            takes_over=expert is None,
             rounds=arguments.rounds,
             steps=arguments.round_steps,
             updates=arguments.updates,

@@ -57,6 +57,10 @@ class Train(RunConfig):
     Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu train Pendulum-v1 --steps 20000 --set learning_rate=1e-3
     """
 
+    assist: bool = False
+    """Open a window on the environment, in which you act in place of the agent while you hold a key. Your steps are also
+    written to a Minari dataset, the folder assisted of the run."""
+    fps: Rate = None
     offline: Annotated[Path | None, Shown("DATASET")] = None
     """Learn from the Minari dataset in this folder, without stepping the environment, which only evaluates: each step is a
     gradient step. By default with IQL."""
@@ -95,10 +99,13 @@ class Clone(RunOptions):
     """Step size of these gradient steps."""
     expert: Annotated[Path | None, Shown("RUN")] = None
     """Folder of a run, or a .safetensors file, of the agent that labels what the clone does."""
+    by_hand: bool = False
+    """Be the expert: open a window in which you take over from the clone while you hold a key."""
+    fps: Rate = None
     rounds: Annotated[Positive, Shown("N")] = 5
-    """With --expert: how often the clone acts and is trained again."""
+    """With an expert: how often the clone acts and is trained again."""
     round_steps: Annotated[Positive, Shown("N")] = 1000
-    """With --expert: environment steps of each round; the last episode is completed."""
+    """With an expert: environment steps of each round; the last episode is completed."""
     which: Which = "best"
     evaluate_episodes: EpisodeCount = None
     device: Annotated[str, Shown("NAME")] = "auto"
@@ -551,6 +558,10 @@ def check_options(arguments: Any) -> None:
     given = {key: value for key, value in vars(arguments).items() if value is not None}
     if {"steps", "minutes"} <= given.keys():
         raise ValueError("--steps and --minutes exclude each other; give one of them")
+    if given.get("by_hand") and "expert" in given:
+        raise ValueError("--by-hand and --expert exclude each other; give one of them")
+    if given.get("assist") and "seeds" in given:
+        raise ValueError("--assist is for a single run; leave it out, or --seeds")
     if {"pause", "seeds"} <= given.keys():
         raise ValueError("--pause is for a single run; leave it out, or --seeds")
     if "jobs" in given and "seeds" not in given:

@@ -98,6 +98,8 @@ class Session(NamedTuple):
     """Whether a video is recorded at the end."""
     backend: str = ""
     """Description of the backend."""
+    more: tuple[Any, ...] = ()
+    """Further callbacks."""
     label: str = ""
     """What the lines about its evaluations begin with, where several runs are trained together."""
 
@@ -208,7 +210,7 @@ class Session(NamedTuple):
                 evaluate_now(evaluate, agent)  # here, and not after learn, so that the last checkpoint contains it
             return not (stop.requested or is_pause_due(turn))
 
-        callbacks: list[Any] = [save, evaluate, finish]
+        callbacks: list[Any] = [save, evaluate, finish, *self.more]
         if config.video_every is not None:
             render = self.environment.rendering
             callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))

@@ -21,7 +21,7 @@ from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import Stopwatch, echo, header
 from rejeu.cli.session import Limits, Session, installed_logs, make_evaluation_env
-from rejeu.envs.make import VectorEnv, WorkerOptions
+from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
 from rejeu.interrupt import Interrupt
 from rejeu.presets import Preset
@@ -44,8 +44,14 @@ def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with ExitStack() as stack:
         session, stop = begin(arguments, seed, stack), stack.enter_context(Interrupt())
+        if arguments.assist:
+            from rejeu.play import assist
+
+            assist.check(session.agent)
         folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
         session = session._replace(folder=folder)
+        if arguments.assist:
+            session = session._replace(more=(assist.Assist(folder.path / "assisted", fps=arguments.fps),))
         runs.write(folder.config, session.config)
         echo(header(session.config, session.environment, session.backend, folder))
         return session.run(stop, stopwatch)
@@ -95,6 +101,8 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
 
 def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
     """Returns the training environments."""
+    if arguments.assist:
+        return make_vector(made.rendering, 1, "gymnasium", seed)
     n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
     backend = default_backend(made, preset)
     if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):

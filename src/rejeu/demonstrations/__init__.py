@@ -142,7 +142,7 @@ def record(
     recording = None if path is None else Recording(path, made, None, "expert")
     try:
         seeds = [None if seed is None else seed + i for i in range(whole("episodes", episodes, least=1))]
-        played = [play(made, agent, lambda obs, own: own, one, recording) for one in seeds]
+        played = [play(made, agent, lambda obs, own: own, one, recording)[0][0] for one in seeds]
     finally:
         if recording is not None:
             recording.close()
@@ -157,28 +157,41 @@ def play(
     label: Callable[[Any, Any], Any],
     seed: int | None = None,
     recording: Any = None,
-    most: int | None = None,
-) -> Episode:
-    """Returns an episode that an agent plays, of at most ``most`` steps, with ``label(obs, action)`` as its actions."""
+    takes_over: bool = False,
+) -> tuple[list[Episode], int]:
+    """Plays an episode with an agent, and returns what was labeled and the number of all steps.
+
+    ``label(obs, action)`` are the actions of the result, and with ``takes_over`` also those that are taken. Steps for which it
+    is None are left out; each stretch between them is an episode.
+    """
     obs, _ = env.reset(seed=seed)
-    observations, actions, rewards, terminated = [obs], [], [], False
+    parts: list[list[tuple[Any, ...]]] = [[]]
     if recording is not None:
         recording.begin(obs, seed)
-    for step in itertools.count(1):
+    n_steps, done = 0, False
+    while not done:
         if (signal := interrupt.requested()) is not None:
             raise interrupt.Stopped(signal)
         action, _ = agent.predict(obs, deterministic=True)
-        actions.append(label(obs, action))
+        labeled = label(obs, action)
+        action = labeled if takes_over and labeled is not None else action
+        before = obs
         obs, reward, terminated, truncated, _ = env.step(action)
-        observations.append(obs)
-        rewards.append(float(reward))
-        truncated = truncated or step == most
+        if labeled is not None:
+            parts[-1].append((before, labeled, float(reward), obs, bool(terminated)))
+        elif parts[-1]:
+            parts.append([])
         if recording is not None:
             recording.step(obs, action, float(reward), terminated, truncated)
-        if terminated or truncated:
-            break
+        n_steps, done = n_steps + 1, terminated or truncated
+    return [episode_of(part) for part in parts if part], n_steps
+
+
+def episode_of(steps: Sequence[tuple[Any, ...]]) -> Episode:
+    """Returns successive steps ``(obs, action, reward, next_obs, terminated)`` as an episode."""
+    obs, actions, rewards, following, terminated = zip(*steps, strict=True)
     stack = lambda parts: jax.tree.map(lambda *leaves: np.stack(leaves), *parts)  # noqa: E731
-    return Episode(stack(observations), stack(actions), np.asarray(rewards, np.float32), bool(terminated))
+    return Episode(stack((*obs, following[-1])), stack(actions), np.asarray(rewards, np.float32), terminated[-1])
 
 
 def clone(
@@ -258,6 +271,7 @@ def dagger(
     env: str | gym.Env,
     demonstrations: Demonstrations | None = None,
     *,
+    takes_over: bool = False,
     rounds: int = 10,
     steps: int = 500,
     updates: int = 1000,
@@ -276,6 +290,8 @@ def dagger(
         env: an id, or an environment.
         demonstrations: what the agent is cloned from before the first round; without, the expert labels what an agent does
             that knows nothing.
+        takes_over: whether the expert acts where it answers. Where it answers None, the agent acts, and nothing is learned
+            from the step (HG-DAgger, Kelly et al. 2019, arXiv 1810.02890).
         rounds: how often.
         steps: least number of steps in each round; the last episode is completed.
         updates: gradient steps in each round.
@@ -294,11 +310,15 @@ def dagger(
             say(0, known)
         for i in range(whole("rounds", rounds, least=1)):
             played: list[Episode] = []
-            while sum(map(len, played)) < steps:
-                start = seed + 1000 * (i + 1) + len(played)
-                played.append(play(made, agent, lambda obs, own: expert(obs), start))
+            n_steps = n_episodes = 0
+            while n_steps < steps:
+                start = seed + 1000 * (i + 1) + n_episodes
+                labeled, length = play(made, agent, lambda obs, own: expert(obs), start, takes_over=takes_over)
+                played, n_steps, n_episodes = played + labeled, n_steps + length, n_episodes + 1
             new = Demonstrations(tuple(played), made.observation_space, made.action_space)
             known = new if known is None else known + new
+            if not played:
+                continue  # nobody took over
             clone(agent, known, updates, learning_rate=learning_rate, seed=seed + i + 1)
             say(i + 1, known)
     finally:
