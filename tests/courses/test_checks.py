@@ -9,11 +9,11 @@ import pytest
 
 import rejeu
 from rejeu.courses import checks
-from rejeu.courses.checks import box, dqn_ppo, goals
+from rejeu.courses.checks import box, dqn_ppo, goals, imitation
 from tests.bit_flipping import BitFlipping
-from tests.courses import box_answers, dqn_ppo_answers, goals_answers
+from tests.courses import box_answers, dqn_ppo_answers, goals_answers, imitation_answers
 
-COURSES = ((dqn_ppo, dqn_ppo_answers), (box, box_answers), (goals, goals_answers))
+COURSES = ((dqn_ppo, dqn_ppo_answers), (box, box_answers), (goals, goals_answers), (imitation, imitation_answers))
 RIGHT = [(check, answer) for check, answers in COURSES for answer in answers.RIGHT]
 WRONG = [(getattr(check, name), wrong, message) for check, all_of in COURSES for name, wrong, message in all_of.WRONG]
 EACH_RIGHT = pytest.mark.parametrize(

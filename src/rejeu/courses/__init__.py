@@ -3,6 +3,7 @@
 :mod:`rejeu.courses.notebooks` describes how to write one, :mod:`rejeu.courses.checks` how answers are checked.
 """
 
+from pathlib import Path
 from typing import Any
 
 from rejeu.courses.checks import SESSION
@@ -12,7 +13,9 @@ from rejeu.errors import MissingExtra
 __all__ = ["LANGUAGES", "Language", "Version", "by_hand", "minutes", "notebook", "sources", "steps", "text", "write"]
 
 
-def by_hand(env: str, episodes: int, seed: int | None = None, against: Any = None) -> list[float]:
+def by_hand(
+    env: str, episodes: int, seed: int | None = None, against: Any = None, record: str | Path | None = None
+) -> list[float]:
     """Opens a window to play an environment by hand, and returns your scores; without a display it prints that and returns.
 
     Args:
@@ -20,11 +23,12 @@ def by_hand(env: str, episodes: int, seed: int | None = None, against: Any = Non
         episodes: the window closes after this number of episodes.
         seed: seed of the first episode; each further one adds one.
         against: an agent that plays the same episodes next to you. Its scores are printed.
+        record: new or empty folder for a Minari dataset and a video of what you play.
     """
     from rejeu.play import play
 
     try:
-        game = play(env, episodes=episodes, seed=seed, against=against)
+        game = play(env, episodes=episodes, seed=seed, against=against, record=record)
     except (MissingExtra, OSError) as error:
         print(SESSION.say("no_game" if isinstance(error, MissingExtra) else "no_window", what=error))
         return []
