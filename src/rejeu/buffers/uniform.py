@@ -124,11 +124,13 @@ class BaseReplayBuffer(ABC):
         if goals is not None:
             for leaves in (obs, next_obs):
                 leaves[self.desired][goals.which] = goals.goal
-        next_action = None
-        if self.with_next_action:
-            was_taken = (ring.kind[ring.index(rows.env, after)] != LAST) & (after < ring.head[rows.env])
-            next_action = np.where(was_taken[:, None], following["action"], np.float32(np.nan))
+        next_action = self.taken(following["action"], rows.env, after) if self.with_next_action else None
         return self.transition(shape, ring.tree(obs), step["action"], result, ring.tree(next_obs), weight, next_action)
+
+    def taken(self, action: np.ndarray, env: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Returns the actions of rows ``(n, ...)``, NaN where the episode has ended or no step was taken yet."""
+        was_taken = (self.ring.kind[self.ring.index(env, time)] != LAST) & (time < self.ring.head[env])
+        return np.where(was_taken[:, None], action, np.float32(np.nan))
 
     def transition(
         self,
