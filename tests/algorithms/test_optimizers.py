@@ -54,6 +54,15 @@ def test_a_name_gives_optaxs_optimizer(name, reference):
     np.testing.assert_allclose(given["w"], expected["w"], rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", list(optimizers.OPTIMIZERS))
+def test_a_dict_of_a_name_alone_gives_what_the_name_gives(name):
+    params, gradients = {"w": jnp.array([1.0, -2.0])}, {"w": jnp.array([0.5, 0.25])}
+    for extra in ({}, {"momentum": 0.0}):
+        both = [optimizers.parse("optimizer", given) for given in (name, {"name": name, **extra})]
+        one, other = (stepped(optimizers.make(given), 0.1, params, gradients) for given in both)
+        np.testing.assert_allclose(one["w"], other["w"], rtol=1e-6)
+
+
 def test_an_optimizer_of_the_users_own_is_scaled_by_the_learning_rate():
     params, gradients = jnp.array([1.0]), jnp.array([2.0])
     for own in (optax.sgd, optax.sgd(1.0)):

@@ -131,6 +131,15 @@ def test_hindsight_batches_equal_those_of_the_host(strategy: Any, n: int, n_step
     assert_same_batches(replay, buffer, stops, n_steps == 1)
 
 
+@pytest.mark.parametrize("chosen", [lambda steps: steps.last[:, None], lambda steps: steps.last + 0.5])
+def test_times_that_the_host_refuses_are_refused_on_the_device(chosen: Any) -> None:
+    goals = goal_functions(Reach(stops=False))
+    assert goals is not None
+    buffer = HerReplayBuffer(filled(N_ENVS, 100), 0.9, HindsightConfig(), goals)
+    with pytest.raises(ValueError, match=r"must return whole numbers from first to last.*it returned (int32|float32)"):
+        assert_same_batches(device_replay(N_ENVS, strategy=chosen), buffer, False, True)
+
+
 def prioritized(ring: Ring) -> Priorities:
     """Returns priorities of the steps of a ring, some of which were drawn before."""
     priorities = Priorities(ring, PriorityConfig(beta=Linear(0.4, 1.0)))

@@ -7,6 +7,7 @@ sampled goal tells where it was taken from.
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +21,7 @@ from rejeu.buffers.hindsight import (
     HindsightConfig,
     counters,
     register_goal_strategy,
+    takes_generator,
 )
 from rejeu.buffers.prioritized import Priorities, PriorityConfig
 from rejeu.buffers.uniform import ReplayBuffer
@@ -352,6 +354,17 @@ def test_a_function_that_leaves_the_episode_is_refused(chosen, received):
     replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, lambda rng, time, first, last: chosen(last))
     with pytest.raises(ValueError, match=f"must return whole numbers from first to last.*{received}"):
         replay.sample(np.random.default_rng(0), (40,))
+
+
+def soon(steps, k=2):
+    return np.minimum(steps.time + k, steps.last)
+
+
+@pytest.mark.parametrize("strategy", [soon, partial(soon, k=5), partial(soon, k=1)])
+def test_settings_with_defaults_do_not_make_a_strategy_one_of_a_generator(strategy):
+    assert not takes_generator(strategy)
+    replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, strategy)
+    replay.sample(np.random.default_rng(0), (40,))
 
 
 class Last(HerReplayBuffer):

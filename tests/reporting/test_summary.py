@@ -151,6 +151,20 @@ def test_the_parts_of_a_nested_observation_are_listed():
     assert "  icon (9, 9, 3) -> 32 x 4x4/2 -> 64 x 3x3/1 -> 20" in describe(learner, obs)
 
 
+class Pixels(eqx.Module):
+    linear: eqx.nn.Linear
+
+    def __call__(self, obs):
+        return jax.vmap(self.linear)(obs.reshape(len(obs), -1) / 255.0)
+
+
+def test_an_encoder_of_the_users_own_is_named_instead_of_layers_that_are_not_there():
+    make = lambda key, leaves: Pixels(eqx.nn.Linear(leaves[0].n_features, 32, key=key))  # noqa: E731
+    learner, obs = state(PolicyConfig(encoder=make), space=spaces.Box(0, 255, (9, 9, 3), np.uint8))
+    text = describe(learner, obs)
+    assert text.endswith("state:\n  observation (9, 9, 3)\n  an encoder of your own -> 32")
+
+
 def test_an_agent_draws_itself():
     agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [64, 64]}, seed=0)
     actor, critic = 3 * 64 + 64 + 64 * 64 + 64 + 64 * 2 + 2, 4 * 64 + 64 + 64 * 64 + 64 + 64 + 1

@@ -42,10 +42,12 @@ OPTIMIZERS: dict[str, Callable[..., optax.GradientTransformation]] = {
     "sgd": lambda **settings: optax.identity(),
 }
 """The values of ``optimizer`` by name; those that are variants of Adam take an algorithm's settings ``b1`` and ``eps``."""
+DEFAULTS: dict[str, dict[str, Any]] = {"adamw": {"weight_decay": WEIGHT_DECAY}, "rmsprop": {"decay": RMSPROP_DECAY}}
+"""Settings of an optimizer that is given as a dict, where they differ from Optax's."""
 
 
 class Named(NamedTuple):
-    """An optimizer by its name, with settings that a file contains."""
+    """An optimizer by its name, with settings that a file contains: ``{"name": "adamw", "weight_decay": 1e-2}``."""
 
     name: str
     settings: tuple[tuple[str, Any], ...]
@@ -53,7 +55,7 @@ class Named(NamedTuple):
 
     def make(self, **adam: float) -> optax.GradientTransformation:
         """Returns the transformation; ``adam`` are the algorithm's settings of Adam, which its own replace."""
-        settings = dict(self.settings)
+        settings = DEFAULTS.get(self.name, {}) | dict(self.settings)
         weight_decay, momentum = settings.pop("weight_decay", 0.0), settings.pop("momentum", 0.0)
         rule = {"rmsprop": optax.scale_by_rms, "lion": optax.scale_by_lion, "adamw": optax.scale_by_adam}.get(
             self.name, OPTIMIZERS[self.name]

@@ -24,7 +24,7 @@ from jax import Array
 from rejeu import schedules
 from rejeu.buffers import device_priorities
 from rejeu.buffers.device_priorities import DevicePriorities
-from rejeu.buffers.hindsight import BUILT_IN, GoalStrategy, HindsightSteps
+from rejeu.buffers.hindsight import BUILT_IN, GoalStrategy, HindsightSteps, whole_times
 from rejeu.buffers.prioritized import PriorityConfig
 from rejeu.buffers.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.buffers.uniform import NewGoals, discounts_of, outcome, replaced
@@ -300,7 +300,7 @@ class DeviceReplay:
         steps = HindsightSteps.of(jnp, self.positions, rows.env, (rows.time, first, last), goals_at, integers)
         times = steps.chosen_by(self.strategy)  # type: ignore[arg-type]
         if self.strategy not in BUILT_IN:
-            times = jnp.clip(times.astype(jnp.int32), first, last)
+            times = jnp.clip(whole_times(times, last).astype(jnp.int32), first, last)
         return self.positions(rows.env, times)
 
 

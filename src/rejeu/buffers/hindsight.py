@@ -168,7 +168,13 @@ def name_of(strategy: str | Callable[..., Any]) -> str | Callable[..., Any]:
 
 def takes_generator(strategy: str | Callable[..., Any]) -> bool:
     """Returns whether a strategy is a function ``(rng, time, first, last)``, for the host only."""
-    return callable(strategy) and len(inspect.signature(strategy).parameters) != 1
+    if not callable(strategy):
+        return False
+    try:
+        inspect.signature(strategy).bind(None)
+    except TypeError:
+        return True
+    return False
 
 
 class GoalSelectionStrategy(str, Enum):
@@ -340,20 +346,30 @@ def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     return np.flatnonzero(chosen)
 
 
+WANTED = "goal_selection_strategy must return whole numbers from first to last, one for each transition,"
+
+
+def whole_times(times: Any, last: Any) -> Any:
+    """Returns the times that a strategy of the user's own chose, of which only shape and dtype are known on the device.
+
+    Raises:
+        ValueError: if they are not whole numbers ``(n,)``.
+    """
+    times = times if hasattr(times, "dtype") else np.asarray(times)
+    if times.shape != last.shape or times.dtype.kind not in "iu":
+        raise ValueError(f"{WANTED} of shape {last.shape}; it returned {times.dtype} of shape {times.shape}")
+    return times
+
+
 def checked(times: Any, first: Any, last: np.ndarray) -> np.ndarray:
     """Returns the times that a strategy of the user's own chose.
 
     Raises:
         ValueError: if one is outside of the episode.
     """
-    times = np.asarray(times)
-    if times.shape != last.shape or times.dtype.kind not in "iu" or ((times < first) | (times > last)).any():
-        received = f"{times.dtype} of shape {times.shape}"
-        if times.shape == last.shape and times.dtype.kind in "iu":
-            wrong = np.flatnonzero((times < first) | (times > last))[0]
-            received = f"{times[wrong]} where first is {first[wrong]} and last is {last[wrong]}"
-        raise ValueError(
-            f"goal_selection_strategy must return whole numbers from first to last, one for each transition, of shape "
-            f"{last.shape}; it returned {received}"
-        )
+    times = np.asarray(whole_times(times, last))
+    if ((times < first) | (times > last)).any():
+        wrong = np.flatnonzero((times < first) | (times > last))[0]
+        received = f"{times[wrong]} where first is {first[wrong]} and last is {last[wrong]}"
+        raise ValueError(f"{WANTED} of shape {last.shape}; it returned {received}")
     return times

@@ -38,6 +38,7 @@ from rejeu.networks import (
     SimBa,
     convolutions,
 )
+from rejeu.networks.encoder import OwnEncoder
 from rejeu.spaces import Leaf
 
 ARROW = " -> "
@@ -60,7 +61,12 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
     }
     reach = max((branch_width(network) for network in networks.values()), default=0)
     paragraphs = [f"{name}: {count(network)}\n{draw(network, reach)}" for name, network in networks.items()]
-    parts = jax.tree.leaves(networks, is_leaf=lambda part: isinstance(part, Encoder))
+    parts = jax.tree.leaves(networks, is_leaf=lambda part: isinstance(part, Encoder | OwnEncoder))
+    if own := next((part for part in parts if isinstance(part, OwnEncoder)), None):
+        entrances = [f"  {leaf.path or 'observation'} {leaf.shape}" for leaf in leaves]
+        return "\n\n".join(
+            [*paragraphs, "\n".join(["state:", *entrances, f"  an encoder of your own -> {own.n_features}"])]
+        )
     shape = next((part.shape for part in parts if isinstance(part, Encoder)), PolicyConfig())
     return "\n\n".join([*paragraphs, *inputs(leaves, shape)])
 

@@ -93,7 +93,7 @@ RUN = {"_last_obs": "obs", "_last_episode_starts": "ended", "_n_updates": "n_upd
 """Attributes of a run by the names that scripts read of an agent."""
 OPTIMIZERS: dict[str, dict[str, Any]] = {
     "Adam": {"name": "adam"},
-    "AdamW": {"name": "adamw"},
+    "AdamW": {"name": "adamw", "weight_decay": 1e-2},
     "NAdam": {"name": "nadam"},
     "RAdam": {"name": "radam"},
     "RMSprop": {"name": "rmsprop", "decay": 0.99, "eps": 1e-8, "eps_in_sqrt": False},
