@@ -6,7 +6,7 @@ import pytest
 
 import rejeu
 from rejeu import AGENTS, presets, validation
-from rejeu.agents.registry import find_preset
+from rejeu.agents import find_preset
 from tests.tiers import exhaustive
 
 
