@@ -296,7 +296,8 @@ def command(site, folder, *arguments):
 
 
 def test_the_command_line_finds_an_installed_algorithm_by_its_name_only_where_it_is_typed(site, tmp_path):
-    tiny = ["--evaluate-episodes", "1", "--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=20"]
+    tiny = ["--evaluate-episodes", "1", "--no-report", "--no-video"]
+    tiny += ["--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=20"]
     done = command(site, tmp_path, "train", "Pendulum-v1", "--algo", "awac", "--steps", "60", "--out", "run", *tiny)
     assert done.returncode == 0, done.stderr
     assert "AWAC, preset, seed" in done.stdout

@@ -24,8 +24,6 @@ from rejeu.schedules import Exponential, Linear, at, parse, to_json
 from tests.environments import Counter
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 
 @pytest.mark.parametrize(("progress", "value"), [(0.0, 1.0), (0.25, 0.55), (0.5, 0.1), (0.8, 0.1), (1.0, 0.1)])
 def test_linear_is_a_line_to_its_fraction_and_constant_after(progress, value):

@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+import tempfile
 from importlib import resources
+from pathlib import Path
 
 SCRIPT = """
 import gymnasium as gym
@@ -44,6 +46,8 @@ follow_imports = silent
 follow_imports = skip
 """
 """The last two lines save most of the time: nothing in the script is of their types."""
+CACHE = Path(tempfile.gettempdir()) / "rejeu-test-mypy"
+"""What is known of the packages from earlier runs."""
 
 
 def test_a_script_type_checks_and_its_mistakes_are_found(tmp_path):
@@ -52,7 +56,7 @@ def test_a_script_type_checks_and_its_mistakes_are_found(tmp_path):
     script.write_text(SCRIPT)
     (tmp_path / "mypy.ini").write_text(SETTINGS)
     done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--no-incremental", str(script)],
+        [sys.executable, "-m", "mypy", "--cache-dir", str(CACHE), str(script)],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -15,8 +15,6 @@ from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, count_updates, same_parameters, small_sac
 from tests.tiers import exhaustive
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 NEVER = 10**6
 """``learning_starts`` of agents that only act at random."""
 

@@ -11,8 +11,6 @@ from rejeu.errors import BadEnvironmentError
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 
 class WithoutGoal(Sampled):
     """A Dict observation without ``desired_goal``."""

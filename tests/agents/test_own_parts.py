@@ -14,8 +14,6 @@ from rejeu.exploration.noise import NormalActionNoise
 from tests.environments import Reach
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 SMALL = {"learning_starts": 8, "batch_size": 4, "buffer_size": 300, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
 BALL = "rejeu/Ball-v0"
 

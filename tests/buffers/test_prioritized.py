@@ -26,8 +26,6 @@ from rejeu.schedules import Linear
 from rejeu.spaces import leaves, structure
 from tests.environments import Sampled
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 NUMBER = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 GOALS = spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), NUMBER))
 

@@ -7,8 +7,6 @@ from rejeu.callbacks import Checkpoint, TrainingCallback
 from rejeu.errors import CheckpointError
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 BALL = "rejeu/Ball-v0"
 
 

@@ -16,8 +16,6 @@ from rejeu.envs.base import DivergedError
 from rejeu.envs.envpool import ActionLog
 from rejeu.envs.make import make_vector
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 pytest.importorskip("envpool")
 
 SPACES = {

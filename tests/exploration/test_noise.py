@@ -28,8 +28,6 @@ from rejeu.exploration.noise import (
 from tests.environments import Counter
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0))
 
 

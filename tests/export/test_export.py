@@ -22,8 +22,6 @@ from rejeu.spaces import parts
 from tests.export.policies import KINDS, agent_of, observations
 from tests.tiers import crossed, exhaustive
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 onnxruntime = pytest.importorskip("onnxruntime")
 has_compiler = any(map(shutil.which, check.COMPILERS))
 FORMS = {

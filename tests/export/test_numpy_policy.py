@@ -15,8 +15,6 @@ from tests.export.policies import KINDS, agent_of, observations
 from tests.export.test_export import OTHERS
 from tests.tiers import exhaustive
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 WITHOUT_MEMORY = [kind for kind in KINDS if kind[0] != "RecurrentPPO"]
 CASES = [
     pytest.param(name, action, observation, normalize, marks=[] if i % 4 == j else exhaustive)

@@ -21,8 +21,6 @@ from tests import hostile_files
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):

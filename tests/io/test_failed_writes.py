@@ -22,8 +22,6 @@ from rejeu.sb3.common.callbacks import CheckpointCallback, EvalCallback
 from tests.full_disk import FullDisk
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 BALL = "rejeu/Ball-v0"
 
 

@@ -20,8 +20,6 @@ from rejeu.reporting.history import History
 from rejeu.reporting.logging import Console, CsvFile
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 NAN = math.nan
 SECONDS = dict.fromkeys(("env", "replay", "update", "total"), 0.0)
 

@@ -19,8 +19,6 @@ from rejeu.reporting import logging
 from rejeu.reporting.logging import CsvFile, JsonLines, check_logs
 from tests.helpers import small_sac
 
-pytestmark = pytest.mark.usefixtures("learners_are_shared")
-
 BALL = "rejeu/Ball-v0"
 ROOT = Path(__file__).parents[2]
 
