@@ -165,7 +165,7 @@ def test_a_signal_after_training_ends_the_command_with_its_status_and_keeps_the_
         from rejeu.cli import main
         sys.exit(main(sys.argv[1:]))
     """
-    argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1"]
+    argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1", "--no-report"]
     argv += ["--out", str(tmp_path / "run"), "--set", *TINY]
     done = subprocess.run([sys.executable, "-c", script, *argv], capture_output=True, text=True)
     assert done.returncode == 143
