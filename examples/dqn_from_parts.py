@@ -5,7 +5,6 @@ python examples/dqn_from_parts.py
 
 import gymnasium as gym
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 
@@ -32,7 +31,7 @@ def train_from_parts(episodes, seed=0, epsilon=(0.9, 0.01), copy_every=10):
     def learn(network, target_network, optimizer_state, batch):
         target = dqn.td_target(network, target_network, batch, double_q=False)
         loss = jax.value_and_grad(dqn.td_loss, has_aux=True)
-        (value, _), gradients = loss(network, batch, target, jnp.square)
+        (value, _), gradients = loss(network, batch, target, dqn.LOSSES["squared"])
         change, optimizer_state = optimizer.update(gradients, optimizer_state)
         return optax.apply_updates(network, change), optimizer_state, value
 

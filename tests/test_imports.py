@@ -23,7 +23,7 @@ import gymnasium
 print(json.dumps({"loaded": sorted(sys.modules), "ids": [i for i in gymnasium.registry if i.startswith("rejeu/")]}))
 """
     found = json.loads(fresh(program))
-    assert found["ids"] == ["rejeu/Ball-v0", "rejeu/CartPoleNoVelocity-v0"]
+    assert found["ids"] == ["rejeu/Ball-v0", "rejeu/CartPoleNoVelocity-v0", "rejeu/ParkingHard-v0"]
     loaded = set(found["loaded"])
     assert not loaded & {"jax", "equinox", "optax", "scipy", "rich", "envpool", "rejeu.agents"}
 

@@ -94,7 +94,7 @@ def test_a_plain_replay_buffer_has_no_hindsight(given):
         ({"gradient_steps": -2}, "gradient_steps=-2 must be a whole number of at least -1"),
         ({"n_critics": 0}, "n_critics=0 must be a whole number of at least 1"),
         ({"target_update_interval": 0}, "target_update_interval=0 must be"),
-        ({"target_entropy": "high"}, "target_entropy='high' must be a finite number"),
+        ({"target_entropy": "high"}, "target_entropy='high' must be 'auto', 'std_0.15' or a number"),
         ({"n_steps": 0}, "n_steps=0 must be a whole number of at least 1"),
         (
             {"replay_buffer_class": "HerBuffer"},

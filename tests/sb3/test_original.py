@@ -57,7 +57,7 @@ def test_policy_kwargs_of_the_original_are_translated():
     config = sac(
         policy_kwargs={"net_arch": [8], "n_critics": 3, "optimizer_class": AdamW, "share_features_extractor": False}
     ).config
-    assert (config.n_critics, config.optimizer) == (3, "adamw")
+    assert (config.n_critics, config.optimizer.name) == (3, "adamw")
     kwargs = {
         "optimizer_class": AdamW,
         "optimizer_kwargs": {"weight_decay": 0.5, "betas": (0.8, 0.9)},

@@ -42,7 +42,9 @@ def values(agent, sights):
         only = state.network if hasattr(state, "network") else state.critic
         critics = jax.tree.map(lambda leaf: leaf[None], only)
     if action.dtype == np.float64:  # of Discrete actions 1, 2 and 3, which stand for 0.5, 1 and 1.5
-        of_each = np.mean(jax.vmap(lambda critic: critic(obs))(critics), axis=0)
+        given = (obs, jnp.linspace(0.05, 0.95, 10)[None]) if agent.name == "IQN" else (obs,)
+        of_each = np.mean(jax.vmap(lambda critic: critic(*given))(critics), axis=0)
+        of_each = of_each.mean(axis=2) if agent.name == "IQN" else of_each
         return of_each[np.arange(len(sights)), (2.0 * action).astype(int) - 1]
     inside = jnp.array(action - 1.0)[:, None]  # bounds 0 and 2 to -1 and 1
     return np.mean(jax.vmap(lambda critic: critic(obs, inside))(critics), axis=(0, 2))
