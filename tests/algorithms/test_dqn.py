@@ -89,6 +89,8 @@ def test_td_loss_equals_numpy(name, weighted):
     network, batch = other_network(), random_batch(weighted=weighted)
     target = np.linspace(-3.0, 3.0, BATCH, dtype=np.float32)
     loss, (td_error, value) = dqn.td_loss(network, batch, jnp.array(target), dqn.LOSSES[name])
+    if name == "squared":
+        assert dqn.td_loss(network, batch, jnp.array(target), jnp.square)[0] == loss
     values = forward(network, batch.obs)
     errors = [values[i, batch.action[i]] - target[i] for i in range(BATCH)]
     assert min(map(abs, errors)) < 1 < max(map(abs, errors)), "both branches of Huber's function are met"

@@ -502,10 +502,18 @@ def munchausen_target(
 
 
 def td_loss(
-    network: Any, batch: Transition, target: Array, returns: Returns, key: Array | None = None
+    network: Any,
+    batch: Transition,
+    target: Array,
+    returns: Returns | Callable[[Array], Array],
+    key: Array | None = None,
 ) -> tuple[Array, tuple[Array, Array]]:
-    """Returns the mean loss, and of each transition the error and the mean of the prediction, ``(batch,)``."""
-    loss, td_error, value = returns.loss(network, batch.obs, batch.action, target, key)
+    """Returns the mean loss, and of each transition the error and the mean of the prediction, ``(batch,)``.
+
+    For ``returns`` a function of the TD error, such as ``jnp.square``, stands for :func:`expected` of it.
+    """
+    known = returns if isinstance(returns, Returns) else expected(returns)
+    loss, td_error, value = known.loss(network, batch.obs, batch.action, target, key)
     return weighted_mean(loss, batch.weight), (td_error, value)
 
 
