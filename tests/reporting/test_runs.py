@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from rejeu.reporting.runs import read_run
+from rejeu.agents import BUILT_IN
+from rejeu.reporting.runs import default_hyperparameters, read_run
 from rejeu.runs import config
 
 CONFIG = {
@@ -196,3 +197,7 @@ def test_folder_without_a_run(tmp_path):
         read_run(tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no run folder"):
         read_run(tmp_path / "none")
+
+
+def test_the_defaults_of_every_algorithm_are_known():
+    assert [name for name in BUILT_IN if not default_hyperparameters(name)] == []
