@@ -383,28 +383,8 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
         xqc,
     )
 
-    modules: Any = (
-        a2c,
-        ars,
-        crossq,
-        ddpg,
-        dqn,
-        flashsac,
-        iql,
-        iqn,
-        maskable_ppo,
-        ppo,
-        pqn,
-        qrdqn,
-        rebrac,
-        recurrent_ppo,
-        sac,
-        td3,
-        td3_bc,
-        tqc,
-        trpo,
-        xqc,
-    )
+    from_replay = (crossq, ddpg, dqn, flashsac, iql, iqn, qrdqn, rebrac, sac, td3, td3_bc, tqc, xqc)
+    modules: Any = (*from_replay, a2c, ars, maskable_ppo, ppo, pqn, recurrent_ppo, trpo)
     kinds = {module.Config.name: module.Config for module in modules} | config.registered
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
 
