@@ -105,15 +105,15 @@ def test_the_default_optimizer_of_a2c_is_the_rmsprop_of_pytorch():
 def test_nothing_is_learned_without_gradient_steps():
     settings = {"learning_starts": 4, "batch_size": 4, "seed": 0, **SMALL}
     still = sb3.SAC("MlpPolicy", "Pendulum-v1", gradient_steps=0, **settings)
-    before = still.get_parameters()
+    before = still.policy.state_dict()
     assert still.learn(12)._n_updates == 0
-    assert all((array == before[name]).all() for name, array in still.get_parameters().items())
+    assert all((array == before[name]).all() for name, array in still.policy.state_dict().items())
 
 
 def test_targets_stay_with_a_tau_of_zero():
     fixed = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=4, batch_size=4, tau=0, seed=0, **SMALL)
-    before = fixed.get_parameters()
-    after = fixed.learn(12).get_parameters()
+    before = fixed.policy.state_dict()
+    after = fixed.learn(12).policy.state_dict()
     same = {name for name in before if (before[name] == after[name]).all()}
     assert {name for name in before if name.startswith("target_critics")} <= same
     assert not any(name.startswith("critics.") and name.endswith("weight") for name in same)
@@ -138,7 +138,7 @@ def test_images_that_are_scaled_already_need_normalize_images_false():
     env = VecNormalize(DummyVecEnv([lambda: envs.FakeImageEnv(screen_height=36, screen_width=36, channel_first=True)]))
     shape = {"features_extractor_kwargs": {"features_dim": 8}, "normalize_images": False}
     model = sb3.A2C("CnnPolicy", env, n_steps=8, policy_kwargs=shape).learn(8)
-    assert any(array.ndim == 4 for array in model.get_parameters().values())
+    assert any(array.ndim == 4 for array in model.policy.parameters())
     with pytest.raises(AssertionError, match="uint8"):
         sb3.A2C("CnnPolicy", env, n_steps=8)
 
@@ -187,7 +187,7 @@ def test_actor_and_critic_share_their_extractor_or_not():
     for shares in (True, False):
         shape = {"share_features_extractor": shares, "features_extractor_kwargs": {"features_dim": 8}}
         model = sb3.PPO("CnnPolicy", env, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=shape).learn(8)
-        sizes.append(sum(array.ndim == 4 for array in model.get_parameters().values()))
+        sizes.append(sum(array.ndim == 4 for array in model.policy.parameters()))
     assert sizes[1] == 2 * sizes[0]
     with pytest.warns(UserWarning, match="share_features_extractor"):
         sb3.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"share_features_extractor": True})
@@ -256,7 +256,7 @@ def test_attributes_of_agents():
 def test_tqc_explores_by_state_dependent_noise_and_td3_has_none_as_in_the_original():
     model = sb3.TQC("MlpPolicy", "Pendulum-v1", use_sde=True, sde_sample_freq=4, learning_starts=8, seed=0, **SMALL)
     model.learn(16)
-    assert any(name.endswith("log_std") for name in model.get_parameters())
+    assert any(name.endswith("log_std") for name in model.policy.state_dict())
     with pytest.raises(TypeError, match="use_sde"):
         sb3.TD3("MlpPolicy", "Pendulum-v1", use_sde=True)
 

@@ -221,6 +221,93 @@ def test_rollout_buffer_computes_advantages_by_the_recursion():
     assert sum(len(batch.actions) for batch in buffer.get(2)) == 3
 
 
+def test_the_rollout_of_an_agent_has_its_values_and_advantages_also_right_after_an_update():
+    sizes = []
+
+    def look(known, names):
+        sizes.append(known["self"].rollout_buffer.size())
+
+    agent = sb3.A2C("MlpPolicy", gym.make("CartPole-v1"), n_steps=8, gae_lambda=0.5, learning_rate=0.0, seed=0, **SMALL)
+    agent.learn(16, callback=look)
+    shown = agent.rollout_buffer
+    assert (sizes[7:9], shown.full, shown.episode_starts[0, 0]) == ([8, 1], True, False)
+    values = agent.policy.predict_values(shown.observations[:, 0])[:, 0]
+    np.testing.assert_allclose(shown.values[:, 0], values, rtol=1e-5)
+    assert not shown.episode_starts[1:].any()
+    last = shown.returns[-1] - shown.rewards[-1]  # the discounted value of what followed
+    error = shown.rewards[:-1] + 0.99 * shown.values[1:] - shown.values[:-1]
+    expected = [shown.rewards[-1] + last - shown.values[-1]]
+    for one in error[::-1]:
+        expected.append(one + 0.99 * 0.5 * expected[-1])
+    np.testing.assert_allclose(shown.advantages, expected[::-1], rtol=1e-4)
+    np.testing.assert_allclose(shown.returns, shown.advantages + shown.values, rtol=1e-5)
+    log_prob = agent.policy.evaluate_actions(shown.observations[:, 0], shown.actions[:, 0, 0])[1]
+    np.testing.assert_allclose(shown.log_probs[:, 0], log_prob, rtol=1e-5)
+    assert not hasattr(sb3.RecurrentPPO("MlpLstmPolicy", "CartPole-v1", **SMALL).rollout_buffer, "values")
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts"),
+    [
+        (sb3.PPO, {"policy", "policy.optimizer"}),
+        (sb3.DQN, {"policy", "policy.optimizer"}),
+        (sb3.DDPG, {"policy", "actor.optimizer", "critic.optimizer"}),
+        (sb3.SAC, {"policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer"}),
+    ],
+)
+def test_parameters_are_got_and_set_by_network_and_optimizer(kind, parts):
+    env = "CartPole-v1" if kind in (sb3.PPO, sb3.DQN) else "Pendulum-v1"
+    one, two = (kind("MlpPolicy", env, seed=seed, **SMALL) for seed in (0, 1))
+    given = one.get_parameters()
+    assert given.keys() == parts
+    assert given["policy"].keys() == one.policy.state_dict().keys()
+    two.set_parameters(given)
+    found = two.get_parameters()
+    assert all(np.array_equal(found[part][name], value) for part in given for name, value in given[part].items())
+    name, array = given["policy"].popitem()
+    for exact, wrong in (
+        (False, {"nobody": {}}),
+        (True, {"policy": {**given["policy"], name: array}}),
+        (True, given),
+        (False, {"policy": {name: array[..., None]}}),
+    ):
+        with pytest.raises(ValueError, match="set_parameters") as caught:
+            two.set_parameters(wrong, exact_match=exact)
+        assert isinstance(caught.value, RuntimeError)
+    two.set_parameters({"policy": {name: array + 1}}, exact_match=False)
+    np.testing.assert_array_equal(two.policy.state_dict()[name], array + 1)
+    two.set_parameters(
+        super(sb3.algorithms.Original, one).get_parameters()
+    )  # by name alone, as rejeu's agents have them
+    np.testing.assert_array_equal(two.policy.state_dict()[name], array)
+
+
+def test_extractors_are_shown_as_parts_of_the_networks():
+    shape = {"features_extractor_class": Features, "net_arch": [4]}
+    agent = sb3.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs=shape, seed=0)
+    obs = np.ones((5, 3), np.float32)
+    for network in (agent.actor, agent.critic, agent.critic_target):
+        extractor = network.features_extractor
+        weight, bias = (array[0] if "critic" in name else array for name, array in extractor.named_parameters())
+        expected = np.maximum(obs @ weight.T + bias, 0)
+        np.testing.assert_allclose(network.extract_features(obs), expected, rtol=1e-5)
+        assert extractor.features_dim == 3
+    agent.actor.features_extractor.load_state_dict(
+        {name: np.zeros_like(array) for name, array in agent.actor.features_extractor.state_dict().items()}
+    )
+    assert not agent.actor.features_extractor(obs).any()
+    assert agent.critic.features_extractor(obs).any()
+
+
+def test_a_policy_class_whose_methods_are_not_called_warns():
+    class Own(ActorCriticPolicy):
+        def forward(self, obs, deterministic=False):
+            return super().forward(obs, deterministic)
+
+    with pytest.warns(UserWarning, match=r"Own.forward='your own' is called neither in training nor by model.predict"):
+        sb3.A2C(Own, "CartPole-v1", policy_kwargs={"net_arch": [4]})
+
+
 def test_hindsight_by_hand_gives_goals_that_were_reached():
     venv = sb3.common.env_util.make_vec_env(lambda: envs.BitFlippingEnv(4, continuous=True))
     buffer = HerReplayBuffer(50, venv.observation_space, venv.action_space, venv, n_sampled_goal=4)
@@ -400,9 +487,9 @@ def test_trust_regions_and_random_search_are_at_their_paths():
 
     assert TRPO(MlpPolicy, "CartPole-v1", n_steps=32, batch_size=32, seed=0).learn(64).num_timesteps == 64
     linear = ARS(LinearPolicy, "CartPole-v1", n_delta=1, seed=0).learn(100)
-    assert {array.shape for array in linear.get_parameters().values() if array.ndim == 2} == {(4, 2)}
+    assert {array.shape for array in linear.policy.parameters() if array.ndim == 2} == {(4, 2)}
     hidden = ARS("MlpPolicy", "CartPole-v1", n_delta=1, seed=0)
-    assert {array.shape for array in hidden.get_parameters().values() if array.ndim == 2} == {
+    assert {array.shape for array in hidden.policy.parameters() if array.ndim == 2} == {
         (4, 64),
         (64, 64),
         (64, 2),

@@ -198,7 +198,7 @@ class Agent(BaseAgent):
 
     def snapshot(self, path: str | Path) -> Callable[[], Path]:
         """Returns a function that writes the model as it is now, as :meth:`save` does."""
-        arrays, header = self.get_parameters(), model_files.header(self)
+        arrays, header = Agent.get_parameters(self), model_files.header(self)
 
         def write() -> Path:
             self.last_saved = checkpoint.write(path, "agent", arrays, header)
@@ -370,7 +370,7 @@ class Agent(BaseAgent):
             checkpoint.require_finite(source, path)
         arrays = {key: np.asarray(value) for key, value in source.items()}
         if not exact_match:
-            arrays = self.get_parameters() | arrays
+            arrays = Agent.get_parameters(self) | arrays
         state = checkpoint.arrays_to_tree(self.learner.shapes, arrays, "set_parameters: the source")
         self.run.state = self.learner.pack(state)
         self.drop_rollout()

@@ -49,6 +49,8 @@ class RolloutBuffer:
         self.running_return = np.zeros(shape, np.float32)
         self.started = np.zeros(n_envs, bool)
         """Whether an episode started with the first step, ``bool (n_envs,)``."""
+        self.previously_started = self.started
+        """The same of the rollout before."""
         self.carry: PyTree = ()
         """Recurrent state of the policy before the first step, with leaves ``(n_envs, ...)``."""
         self.length = 0
@@ -76,7 +78,7 @@ class RolloutBuffer:
             started: whether an episode starts with the first step, ``bool (n_envs,)``.
         """
         self.length = 0
-        self.carry, self.started = carry, started.copy()
+        self.carry, self.previously_started, self.started = carry, self.started, started.copy()
 
     def observe(self, obs: PyTree) -> None:
         """Stores the observations ``(n_envs, ...)`` before the next step."""

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rejeu import agents, schedules, validation
@@ -27,10 +28,14 @@ from rejeu.agents import Agent, model_files
 from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.algorithms import config as configs
+from rejeu.algorithms.actor_critic.network import ActorCritic
+from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
+from rejeu.core import Rollout
 from rejeu.envs.masks import split
 from rejeu.envs.wrappers import TimeLimitTerminates
+from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import ActionNoise
 from rejeu.io import checkpoint
 from rejeu.reporting import logging
@@ -101,6 +106,10 @@ OPTIMIZERS: dict[str, dict[str, Any]] = {
     "SGD": {"name": "sgd"},
 }
 """Optimizers by the names of PyTorch's classes, with the settings by which they differ from Optax's."""
+PARTS = {"optimizer": "policy", "actor_optimizer": "actor", "critic_optimizer": "critic", "critics_optimizer": "critic"}
+PARTS = {field: f"{part}.optimizer" for field, part in PARTS.items()}
+PARTS |= dict.fromkeys(("alpha_optimizer", "log_alpha"), "ent_coef_optimizer")
+"""Where :meth:`Original.get_parameters` has the fields of the algorithms' states that are no networks."""
 OFF_POLICY = ("learning_rate", "buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq")
 SHAPING = {
     "action_masks",
@@ -158,6 +167,10 @@ class Refused(ValueError, AssertionError):
     """A setting or a space that an algorithm does not take: scripts catch either error."""
 
 
+class Mismatch(CheckpointError, RuntimeError):
+    """Parameters that do not fit an agent: scripts catch ``ValueError`` or ``RuntimeError``."""
+
+
 class Original(Agent):
     """An agent with Stable-Baselines3's arguments, attributes and methods. Abstract.
 
@@ -213,6 +226,10 @@ class Original(Agent):
         """Returns the environment, the name of the policy and the policy, for a class of policies."""
         if not issubclass(kind, BasePolicy):
             raise TypeError(f"policy={kind.__name__} must be a name, or a class derived from BasePolicy")
+        mine = [base for base in kind.__mro__ if base.__module__ != policies.__name__]
+        for name in ("forward", "_predict", "evaluate_actions", "predict_values", "get_distribution"):
+            if any(name in vars(base) for base in mine):
+                unsupported(f"{kind.__name__}.{name}", "your own", "is called neither in training nor by model.predict")
         made = None
         env = make_vec_env(env) if isinstance(env, str) else env
         space = getattr(env, "single_observation_space", env.observation_space)
@@ -337,7 +354,7 @@ class Original(Agent):
         if name in ("_logger", "_vec_normalize_env"):
             return self.logger if name == "_logger" else self.get_vec_normalize_env()
         if name in ("log_ent_coef", "ent_coef_tensor") and hasattr(self.learner.shapes, "log_alpha"):
-            log_alpha = np.asarray(self.state.log_alpha)
+            log_alpha = utils.Tensor.of(np.array(self.state.log_alpha))
             if name == "log_ent_coef":
                 return log_alpha if config.learns_temperature else None
             return np.exp(log_alpha)
@@ -416,7 +433,10 @@ class Original(Agent):
 
     @property
     def rollout_buffer(self) -> buffers.RolloutBuffer:
-        """A copy of the steps since the last update, without values and log-probabilities.
+        """A copy of the steps since the last update, or right after it of those that it learned from; actions in [-1, 1].
+
+        ``values``, ``log_probs``, ``advantages`` and ``returns`` are by the network as it is now: the one that acted, and
+        right after an update the new one. Agents with memory, ``normalize`` or ``rnd``, and ARS, do not have them.
 
         Raises:
             AttributeError: for an agent with a replay buffer.
@@ -424,12 +444,25 @@ class Original(Agent):
         core = self.run.replay
         if isinstance(self, OffPolicyAgent):
             raise AttributeError(f"{self.name} has no rollout buffer")
-        shown = buffers.RolloutBuffer(core.n_steps, self.observation_space, self.action_space, n_envs=core.n_envs)
-        rollout = core.rollout()
-        shown.observations, shown.rewards = jax.tree.map(np.copy, rollout.obs), rollout.reward.copy()
-        shown.actions = np.array(rollout.action).reshape(core.n_steps, core.n_envs, -1)
-        shown.episode_starts[0], shown.episode_starts[1:] = rollout.started, rollout.ended[:-1]
-        shown.pos, shown.full = core.length, core.full
+        shape = (core.n_steps, core.n_envs)
+        shown = buffers.RolloutBuffer(shape[0], self.observation_space, self.action_space, n_envs=shape[1])
+        shown.pos = core.length or int(core.valid.any(axis=1).sum())
+        shown.full = shown.pos == core.n_steps
+        obs, next_obs = (jax.tree.unflatten(core.obs_structure, leaves) for leaves in (core.obs, core.next_obs))
+        valid = core.valid & (np.arange(core.n_steps) < shown.pos)[:, None]
+        seen = Rollout(obs, core.action, core.reward, next_obs, core.discount, core.ended, valid, (), (), ())
+        seen = jax.tree.map(np.copy, seen)
+        shown.observations, shown.rewards, shown.actions = seen.obs, seen.reward, seen.action.reshape(*shape, -1)
+        shown.episode_starts[0] = core.started if core.length else core.previously_started
+        shown.episode_starts[1:] = seen.ended[:-1]
+        network = getattr(self.state, "network", None)
+        if not isinstance(network, ActorCritic):
+            del shown.log_probs, shown.values, shown.advantages, shown.returns
+            return shown
+        found = samples(network, jax.tree.map(jnp.asarray, seen), self.config.gae_lambda)
+        shown.log_probs, shown.values, shown.advantages, shown.returns = (
+            np.where(valid, np.reshape(x, shape), 0.0) for x in found[2:6]
+        )
         return shown
 
     def make_envs(self, env: Any, *args: Any, **kwargs: Any) -> Any:
@@ -565,6 +598,45 @@ class Original(Agent):
             self.logger.name_to_value |= self.logger.left
         return self
 
+    def get_parameters(self) -> dict[str, dict[str, utils.Tensor]]:  # type: ignore[override]
+        """Returns a copy of the algorithm's state: for the networks and for each optimizer the arrays by name.
+
+        The networks are ``"policy"``; the optimizers ``"policy.optimizer"``, or ``"actor.optimizer"``, ``"critic.optimizer"``
+        and ``"ent_coef_optimizer"``, which has the temperature too. Counters and all else are with the first optimizer.
+        """
+        parts: dict[str, dict[str, utils.Tensor]] = {"policy": {}}
+        arrays = super().get_parameters()
+        first = PARTS["actor_optimizer" if any("actor_optimizer" in name for name in arrays) else "optimizer"]
+        for name, array in arrays.items():
+            fields = name.split(".")
+            found = [PARTS[field] for field in fields if field in PARTS]
+            part = found[0] if found else "policy" if policies.ALL_NETWORKS & {*fields} else first
+            parts.setdefault(part, {})[name] = utils.Tensor.of(array)
+        return parts
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
+        """Sets parameters from :meth:`get_parameters`, of this class or of rejeu's agents, or from a model file.
+
+        Args:
+            load_path_or_dict: arrays by part and name, arrays by name, or a path.
+            exact_match: require all parameters; False sets those that are given and keeps the others.
+            device: accepted.
+
+        Raises:
+            ValueError: if a part, name, shape or dtype does not match; the agent is then unchanged.
+            RuntimeError: the same error.
+        """
+        given = load_path_or_dict
+        if isinstance(given, Mapping) and any(isinstance(part, Mapping) for part in given.values()):
+            unknown = [*given.keys() - (own := self.get_parameters()).keys()]
+            if unknown:
+                raise Mismatch(f"set_parameters got {unknown[0]!r}, and {self.name} has {', '.join(own)}")
+            given = {name: array for part in given.values() for name, array in part.items()}
+        try:
+            super().set_parameters(given, exact_match)
+        except CheckpointError as error:
+            raise Mismatch(*error.args) from None
+
     def set_logger(self, logger: Any) -> None:
         """Replaces the logger for all further training."""
         super().set_logger(logger)
@@ -593,7 +665,7 @@ class Original(Agent):
         header, defaults = model_files.header(self), configs.to_json(type(self.config)())
         header["config"] |= {key: defaults[key] for key in exclude & defaults.keys() - SHAPING}
         header["attributes"] = {key: getattr(self, key) for key in sorted(include - defaults.keys())}
-        self.last_saved = checkpoint.write(path, "agent", self.get_parameters(), header)
+        self.last_saved = checkpoint.write(path, "agent", super().get_parameters(), header)
         return self.last_saved
 
     def save_replay_buffer(self, path: Any) -> Any:

@@ -98,8 +98,8 @@ class BaseModel:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns a copy of the parameters as arrays by name."""
-        named = self.model.get_parameters().items()
-        return {name: Tensor.of(array) for name, array in named if self.fields & {*name.split(".")}}
+        named = self.model.get_parameters()["policy"].items()
+        return {name: array for name, array in named if self.fields & {*name.split(".")}}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True) -> None:
         """Sets parameters.
@@ -165,6 +165,15 @@ class BaseModel:
             observation = maybe_transpose(np.asarray(observation), self.observation_space)
         return is_vectorized_observation(observation, self.observation_space)
 
+    @property
+    def features_extractor(self) -> FeaturesExtractor:
+        """What maps observations to features: of PPO and A2C the policy's, of several critics the first one's."""
+        return FeaturesExtractor.of(self.model, self.fields)
+
+    def extract_features(self, obs: Any, features_extractor: Any = None) -> np.ndarray:
+        """Returns the features of a batch of observations, ``(batch, features_dim)``."""
+        return (features_extractor or self.features_extractor)(obs)
+
     def obs_to_tensor(self, observation: Any) -> tuple[Any, bool]:
         """Returns observations as a batch of arrays, and whether they were a batch."""
         batch, single = as_batch(observation, self.model.observation_space, self.model.obs_leaves)
@@ -178,6 +187,32 @@ class BaseModel:
 
     def _batch(self, obs: Any) -> Any:
         return self.obs_to_tensor(obs)[0]
+
+
+class FeaturesExtractor(BaseModel):
+    """What maps observations to features, in one network of an agent or in several."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns a copy of the parameters as arrays by name."""
+        return {name: array for name, array in super().state_dict().items() if "encoder" in name.split(".")}
+
+    def __call__(self, obs: Any) -> np.ndarray:
+        """Returns the features of a batch of observations, ``(batch, features_dim)``."""
+        return Tensor.of(self._encoder()(jax.tree.map(jnp.asarray, self._batch(obs))))
+
+    forward = __call__
+
+    @property
+    def features_dim(self) -> int:
+        """The number of features."""
+        return self._encoder().n_features
+
+    def _encoder(self) -> Any:
+        state = self.model.state
+        state = getattr(state, "learner", state)  # of normalize or rnd
+        field = next(field for field in vars(state) if field in self.fields)
+        network = getattr(state, field)
+        return jax.tree.map(lambda x: x[0], network.encoder) if field.endswith("critics") else network.encoder
 
 
 class Actor(BaseModel):
@@ -322,13 +357,4 @@ class MlpPolicy(ActorCriticPolicy):
     policy_name = "MlpPolicy"
 
 
-class CnnPolicy(ActorCriticPolicy):
-    """The policy of any algorithm for images."""
-
-    policy_name = "CnnPolicy"
-
-
-class MultiInputPolicy(ActorCriticPolicy):
-    """The policy of any algorithm for Dict observations."""
-
-    policy_name = "MultiInputPolicy"
+CnnPolicy, MultiInputPolicy = ActorCriticCnnPolicy, MultiInputActorCriticPolicy

@@ -173,7 +173,7 @@ class ReplayBuffer(BaseBuffer):
         buffer = cls.__new__(cls)
         ring = core.ring
         BaseBuffer.__init__(buffer, ring.rows, agent.observation_space, agent.action_space, agent.device, ring.n_envs)
-        buffer.core, buffer.agent = core, agent
+        buffer.core, buffer.agent, buffer.device = core, agent, agent.device
         buffer.optimize_memory_usage, buffer.handle_timeout_termination = False, True
         buffer.pos = int(ring.n_steps.min())
         buffer.full = bool((ring.head >= ring.rows).all())
