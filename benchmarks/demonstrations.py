@@ -32,8 +32,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import machine, provenance, write as save
 
 RESULTS = Path(__file__).parent / "results" / "demonstrations"
-EXPERTS = {"Pendulum-v1": (8_000, 2_000), "LunarLanderContinuous-v3": (60_000, 20_000)}
+EXPERTS = {"Pendulum-v1": (8_000, 3_000), "LunarLanderContinuous-v3": (60_000, 20_000)}
 """Steps of SAC for the expert and for the medium policy."""
+WEIGHTS: dict[str, dict[str, Any]] = {
+    "medium": {"TD3BC": {"alpha": 5.0}, "ReBRAC": {"actor_bc": 0.01, "critic_bc": 0.1}},
+    "expert": {"TD3BC": {"alpha": 1.0}, "ReBRAC": {"actor_bc": 1.0, "critic_bc": 0.01}},
+}
+"""How much recorded actions weigh, the best of four for each dataset on seed 100. At their defaults TD3+BC and ReBRAC leave the
+few states of Pendulum's expert: -536 and -1533."""
 N_STEPS, EPISODES = 20_000, 50
 
 
@@ -86,6 +92,7 @@ def offline(arguments: argparse.Namespace) -> None:
                 began = time.perf_counter()
                 kind = rejeu.TD3 if algorithm == "BC" else getattr(rejeu, algorithm)
                 more = {"batch_size": 256} if algorithm == "ReBRAC" else {}
+                more |= WEIGHTS[name].get(algorithm, {})
                 learner = kind("MlpPolicy", env_id, seed=seed, **small, **more)
                 if algorithm == "BC":
                     clone(learner, data, arguments.updates, batch_size=256, seed=seed)
