@@ -13,12 +13,14 @@ hyperparameters of the preset::
 
 With ``--zoo`` the hyperparameters are those of ``benchmarks/zoo.toml`` in the place of the preset's, and the results are in
 ``benchmarks/results/learning/zoo``. The file is written after every seed; ``--continue`` keeps the seeds that it has.
-``--preset PPO`` takes the settings of that algorithm, where the algorithm itself has none for the environment.
+``--preset PPO`` takes the settings of that algorithm, where the algorithm itself has none for the environment, and
+``--preset small`` those of a preset with that name.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.metadata
 import json
 import math
@@ -114,7 +116,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env_id")
     parser.add_argument("algorithm")
-    parser.add_argument("--preset", metavar="ALGORITHM", help="whose settings are used; default: the algorithm's own")
+    parser.add_argument("--preset", metavar="NAME", help="algorithm or preset whose settings are used; default: its own")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int)
     parser.add_argument("--minutes", type=float, help="train so long instead, everything from making the agent counted")
@@ -133,9 +135,10 @@ def main() -> None:
     arguments = parser.parse_args()
     find = zoo if arguments.zoo else presets.find
     of = arguments.preset or arguments.algorithm
-    preset = find(arguments.env_id, of)
+    preset = find(arguments.env_id, of) or presets.named(of, arguments.env_id, arguments.algorithm)
     if preset is None:
         parser.error(f"there is no preset of {of} for {arguments.env_id}")
+    preset = dataclasses.replace(preset, env_id=arguments.env_id)
     name = arguments.name or f"{arguments.env_id.replace('/', '-')}-{arguments.algorithm}"
     path = arguments.out / ("zoo" if arguments.zoo else "") / f"{name}.json"
     runs: list[dict] = []
