@@ -29,6 +29,7 @@ from rejeu.callbacks import Evaluate
 from rejeu.demonstrations import Demonstrations, clone, dagger, learn_offline, record
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.learning import summary
 from trials.provenance import machine, provenance, write as save
 
 RESULTS = Path(__file__).parent / "results" / "demonstrations"
@@ -38,8 +39,8 @@ WEIGHTS: dict[str, dict[str, Any]] = {
     "medium": {"TD3BC": {"alpha": 5.0}, "ReBRAC": {"actor_bc": 0.01, "critic_bc": 0.1}},
     "expert": {"TD3BC": {"alpha": 1.0}, "ReBRAC": {"actor_bc": 1.0, "critic_bc": 0.01}},
 }
-"""How much recorded actions weigh, the best of four for each dataset on seed 100. At their defaults TD3+BC and ReBRAC leave the
-few states of Pendulum's expert: -536 and -1533."""
+"""How much recorded actions weigh, the best of four for each dataset on seed 100. At their defaults TD3+BC and ReBRAC leave
+the few states of Pendulum's expert: -536 and -1533."""
 N_STEPS, EPISODES = 20_000, 50
 
 
@@ -171,10 +172,21 @@ def share(arguments: argparse.Namespace) -> None:
 
 
 def write(arguments: argparse.Namespace, results: list[dict[str, Any]]) -> None:
-    """Writes the results so far, and prints the newest."""
+    """Writes the results so far with their summary over the seeds, and prints the newest."""
     print(json.dumps(results[-1]), flush=True)
     out = arguments.out or RESULTS / f"{arguments.what}-{arguments.env.replace('/', '-')}.json"
-    save(out, {**provenance(), "machine": machine(), "results": results}, "results")
+    save(out, {**provenance(), "machine": machine(), "summary": summarized(results), "results": results}, "results")
+
+
+def summarized(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the mean over the seeds and its interval, for each algorithm and dataset, round, or with and without a share."""
+    rows = [{**one, **part} for one in results for part in one.get("rounds", [{}])]
+    kinds = [name for name in ("data", "algorithm", "round", "demonstrations") if name in rows[0]]
+    measure = "steps_to_90" if "steps_to_90" in rows[0] else "mean_return"
+    groups: dict[tuple[Any, ...], list[float]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in kinds), []).append(row[measure])
+    return [{**dict(zip(kinds, key, strict=True)), **(summary(values) or {})} for key, values in groups.items()]
 
 
 def main() -> None:
