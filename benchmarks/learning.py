@@ -14,7 +14,8 @@ hyperparameters of the preset::
 With ``--zoo`` the hyperparameters are those of ``benchmarks/zoo.toml`` in the place of the preset's, and the results are in
 ``benchmarks/results/learning/zoo``. The file is written after every seed; ``--continue`` keeps the seeds that it has.
 ``--preset PPO`` takes the settings of that algorithm, where the algorithm itself has none for the environment, and
-``--preset small`` those of a preset with that name.
+``--preset small`` those of a preset with that name, and ``--preset default`` those of ``rejeu train`` for an environment
+without a preset.
 """
 
 from __future__ import annotations
@@ -116,7 +117,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env_id")
     parser.add_argument("algorithm")
-    parser.add_argument("--preset", metavar="NAME", help="algorithm or preset whose settings are used; default: its own")
+    parser.add_argument(
+        "--preset", metavar="NAME", help="algorithm or preset whose settings are used; default: its own"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int)
     parser.add_argument("--minutes", type=float, help="train so long instead, everything from making the agent counted")
@@ -135,7 +138,10 @@ def main() -> None:
     arguments = parser.parse_args()
     find = zoo if arguments.zoo else presets.find
     of = arguments.preset or arguments.algorithm
-    preset = find(arguments.env_id, of) or presets.named(of, arguments.env_id, arguments.algorithm)
+    if of == "default":
+        preset = presets.default(arguments.env_id, arguments.algorithm)
+    else:
+        preset = find(arguments.env_id, of) or presets.named(of, arguments.env_id, arguments.algorithm)
     if preset is None:
         parser.error(f"there is no preset of {of} for {arguments.env_id}")
     preset = dataclasses.replace(preset, env_id=arguments.env_id)
