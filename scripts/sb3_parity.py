@@ -127,8 +127,8 @@ def text() -> str:
     """Returns the comparison for the documentation."""
     modules, arguments, methods = compared()
     n, of = (sum(row[i] for row in modules.values()) for i in (0, 1))
-    complete = ", ".join(f"`{path}`" for path, (_, _, missing) in modules.items() if not missing)
-    lines = [f"{n} of {of} public classes and functions are where the original has them. Complete: {complete}.", ""]
+    complete = f"{sum(not row[2] for row in modules.values())} of {len(modules)} modules are complete, all but these"
+    lines = [f"{n} of {of} public classes and functions are where the original has them. {complete}:", ""]
     lines += ["| module | names | missing |", "|---|---|---|"]
     for path, (there, total, missing) in modules.items():
         if missing:
@@ -151,12 +151,13 @@ def examples() -> str:
         row = counts.setdefault(one.page, [0, 0, 0])
         row[2 if one.needs == "ale_py" else 1 if one.fails else 0] += 1
     n = sum(row[0] for row in counts.values())
-    lines = [f"{n} of {len(EXAMPLES)} examples run.", "", "| page | run | fail | not tried |", "|---|---|---|---|"]
-    lines += [
-        f"| {page} | {' | '.join(str(count) if count else '' for count in row)} |" for page, row in counts.items()
-    ]
-    reasons = [f"- {one.run.__name__.replace('_', ' ')}: {one.fails}" for one in EXAMPLES if one.fails]
-    return "\n".join([*lines, "", *reasons, "- not tried: ale-py is not installed where the tests run"])
+    complete = ", ".join(f"{page} ({row[0]})" for page, row in counts.items() if not row[1] + row[2])
+    lines = [f"{n} of {len(EXAMPLES)} examples run. All do of {complete}. These do not:", ""]
+    lines += [f"- {one.page}, {one.run.__name__.replace('_', ' ')}: {one.fails}" for one in EXAMPLES if one.fails]
+    untried = ", ".join(page for page, row in counts.items() if row[2])
+    return "\n".join(
+        [*lines, f"- one each of {untried}: not tried, because ale-py is not installed where the tests run"]
+    )
 
 
 def suite() -> str:
@@ -164,23 +165,16 @@ def suite() -> str:
     content = json.loads((ROOT / "trials" / "results" / "sb3_suite.json").read_text(encoding="utf-8"))
     if not content["files"]:
         raise FileNotFoundError("the tests were not run")
-    kinds = [*dict.fromkeys(kind for row in content["files"] for kind in row["kinds"])]
-    kinds.sort(key=lambda kind: -sum(row["kinds"].get(kind, 0) for row in content["files"]))
     original = {row["file"]: row["passed"] for row in content["original"]}
-    lines = [
-        f"| file | original passes | passes here | {' | '.join(kinds)} | commit |",
-        "|---" * (len(kinds) + 4) + "|",
-    ]
-    total = {
-        "file": "all",
-        "passed": sum(row["passed"] for row in content["files"]),
-        "kinds": {kind: sum(row["kinds"].get(kind, 0) for row in content["files"]) for kind in kinds},
-    }
-    for row in [*content["files"], total]:
-        there = original.get(row["file"], sum(original.get(one["file"], 0) for one in content["files"]))
-        numbers = [str(row["kinds"].get(kind, "")) for kind in kinds]
-        cells = [row["file"].removesuffix(".py"), str(there), str(row["passed"]), *numbers, row.get("commit", "")[:7]]
-        lines.append(f"| {' | '.join(cells)} |")
+    complete = [row for row in content["files"] if not row["failed"]]
+    lines = ["| file | original passes | passes here | fails here |", "|---|---|---|---|"]
+    for row in content["files"]:
+        kinds = sorted(row["kinds"].items(), key=lambda item: -item[1])
+        fails = ", ".join(f"{count} {kind}" for kind, count in kinds)
+        cells = row["file"].removesuffix(".py"), str(original[row["file"]]), str(row["passed"]), fails
+        lines += [f"| {' | '.join(cells)} |"] * bool(row["failed"])
+    everything = ", ".join(f"{row['file'].removesuffix('.py')} ({row['passed']})" for row in complete)
+    lines += ["", f"All tests pass of {everything}."]
     passed, n_tests = content["total"]["passed"], content["total"]["passed"] + content["total"]["failed"]
     without = n_tests - content["total"]["kinds"].get("tensor", 0)
     share = f"{passed} of {n_tests} tests pass; without those that need tensors of PyTorch, {passed} of {without}"
@@ -197,10 +191,8 @@ def same_scripts() -> str:
         name: json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["runs"]
         for name in ("original", "rejeu")
     }
-    lines = [
-        "| | task | steps | seeds | Stable-Baselines3 | rejeu | intervals overlap |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = ["| | task | steps | seeds | Stable-Baselines3 | rejeu |", "|---|---|---|---|---|---|"]
+    apart = []
     for algorithm in dict.fromkeys(run["algorithm"] for run in runs["rejeu"]):
         shown, limits = [], []
         for rows in runs.values():
@@ -210,10 +202,11 @@ def same_scripts() -> str:
             half = float(stats.t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / len(values) ** 0.5
             limits.append((mean - half, mean + half))
             shown.append(f"{mean:.1f} [{mean - half:.1f}, {mean + half:.1f}]")
-        overlap = max(low for low, _ in limits) <= min(high for _, high in limits)
+        apart += [algorithm] * (max(low for low, _ in limits) > min(high for _, high in limits))
         first = f"| {algorithm} | {own[0]['env_id']} | {own[0]['steps']:,} | {len(own)} |"
-        lines.append(f"{first} {' | '.join(shown)} | {'yes' if overlap else 'no'} |")
-    return "\n".join(lines)
+        lines.append(f"{first} {' | '.join(shown)} |")
+    overlap = f"Intervals do not overlap: {', '.join(apart)}." if apart else "All intervals overlap."
+    return "\n".join([*lines, "", overlap])
 
 
 if __name__ == "__main__":
