@@ -29,7 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
 from benchmarks.bench.text import table, times  # noqa: E402
-from rejeu import presets, validation  # noqa: E402
+from rejeu import presets, schedules, validation  # noqa: E402
 from rejeu.agents import AGENTS  # noqa: E402
 from rejeu.algorithms import dqn, ppo  # noqa: E402
 from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
@@ -167,42 +167,45 @@ def curve(algorithm: str) -> str:
 
 
 def hyperparameters(algorithm: str) -> str:
-    """The hyperparameters of an algorithm with defaults and meanings, and the defaults of those that it shares with others."""
+    """The hyperparameters of an algorithm with defaults and meanings; of those that it shares, the defaults that differ."""
     config = AGENTS[algorithm].algorithm.Config
     docs, defaults = validation.field_docs(config), validation.field_defaults(config)
-    shared: dict[str, list[str]] = {}
     known: set[str] = set()
+    shared = []
     for base, owner, link in SHARED:
         if issubclass(config, base) and config is not base and owner != algorithm:
             explained = validation.field_docs(base)
+            usual = validation.field_defaults(AGENTS[owner].algorithm.Config if owner in AGENTS else base)
             names = [name for name in docs if name not in known and docs[name] == explained.get(name)]
-            shared.setdefault(f"[of {owner}]({link})", []).extend(names)
+            differ = {name: shown(defaults[name]) for name in names if shown(defaults[name]) != shown(usual[name])}
+            shared += [differences(f"[of {owner}]({link})", differ, [*(explained.keys() - docs.keys())])] * bool(names)
             known.update(names)
-    rest = "\n\n".join(defaults_of(where, names, defaults) for where, names in shared.items() if names)
     declared = [name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()) if name in docs]
     own = [name for name in dict.fromkeys(declared) if name not in known]
-    return f"{meanings(own, docs, defaults)}\n\n{rest}" if own else rest
+    return "\n\n".join([meanings(own, docs, defaults)] * bool(own) + shared)
 
 
-def defaults_of(where: str, names: list[str], defaults: dict[str, Any]) -> str:
-    """A sentence with the defaults of hyperparameters that are explained elsewhere."""
-    values = {name: shown(defaults[name]) for name in names}
-    listed = ", ".join(f"`{name}={value}`" if value else f"`{name}`" for name, value in values.items())
-    return textwrap.fill(f"Those {where}, with the defaults {listed}.", 135, break_on_hyphens=False)
+def differences(where: str, defaults: dict[str, str], missing: list[str]) -> str:
+    """A sentence on hyperparameters that are explained elsewhere: the defaults that differ, and those that are not there."""
+    listed = ", ".join(f"`{name}={value}`" if value else f"`{name}`" for name, value in defaults.items())
+    without = ", ".join(f"`{name}`" for name in sorted(missing))
+    text = f"Those {where}" + f", without {without}" * bool(without)
+    return textwrap.fill(
+        f"{text}, with the same defaults{f' but {listed}' * bool(listed)}.", 135, break_on_hyphens=False
+    )
 
 
 def shared_hyperparameters(kind: str) -> str:
     """The hyperparameters that all off-policy or all on-policy algorithms have; the latter without those of both kinds."""
-    docs, others = (validation.field_docs(config) for config in (OnPolicyConfig, OffPolicyConfig))
-    own = {name: text for name, text in docs.items() if others.get(name) != text}
-    return meanings(list(others), others, None) if kind == "off-policy" else meanings(list(own), own, None)
+    config, other = (OffPolicyConfig, None) if kind == "off-policy" else (OnPolicyConfig, OffPolicyConfig)
+    docs, known = validation.field_docs(config), validation.field_docs(other) if other else {}
+    names = [name for name in docs if known.get(name) != docs[name]]
+    return meanings(names, docs, validation.field_defaults(config))
 
 
-def meanings(names: list[str], docs: dict[str, str], defaults: dict[str, Any] | None) -> str:
-    """A table of hyperparameters, with their defaults if there are any."""
+def meanings(names: list[str], docs: dict[str, str], defaults: dict[str, Any]) -> str:
+    """A table of hyperparameters with their defaults."""
     cells = {name: docs[name].replace("``", "`").replace("|", "\\|") for name in names}
-    if defaults is None:
-        return table(("hyperparameter", "meaning"), [(f"`{name}`", text) for name, text in cells.items()])
     rows = [
         (f"`{name}`", f"`{shown(defaults[name])}`" * bool(shown(defaults[name])), text) for name, text in cells.items()
     ]
@@ -210,8 +213,8 @@ def meanings(names: list[str], docs: dict[str, str], defaults: dict[str, Any] | 
 
 
 def shown(default: Any) -> str:
-    """A default value; nothing for the settings of networks, which are a configuration of their own."""
-    return "" if dataclasses.is_dataclass(default) else repr(default)
+    """A default value; nothing for settings that are a configuration of their own, such as those of networks."""
+    return repr(default) if isinstance(default, schedules.Linear) or not dataclasses.is_dataclass(default) else ""
 
 
 def supported() -> str:
