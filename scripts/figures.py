@@ -114,7 +114,10 @@ def code(text: str) -> str:
 
 
 def learned(folder: str, length: str = "") -> str:
-    """Every result of a folder of ``benchmarks/results``, beside all that is published; ``short`` leaves its origin out."""
+    """Every result of a folder of ``benchmarks/results``, beside all that is published; ``short`` leaves its origin out.
+
+    The text above a short table says that what is published is RL Zoo's or of CleanRL's defaults.
+    """
     rows = []
     for path in sorted((DATA / folder).glob("*.json")):
         content = load(path.name, path.parent)
@@ -124,8 +127,9 @@ def learned(folder: str, length: str = "") -> str:
             steps = f"{entry['steps']:,} steps"
             if (entry["algorithm"], entry["env"]) == (result.algorithm, result.env_id) and HIDDEN not in result.setting:
                 differs = [entry.get("version", ""), "" if steps == result.budget else steps]
-                notes = ", ".join(filter(None, [entry["by"], *differs]))
-                others.append(f"[{entry['return']:.1f}]({entry['source']}) ({notes})")
+                by = entry["by"].partition(",")[0].replace("RL Zoo", "") if length == "short" else entry["by"]
+                notes = ", ".join(filter(None, [by, *differs]))
+                others.append(f"[{entry['return']:.1f}]({entry['source']})" + f" ({notes})" * bool(notes))
         rows.append(
             (
                 ", ".join(filter(None, (result.env_id, result.setting))),
@@ -293,17 +297,6 @@ def time_of(result: Result) -> str:
     return f"{low} s" if low == high else f"{low} to {high} s"
 
 
-def ball() -> str:
-    """The success rates on Ball-v0, one row for each ``sigma``."""
-    found = [result for result in measured() if result.env_id == "rejeu/Ball-v0"]
-    algorithms = ("TD3", "DDPG", "SAC")
-    rows = []
-    for setting in sorted({result.setting for result in found}):
-        cells = {result.algorithm: result.figures for result in found if result.setting == setting}
-        rows.append((setting.removeprefix("sigma="), *(cells[name] for name in algorithms)))
-    return table(("`sigma`", *algorithms), rows)
-
-
 def parking() -> str:
     """Time and results of ``rejeu train parking-v0``."""
     result = next(result for result in measured() if result.env_id == "parking-v0")
@@ -413,7 +406,6 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "shared-hyperparameters": shared_hyperparameters,
     "supported": supported,
     "presets": training_times,
-    "ball": ball,
     "parking": parking,
     "speed": speed,
     "sb3-names": sb3_parity.text,

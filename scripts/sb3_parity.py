@@ -114,12 +114,11 @@ def compared() -> tuple[dict[str, tuple[int, int, list[str]]], dict[str, set[str
 
 
 def names_of(lacking: dict[str, set[str]]) -> str:
-    """Returns what is lacking, each with up to three of the classes and functions that lack it."""
+    """Returns what is lacking, with the class or function that lacks it and the number of others."""
     shown = []
-    for key in sorted(lacking):
-        owners = sorted(lacking[key])
-        more = f" and {len(owners) - 3} more" if len(owners) > 3 else ""
-        shown.append(f"`{key}` ({', '.join(owners[:3])}{more})")
+    for key, owners in sorted(lacking.items()):
+        more = f" and {len(owners) - 1} more" if len(owners) > 1 else ""
+        shown.append(f"`{key}` ({min(owners)}{more})")
     return ", ".join(shown)
 
 
@@ -151,7 +150,7 @@ def examples() -> str:
         row = counts.setdefault(one.page, [0, 0, 0])
         row[2 if one.needs == "ale_py" else 1 if one.fails else 0] += 1
     n = sum(row[0] for row in counts.values())
-    complete = ", ".join(f"{page} ({row[0]})" for page, row in counts.items() if not row[1] + row[2])
+    complete = ", ".join(page for page, row in counts.items() if not row[1] + row[2])
     lines = [f"{n} of {len(EXAMPLES)} examples run. All do of {complete}. These do not:", ""]
     lines += [f"- {one.page}, {one.run.__name__.replace('_', ' ')}: {one.fails}" for one in EXAMPLES if one.fails]
     untried = ", ".join(page for page, row in counts.items() if row[2])
@@ -160,26 +159,28 @@ def examples() -> str:
     )
 
 
-def suite() -> str:
-    """Returns how the original's own tests end here, for the documentation."""
+def suite(length: str = "") -> str:
+    """Returns how the original's own tests end here; ``short`` leaves the files out."""
     content = json.loads((ROOT / "trials" / "results" / "sb3_suite.json").read_text(encoding="utf-8"))
     if not content["files"]:
         raise FileNotFoundError("the tests were not run")
+    passed, total = content["total"]["passed"], content["total"]["passed"] + content["total"]["failed"]
+    without = total - content["total"]["kinds"].get("tensor", 0)
+    share = f"{passed} of {total} tests pass; without those that need tensors of PyTorch, {passed} of {without}"
+    share += f" ({passed / without:.1%}). The others are {counted(content['total']['kinds'])}."
+    if length == "short":
+        return share
     original = {row["file"]: row["passed"] for row in content["original"]}
-    complete = [row for row in content["files"] if not row["failed"]]
-    lines = ["| file | original passes | passes here | fails here |", "|---|---|---|---|"]
+    lines = ["| file | original passes | passes here | fails here | commit |", "|---|---|---|---|---|"]
     for row in content["files"]:
-        kinds = sorted(row["kinds"].items(), key=lambda item: -item[1])
-        fails = ", ".join(f"{count} {kind}" for kind, count in kinds)
-        cells = row["file"].removesuffix(".py"), str(original[row["file"]]), str(row["passed"]), fails
-        lines += [f"| {' | '.join(cells)} |"] * bool(row["failed"])
-    everything = ", ".join(f"{row['file'].removesuffix('.py')} ({row['passed']})" for row in complete)
-    lines += ["", f"All tests pass of {everything}."]
-    passed, n_tests = content["total"]["passed"], content["total"]["passed"] + content["total"]["failed"]
-    without = n_tests - content["total"]["kinds"].get("tensor", 0)
-    share = f"{passed} of {n_tests} tests pass; without those that need tensors of PyTorch, {passed} of {without}"
-    share += f" ({passed / without:.1%})."
+        cells = row["file"].removesuffix(".py"), str(original[row["file"]]), str(row["passed"]), counted(row["kinds"])
+        lines.append(f"| {' | '.join(cells)} | {row['commit'][:7]} |")
     return "\n".join([share, "", f"{content['date']}, `{content['command']}`", "", *lines])
+
+
+def counted(kinds: dict[str, int]) -> str:
+    """Returns numbers of failures by kind, the most frequent first."""
+    return ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
 
 
 def same_scripts() -> str:
