@@ -152,6 +152,38 @@ def test_dagger_asks_the_expert_where_the_agent_came() -> None:
     assert agent.evaluate(5, env=Corridor()).mean_return > 40
 
 
+class InPlace(gym.Env):
+    """Counts its steps, always in the same array."""
+
+    observation_space, action_space = gym.spaces.Box(0.0, 9.0, (1,)), gym.spaces.Box(0.0, 9.0, (1,))
+
+    def __init__(self) -> None:
+        self.obs = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.obs[:] = 0.0
+        return self.obs, {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.obs += 1.0
+        return self.obs, 1.0, False, bool(self.obs[0] == 6), {}
+
+
+def test_what_is_played_keeps_arrays_that_environment_and_agent_write_to_again() -> None:
+    class Repeats:
+        action = np.zeros(1, np.float32)
+
+        def predict(self, obs: np.ndarray, deterministic: bool = True) -> tuple[np.ndarray, None]:
+            self.action[:] = obs
+            return self.action, None
+
+    for episode in record(Repeats(), InPlace(), 2, seed=0).episodes:
+        np.testing.assert_array_equal(episode.observations[:, 0], np.arange(7))
+        np.testing.assert_array_equal(episode.actions[:, 0], np.arange(6))
+    parts, _ = demonstrations.play(InPlace(), Repeats(), lambda obs, own: None if obs[0] == 3 else own)
+    assert [part.observations[:, 0].tolist() for part in parts] == [[0, 1, 2, 3], [4, 5, 6]]
+
+
 def test_a_dataset_is_read_as_it_was_recorded(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     env = Target()

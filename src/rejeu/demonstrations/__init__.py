@@ -175,10 +175,10 @@ def play(
         action, _ = agent.predict(obs, deterministic=True)
         labeled = label(obs, action)
         action = labeled if takes_over and labeled is not None else action
-        before = obs
+        before, labeled = jax.tree.map(np.copy, (obs, labeled))  # which may be written to again
         obs, reward, terminated, truncated, _ = env.step(action)
         if labeled is not None:
-            parts[-1].append((before, labeled, float(reward), obs, bool(terminated)))
+            parts[-1].append((before, labeled, float(reward), jax.tree.map(np.copy, obs), bool(terminated)))
         elif parts[-1]:
             parts.append([])
         if recording is not None:
