@@ -27,9 +27,10 @@ def test_offline_relatives_of_td3_improve_on_what_was_shown(name: str) -> None:
     assert agent.evaluate(20, env=Target(), seed=0).mean_return > 0.4 * mixed.mean_return
 
 
-def test_next_actions_are_those_of_the_same_episode() -> None:
+@pytest.mark.parametrize("n_steps", [1, 2, 5])
+def test_next_actions_are_those_of_the_next_observation_in_the_same_episode(n_steps: int) -> None:
     env = Target()
-    agent = rejeu.ReBRAC("MlpPolicy", env, n_critics=1, **SMALL)
+    agent = rejeu.ReBRAC("MlpPolicy", env, n_critics=1, n_steps=n_steps, **SMALL)
     episodes = []
     for first, terminated in ((0.0, True), (10.0, False)):
         one = by_hand(3, terminated, first)
@@ -39,7 +40,9 @@ def test_next_actions_are_those_of_the_same_episode() -> None:
     batch = replay.sample(np.random.default_rng(0), (2, 50))
     x = batch.obs[..., 0]
     np.testing.assert_allclose(batch.action[..., 0], x / 10, atol=1e-6)
-    expected = np.where(x % 10 == 2, np.nan, (x + 1) / 10)
+    after = batch.next_obs[..., 0]
+    np.testing.assert_array_equal(after, np.minimum(x + n_steps, x // 10 * 10 + 3))
+    expected = np.where(after % 10 == 3, np.nan, after / 10)
     np.testing.assert_allclose(batch.next_action[..., 0], expected, atol=1e-6)
 
 

@@ -89,6 +89,22 @@ def test_an_evaluation_of_nan_is_worse_than_any_other():
     assert best == [10, 20, 20, 20]
 
 
+@pytest.mark.parametrize("best", [None, 0, 1, 2])
+def test_a_resumed_evaluation_has_the_same_results_and_the_same_best_one(best):
+    one, other = (Evaluate("Pendulum-v1", 10, episodes=1, seed=0) for _ in range(2))
+    returns = [] if best is None else [9.0 if i == best else float(i) for i in range(3)]
+    agent = scripted_agent([evaluation([value]) for value in returns])
+    for i in range(len(returns)):
+        one.run(agent, 10 * i)
+    other.load_state_dict(one.state_dict())
+    for callback in (one, other):
+        callback.close()
+        assert [(step, result.returns.tolist()) for step, result in callback.results] == [
+            (10 * i, [value]) for i, value in enumerate(returns)
+        ]
+        assert (None if callback.best is None else callback.best.step) == (None if best is None else 10 * best)
+
+
 def test_a_resumed_evaluation_knows_how_many_episodes_were_cut_off():
     one, other = (Evaluate("Pendulum-v1", 10, episodes=1, seed=0) for _ in range(2))
     one.run(scripted_agent([Evaluation(np.ones(2), np.ones(2, int), np.full(2, math.nan), cut=1)]), 10)

@@ -434,6 +434,19 @@ def test_statistics_are_copied_only_between_vectors_wrapped_alike():
         sync_envs_normalization(VecNormalize(walks()), VecMonitor(walks()))
 
 
+def test_statistics_that_are_copied_are_of_each_vector_alone():
+    training, evaluating = (VecNormalize(walks()) for _ in range(2))
+    training.reset()
+    sync_envs_normalization(training, evaluating)
+    for own, other, value in ((training, evaluating, 50.0), (evaluating, training, -9.0)):
+        before = {name: array.copy() for name, array in other.statistics().items()}
+        own.obs_rms.update(np.full((7, *own.obs_rms.mean.shape), value))
+        own.ret_rms.update(np.full(7, value))
+        for name, array in other.statistics().items():
+            np.testing.assert_array_equal(array, before[name])
+            assert (own.statistics()[name] != array).all() or name.endswith(".count")
+
+
 # Other wrappers.
 
 
