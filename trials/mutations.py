@@ -44,6 +44,8 @@ class Mutation(NamedTuple):
     """Occurs once in the file."""
     new: str
     kind: str
+    at_first: str | None = None
+    """``caught`` or ``missed``: what the tests did at first, of a bug by someone who knew neither the list nor the tests."""
 
 
 MUTATIONS = [
@@ -63,12 +65,18 @@ STAGES = {
     "algorithms/dqn": ["tests/algorithms/test_dqn.py", "tests/algorithms/test_recorded_updates.py"],
     "algorithms/": ["tests/algorithms/test_NAME.py"],
     "buffers/ring": ["tests/buffers/test_uniform.py"],
+    "buffers/uniform": ["tests/buffers/test_uniform.py", "tests/test_offline.py"],
     "buffers/": ["tests/buffers/test_NAME.py"],
     "loops/device/": ["tests/loops/device", "tests/test_schedules.py"],
     "loops/": ["tests/test_schedules.py", "tests/agents/test_agent.py"],
     "agents/": ["tests/test_schedules.py", "tests/agents/test_agent.py"],
     "core": ["tests/algorithms/test_off_policy_updates.py"],
-    "exploration/": ["tests/exploration"],
+    "exploration/": ["tests/exploration", "tests/algorithms/test_keys.py"],
+    "networks/memory": ["tests/algorithms/test_memory.py"],
+    "networks/": ["tests/networks/test_NAME.py"],
+    "envs/functional/": ["tests/envs/functional/test_NAME.py"],
+    "callbacks/": ["tests/callbacks"],
+    "sb3/": ["tests/sb3/test_vec_env.py"],
     "": ["tests/test_NAME.py"],
 }
 """By the first characters of the file: the tests that are about it. NAME stands for the file's own."""
@@ -139,7 +147,8 @@ def run(mutation: Mutation, folder: Path, n_stages: int) -> dict[str, object]:
         "PYTHONPATH": os.pathsep.join([str(folder / "src"), str(folder)]),
         "JAX_PLATFORMS": "cpu",
     }
-    row: dict[str, object] = {**mutation._asdict(), "caught_by": None, "stage": None}
+    row: dict[str, object] = {name: value for name, value in mutation._asdict().items() if value}
+    row |= {"caught_by": None, "stage": None}
     began, done = time.monotonic(), list[str]()
     try:
         for number, tests in enumerate(stages(mutation)[:n_stages], 1):
@@ -223,11 +232,18 @@ def write(new: dict[tuple[str, str, str], dict]) -> None:
     )
     ordered = [rows[key(m)] for m in MUTATIONS if key(m) in rows]
     caught = sum(row["caught_by"] is not None for row in ordered)
+    at_first = [mutation.at_first for mutation in MUTATIONS if mutation.at_first]
     content = {
         "command": "python trials/mutations.py",
         "commit": commit.stdout.strip(),
         "date": time.strftime("%Y-%m-%d"),
-        "summary": {"planted": len(MUTATIONS), "tried": len(ordered), "caught": caught},
+        "summary": {
+            "planted": len(MUTATIONS),
+            "tried": len(ordered),
+            "caught": caught,
+            "planted by someone who knew neither the list nor the tests": len(at_first),
+            "of these caught at first": at_first.count("caught"),
+        },
         "mutations": ordered,
     }
     RESULTS.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
