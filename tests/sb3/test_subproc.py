@@ -35,7 +35,7 @@ def test_environments_in_processes_show_what_those_in_this_process_show():
                     np.testing.assert_array_equal(there, expected)
                     assert there.dtype == expected.dtype
         assert env.get_attr("rank") == [0, 1]
-        env.set_attr("scale", 2.0, indices=1)
+        env.set_attr("scale", 2.0, indices=-1)  # counted from the end
         assert env.get_attr("scale", [1, 0]) == [2.0, 1.0]
         assert env.env_method("has_wrapper_attr", "rang") == [False, False]
         assert env.env_is_wrapped(Monitor) == [True, True]

@@ -200,7 +200,7 @@ class VecEnv(ABC):
 
     def _get_indices(self, indices: Indices) -> list[int]:
         chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
-        return list(chosen)
+        return [range(self.num_envs)[i] for i in chosen]
 
 
 class SingleEnvs(VecEnv):
